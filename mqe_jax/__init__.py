@@ -1,0 +1,1 @@
+"""Multi-agent Quadruped Environment in JAX on MuJoCo MJX."""
