@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Returns the log-density of a diagonal Gaussian per dimension: (..., D); sum over D for the joint one."""
+    """Returns the log-density of a diagonal Gaussian per dimension, (..., D); their sum is the joint one."""
     z = (action - mean) * jnp.exp(-log_std)
     return -0.5 * jnp.square(z) - log_std - _LOG_SQRT_2PI
 
@@ -73,3 +74,32 @@ def value_loss(
         return free
     kept = old_value + jnp.clip(value - old_value, -clip, clip)
     return jnp.maximum(free, loss(kept - target))
+
+
+def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns one log-ratio per agent from log-densities per dimension: (..., A, D) -> (..., A, 1).
+
+    Source: MAPPO, Yu et al., arXiv 2103.01955.
+    """
+    return jnp.sum(new - old, axis=-1, keepdims=True)
+
+
+def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns one log-ratio per action dimension, as OpenRL clips them: (..., A, D) -> (..., A, D)."""
+    return new - old
+
+
+def ratio_joint(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns the log of the product of all agents' ratios: (..., A, D) -> (..., 1, 1).
+
+    Source: JRPO, PPO on the joint policy of a team.
+    """
+    return jnp.sum(new - old, axis=(-2, -1), keepdims=True)
+
+
+RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+    "agent": ratio_per_agent,
+    "dimension": ratio_per_dimension,
+    "joint": ratio_joint,
+}
+"""What PPO clips, by the name that the settings give it."""

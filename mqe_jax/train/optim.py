@@ -16,11 +16,11 @@ class AdamState(NamedTuple):
 
     mean: PyTree
     square: PyTree
-    count: jax.Array
+    updates: jax.Array
 
 
 class Optimizer(NamedTuple):
-    """`init(params) -> state`; `update(grads, state, params, learning_rate) -> (params, state, grad_norm)`."""
+    """`init(params) -> state`; `update(grads, state, params, rate) -> (params, state, grad_norm)`."""
 
     init: Callable[[PyTree], AdamState]
     update: Callable[[PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]]
@@ -43,7 +43,7 @@ def adam(
         return AdamState(
             mean=jax.tree.map(jnp.zeros_like, params),
             square=jax.tree.map(jnp.zeros_like, params),
-            count=jnp.zeros((), jnp.int32),
+            updates=jnp.zeros((), jnp.int32),
         )
 
     def update(
@@ -53,8 +53,8 @@ def adam(
         if max_grad_norm is not None:
             scale = jnp.minimum(1.0, max_grad_norm / jnp.maximum(grad_norm, 1e-12))
             grads = jax.tree.map(lambda g: g * scale, grads)
-        count = state.count + 1
-        steps = count.astype(jnp.float32)
+        updates = state.updates + 1
+        steps = updates.astype(jnp.float32)
         mean = jax.tree.map(lambda m, g: b1 * m + (1.0 - b1) * g, state.mean, grads)
         square = jax.tree.map(lambda s, g: b2 * s + (1.0 - b2) * jnp.square(g), state.square, grads)
         mean_scale = 1.0 / (1.0 - b1**steps)
@@ -64,6 +64,6 @@ def adam(
             return p - learning_rate * (m * mean_scale) / (jnp.sqrt(s * square_scale) + eps)
 
         params = jax.tree.map(move, params, mean, square)
-        return params, AdamState(mean, square, count), grad_norm
+        return params, AdamState(mean, square, updates), grad_norm
 
     return Optimizer(init, update)
