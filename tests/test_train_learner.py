@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,51 +94,65 @@ def test_memory_carries_a_sign_through_an_episode() -> None:
     assert float(metrics["average_step_reward"]) > -0.06  # without memory at best -0.19
 
 
-def test_a_chunk_repeats_the_rollout() -> None:
-    """The first gradient step sees the rollout's own log-densities and values, memory included."""
-    env = Probe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=3)
-    config = small(num_envs=4, rollout_steps=8, recurrent=True, chunk_length=4, epochs=1, minibatches=1)
-    _, metrics = learn(env, config, 3)
-    assert abs(float(metrics["approx_kl"])) < 1e-6
-    assert float(metrics["clip_fraction"]) == 0.0
+class CountingProbe(Probe):
+    """A probe that counts how often its step is traced."""
 
-
-def test_update_is_traced_once_and_pure() -> None:
     traces = 0
-    inner = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
 
-    class Counting:
-        def __getattr__(self, name: str) -> Any:
-            return getattr(inner, name)
+    def step(self, state: probes.ProbeState, action: jax.Array) -> probes.ProbeState:
+        CountingProbe.traces += 1
+        return super().step(state, action)
 
-        def step(self, state: Any, action: jax.Array) -> Any:
-            nonlocal traces
-            traces += 1
-            return inner.step(state, action)
 
-    learner = make_learner(Counting(), small(num_envs=4))  # pyright: ignore[reportArgumentType]
-    first = jax.jit(learner.init)(jax.random.PRNGKey(0))
+class OnePass(NamedTuple):
+    """What updates of a single gradient step gave."""
+
+    traces: list[int]
+    states: list[TrainState]
+    metrics: list[dict[str, jax.Array]]
+    first_again: dict[str, jax.Array]
+
+
+@pytest.fixture(scope="module")
+def one_pass() -> OnePass:
+    """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
+    env = CountingProbe(
+        probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4
+    )
+    learner = make_learner(env, small(num_envs=4, recurrent=True, chunk_length=4, epochs=1, minibatches=1))
     update = jax.jit(learner.update)
-    state, metrics = update(first)
-    once = traces
+    states, all_metrics, traces = [jax.jit(learner.init)(jax.random.PRNGKey(0))], [], []
     for _ in range(3):
-        state, _ = update(state)
-    assert traces == once
-    _, again = update(first)
-    np.testing.assert_array_equal(metrics["loss/policy"], again["loss/policy"])
-    assert int(state.updates) == 4
+        state, metrics = update(states[-1])
+        states.append(state)
+        all_metrics.append(metrics)
+        traces.append(CountingProbe.traces)
+    return OnePass(traces, states, all_metrics, update(states[0])[1])
+
+
+def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
+    """The first gradient step sees the rollout's own log-densities, memory and resets included."""
+    for metrics in one_pass.metrics:
+        assert abs(float(metrics["approx_kl"])) < 1e-6
+        assert float(metrics["clip_fraction"]) == 0.0
+
+
+def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
+    assert len(set(one_pass.traces)) == 1
+    assert [int(state.updates) for state in one_pass.states] == [0, 1, 2, 3]
+    for name, value in one_pass.metrics[0].items():
+        np.testing.assert_array_equal(value, one_pass.first_again[name])
+
+
+def test_success_is_averaged_over_episode_ends(one_pass: OnePass) -> None:
+    """Even worlds end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
+    metrics = one_pass.metrics[0]
+    assert float(metrics["episodes"]) == 2 * 4 + 2 * 2
+    assert float(metrics["success"]) == pytest.approx(2 / 3)
+    assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
 
 
 def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
     with pytest.raises(ValueError, match="num_envs: 32; the environment given has 4"):
         make_learner(env, small())
-
-
-def test_success_is_averaged_over_episode_ends() -> None:
-    """Even worlds end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
-    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
-    _, metrics = learn(env, dataclasses.replace(small(num_envs=4), epochs=1), 1)
-    assert float(metrics["episodes"]) == 2 * 4 + 2 * 2
-    assert float(metrics["success"]) == pytest.approx(2 / 3)
-    assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
