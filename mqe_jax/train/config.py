@@ -86,6 +86,8 @@ class TrainConfig:
     """Whether the mean action is free or kept within -1 and 1."""
     log_std_init: float = 0.0
     """Logarithm of the actions' deviation at the start."""
+    log_std_max: float | None = None
+    """Upper bound of that logarithm, against which an entropy bonus can push; none sets no bound."""
     normalize_observations: bool = False
     """Whether observations are brought to mean 0 and deviation 1 by running statistics."""
     normalize_values: bool = True
@@ -152,6 +154,8 @@ def _validate(config: TrainConfig) -> None:
         _fail("value_norm_decay", config.value_norm_decay, "at least 0 and less than 1")
     if config.dual_clip is not None and not config.dual_clip > 1.0:
         _fail("dual_clip", config.dual_clip, "greater than 1, or none")
+    if config.log_std_max is not None and config.log_std_init > config.log_std_max:
+        _fail("log_std_init", config.log_std_init, f"at most log_std_max ({config.log_std_max})")
     if not all(size > 0 for size in config.hidden_sizes) or not config.hidden_sizes:
         _fail("hidden_sizes", config.hidden_sizes, "one or more widths greater than 0")
     if config.rollout_steps % config.chunk:
@@ -231,9 +235,21 @@ def config_from_mapping(values: Mapping[str, Any]) -> TrainConfig:
 
 
 def config_to_mapping(config: TrainConfig) -> dict[str, Any]:
-    """Returns the settings as plain values that JSON and YAML can hold."""
-    values = dataclasses.asdict(config)
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+    """Returns the settings as plain values that JSON and YAML can hold.
+
+    Raises ValueError for an override in `env` that is no such value.
+    """
+    return {f.name: _plain(f.name, getattr(config, f.name)) for f in dataclasses.fields(config)}
+
+
+def _plain(name: str, value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Mapping):
+        return {str(k): _plain(f"{name}.{k}", v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(f"{name}[{i}]", v) for i, v in enumerate(value)]
+    _fail(name, value, "a number, a text, true, false, none, or lists and mappings of these")
 
 
 def load_config(path: str | Path, **overrides: Any) -> TrainConfig:
