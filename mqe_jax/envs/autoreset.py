@@ -39,6 +39,7 @@ class VectorEnv:
     Attributes:
         env: the task.
         num_envs: N.
+        max_episode_steps: environment steps until the time limit.
     """
 
     def __init__(self, env: QuadrupedEnv, num_envs: int) -> None:
@@ -47,6 +48,7 @@ class VectorEnv:
         self.env = env.with_room_for(num_envs)
         self.num_envs = num_envs
         self.name = env.name
+        self.max_episode_steps = env.max_steps
         self.num_agents = env.num_agents
         self.observation_size = env.observation_size
         self.privileged_observation_size = env.privileged_observation_size

@@ -21,7 +21,7 @@ def gae(
     Shapes: time-major (T, ...); `terminated` and `done` (bool) may lack trailing axes of `reward`.
     `next_value[t]` is the value of the state in which step t arrived, before any reset, so a truncated
     episode bootstraps from its own last state. `terminated` removes the bootstrap; `done`
-    (terminated or truncated) cuts the trace. Source: Schulman et al., arXiv 1506.02438.
+    (terminated or truncated) cuts the trace. A `terminated` between 0 and 1 removes that part of the bootstrap. Source: Schulman et al., arXiv 1506.02438.
     """
 
     def as_reward(flag: jax.Array) -> jax.Array:

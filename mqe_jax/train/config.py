@@ -48,6 +48,11 @@ class TrainConfig:
     """Discount per step."""
     gae_lambda: float = 0.95
     """Decay of the advantage estimate's trace."""
+    failure_bootstrap: float = 0.0
+    """Share of the value that a terminated episode still gets, falling linearly to 0: an early failure then costs
+    its penalty alone, so that agents dare to try what often fails at first."""
+    failure_bootstrap_until: float = 0.5
+    """Part of the training after which that share is 0."""
     clip: float = 0.2
     """Half width of the interval to which PPO clips the ratio."""
     dual_clip: float | None = None
@@ -96,6 +101,9 @@ class TrainConfig:
     """Memory, per rollout, of the statistics that normalise values."""
     normalize_advantages: bool = True
     """Whether a rollout's advantages are brought to mean 0 and deviation 1."""
+    advantage_clip: float | None = None
+    """Bounds advantages to so many times their median size, by which they are then divided, so that rare great
+    losses do not drown everyday gains; none leaves them."""
     stagger_episodes: bool = False
     """Whether the first episodes begin at random times, so that worlds do not reset all at once."""
     checkpoint_every: int = 20
@@ -124,10 +132,10 @@ class TrainConfig:
 
 _POSITIVE = (
     "num_envs total_steps rollout_steps epochs minibatches learning_rate target_kl adam_eps max_grad_norm "
-    "clip value_clip huber_delta gru_size chunk_length action_gain checkpoint_every checkpoints_kept"
+    "failure_bootstrap_until advantage_clip clip value_clip huber_delta gru_size chunk_length action_gain checkpoint_every checkpoints_kept"
 ).split()
 _NOT_NEGATIVE = "seed value_coef entropy_coef entropy_coef_final".split()
-_SHARE = "gamma gae_lambda".split()
+_SHARE = "gamma gae_lambda failure_bootstrap".split()
 
 
 def _fail(name: str, value: object, allowed: str) -> typing.NoReturn:

@@ -183,11 +183,13 @@ def _prepare(
     reward = transitions.reward
     if config.value == "joint":
         reward = jnp.mean(reward, axis=-1, keepdims=True)
+    progress = state.updates.astype(jnp.float32) / config.num_updates
+    share = config.failure_bootstrap * jnp.maximum(1.0 - progress / config.failure_bootstrap_until, 0.0)
     advantage, target = gae(
         reward,
         value,
         next_value,
-        transitions.terminated,
+        transitions.terminated * (1.0 - share),
         transitions.done,
         gamma=config.gamma,
         lam=config.gae_lambda,
@@ -196,6 +198,9 @@ def _prepare(
         value_normalizer = value_update(value_normalizer, target, config.value_norm_decay)
     error_share = jnp.var(target - value) / jnp.maximum(jnp.var(target), 1e-8)
     metrics = {"value_mean": jnp.mean(value), "explained_variance": 1.0 - error_share}
+    if config.advantage_clip is not None:
+        scale = jnp.median(jnp.abs(advantage)) + 1e-8
+        advantage = jnp.clip(advantage / scale, -config.advantage_clip, config.advantage_clip)
     if config.normalize_advantages:
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 

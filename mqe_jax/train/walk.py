@@ -59,11 +59,11 @@ class WalkConfig:
         seed: of everything random.
     """
 
-    num_envs: int = 4000
+    num_envs: int = 8192
     rollout_length: int = 24
-    iterations: int = 2000
+    iterations: int = 1200
     epochs: int = 5
-    minibatches: int = 4
+    minibatches: int = 6
     learning_rate: float = 1e-3
     target_kl: float = 0.01
     clip: float = 0.2
@@ -74,8 +74,8 @@ class WalkConfig:
     adaptation: float = 1.0
     max_grad_norm: float = 1.0
     initial_std: float = 1.0
-    curriculum: int = 500
-    seed: int = 0
+    curriculum: int = 400
+    seed: int = 1
 
 
 @jax.tree_util.register_dataclass
