@@ -4,6 +4,7 @@ Drawing is `mujoco.Renderer` on a GL library that works without a screen (EGL, t
 works, the same episode is drawn from above with matplotlib, and one line says which packages give the real one.
 """
 
+import copy
 import os
 import subprocess
 import sys
@@ -61,8 +62,8 @@ class Camera:
 
     lookat: tuple[float, float, float]  # metre
     distance: float  # metre
-    azimuth: float = 42.0  # 0 looks along +x, 90 along +y
-    elevation: float = -38.0  # -90 looks straight down
+    azimuth: float = 60.0  # 0 looks along +x, 90 along +y
+    elevation: float = -40.0  # -90 looks straight down
 
 
 def record(
@@ -122,8 +123,8 @@ def best(episodes: list[Episode]) -> Episode:
 def robot_bases(model: mujoco.MjModel) -> list[int]:
     """Ids of the bodies that are robots' trunks: a free joint above at least twelve hinges."""
     bases = []
-    hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
-    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+    hinges = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
         body = int(model.jnt_bodyid[joint])
         inside = model.body_rootid[model.jnt_bodyid] == model.body_rootid[body]
         if np.count_nonzero(hinges & inside) >= 12:
@@ -147,6 +148,18 @@ def _box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.nd
     return data.geom_xpos[geom] + (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
 
 
+def _scenery(model: mujoco.MjModel) -> list[int]:
+    """Ids of the shown geoms that are neither ground nor part of a robot."""
+    robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if int(model.geom_type[geom]) not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+        and int(model.geom_group[geom]) != COLLISION_GROUP
+        and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots
+    ]
+
+
 def _extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner (3,) of what the clip should hold: the scene and every robot's way."""
     data = mujoco.MjData(model)
@@ -155,22 +168,18 @@ def _extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.nda
         _pose(model, data, episode, int(index))
         for body in robot_bases(model):
             points += [data.xpos[body] - [0.4, 0.4, 0.3], data.xpos[body] + [0.4, 0.4, 0.2]]
-    robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
-    for geom in range(model.ngeom):
-        flat = model.geom_type[geom] in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        if not flat and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots:
-            points += list(_box_corners(model, data, geom))
+    for geom in _scenery(model):
+        points += list(_box_corners(model, data, geom))
     if not points:
         points = [np.full(3, -1.0), np.full(3, 1.0)]
     return np.min(points, axis=0), np.max(points, axis=0)
 
 
-def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 4 / 3) -> Camera:
+def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 / 9) -> Camera:
     """A three-quarter view from behind and above that holds the whole track and every robot's way."""
     low, high = _extent(model, episode)
     centre = (low + high) / 2
-    centre[2] = low[2] + 0.25
-    camera = Camera((float(centre[0]), float(centre[1]), float(centre[2])), 1.0)
+    camera = Camera((float(centre[0]), float(centre[1]), 0.2), 1.0)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])])
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array(
@@ -179,10 +188,44 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 4 / 
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     up = np.cross(right, forward)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
-    offset = corners - centre
-    # A corner is inside the picture when |offset . right| <= depth tan aspect and |offset . up| <= depth tan.
-    need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
-    return replace(camera, distance=float(np.clip(0.97 * need.max(), 1.5, 60.0)))
+    lookat, distance = np.array(camera.lookat), 1.0
+    for _ in range(8):  # put the middle of what is seen into the middle of the picture, then step back or forth
+        offset = corners - lookat
+        # A corner is inside the picture when |offset . right| <= depth tan aspect and |offset . up| <= depth tan.
+        need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
+        distance = need.max()
+        depth = distance + offset @ forward
+        across, along = offset @ right / depth, offset @ up / depth
+        shift = distance * ((across.max() + across.min()) * right + (along.max() + along.min()) * up) / 2
+        lookat = lookat + shift
+    distance = float(np.clip(1.04 * distance, 1.5, 60.0))
+    return replace(camera, lookat=(float(lookat[0]), float(lookat[1]), float(lookat[2])), distance=distance)
+
+
+def _drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
+    """A copy to draw from, in which moving walls end at the track's side walls.
+
+    A gate's walls are long enough for every place that its gap may take, so that they stand out behind the
+    side walls; what stands out is not drawn.
+    """
+    model = copy.deepcopy(model)
+    box = int(mujoco.mjtGeom.mjGEOM_BOX)
+    shown = [geom for geom in _scenery(model) if int(model.geom_type[geom]) == box]
+    fixed = [geom for geom in shown if int(model.geom_bodyid[geom]) == 0]
+    if not fixed:
+        return model
+    data = mujoco.MjData(model)
+    _pose(model, data, episode, 0)
+    sides = np.concatenate([_box_corners(model, data, geom)[:, 1] for geom in fixed])
+    for geom in shown:
+        if model.body_mocapid[model.geom_bodyid[geom]] < 0:
+            continue
+        wall = _box_corners(model, data, geom)[:, 1]
+        low, high = max(wall.min(), sides.min()), min(wall.max(), sides.max())
+        if low < high and (low, high) != (wall.min(), wall.max()):
+            model.geom_pos[geom, 1] += (low + high) / 2 - data.geom_xpos[geom, 1]
+            model.geom_size[geom, 1] = model.geom_aabb[geom, 4] = (high - low) / 2
+    return model
 
 
 # ---------------------------------------------------------------- mujoco.Renderer
@@ -235,15 +278,16 @@ def _draw_gl(
 ) -> Iterator[np.ndarray]:
     """Frames (H, W, 3) uint8 of the episode, drawn by `mujoco.Renderer`."""
     width, height = size
-    # The offscreen buffer and its quality belong to the model: they are put back when the clip is drawn.
-    settings = {"offwidth": width, "offheight": height}
-    before = {name: getattr(model.vis.global_, name) for name in settings}
-    quality = {"shadowsize": 4096, "offsamples": 4}
-    quality_before = {name: getattr(model.vis.quality, name) for name in quality}
-    for name, value in settings.items():
-        setattr(model.vis.global_, name, value)
-    for name, value in quality.items():
-        setattr(model.vis.quality, name, value)
+    vis = model.vis
+    vis.global_.offwidth, vis.global_.offheight = width, height
+    vis.quality.shadowsize, vis.quality.offsamples = 2048, 4
+    # One sun and some light from the camera, together short of white on a pale floor.
+    vis.headlight.ambient[:] = 0.38
+    vis.headlight.diffuse[:] = 0.22
+    vis.headlight.specular[:] = 0.0
+    if model.nlight:
+        model.light_diffuse[:] = 0.45
+        model.light_specular[:] = 0.05
     option = mujoco.MjvOption()
     option.geomgroup[COLLISION_GROUP] = 0
     option.sitegroup[:] = 0
@@ -252,18 +296,12 @@ def _draw_gl(
     view.lookat[:] = camera.lookat
     view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
     data = mujoco.MjData(model)
-    try:
-        with _renderer(model, width, height, backend) as renderer:
-            for index in range(len(episode)):
-                _pose(model, data, episode, index)
-                mujoco.mj_camlight(model, data)
-                renderer.update_scene(data, view, option)
-                yield renderer.render()
-    finally:
-        for name, value in before.items():
-            setattr(model.vis.global_, name, value)
-        for name, value in quality_before.items():
-            setattr(model.vis.quality, name, value)
+    with _renderer(model, width, height, backend) as renderer:
+        for index in range(len(episode)):
+            _pose(model, data, episode, index)
+            mujoco.mj_camlight(model, data)
+            renderer.update_scene(data, view, option)
+            yield renderer.render()
 
 
 # ---------------------------------------------------------------- the view from above
@@ -302,14 +340,9 @@ def _draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) ->
     axes.axis("off")
     data = mujoco.MjData(model)
     bases = robot_bases(model)
-    roots = {int(model.body_rootid[body]) for body in bases}
     scenery, robots = [], []
-    flat = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-    for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
-        if int(model.body_rootid[body]) in roots or model.geom_type[geom] in flat:
-            continue
-        moves = model.body_dofnum[model.body_rootid[body]] > 0
+    for geom in _scenery(model):
+        moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
         patch = Polygon(
             np.zeros((3, 2)), facecolor="#c9ced6" if moves else "#3a3d45", edgecolor="#23252b", lw=0.6, zorder=2
         )
@@ -344,14 +377,14 @@ def render_frames(
     env: Any,
     episode: Episode,
     camera: Camera | None = None,
-    size: tuple[int, int] = (640, 480),
+    size: tuple[int, int] = (960, 540),
     backend: str | None = "auto",
 ) -> Iterator[np.ndarray]:
     """Yield the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
     `backend` is `auto` (what `gl_backend` finds), `egl`, `osmesa`, or None for the matplotlib view from above.
     """
-    model = env.mj_model
+    model = _drawn_model(env.mj_model, episode)
     if backend == "auto":
         backend = gl_backend()
     if backend is None:
@@ -435,12 +468,12 @@ def render_episode(
 ) -> str:
     """Draw an episode into a file chosen by suffix; returns what drew it (`egl`, `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 720 at 25 frames/s, .gif 480 x 360 at 12.5 frames/s, .png 1280 x 960, the middle frame.
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720, the middle frame.
     Where GL is missing, one line on standard error names the packages that give the real picture.
     """
     check_output(path)
     suffix = path.suffix.lower()
-    size = size or {".mp4": (960, 720), ".gif": (480, 360), ".png": (1280, 960)}[suffix]
+    size = size or {".mp4": (960, 540), ".gif": (480, 270), ".png": (1280, 720)}[suffix]
     fps = fps or {".mp4": 25.0, ".gif": 12.5, ".png": 1.0}[suffix]
     if backend == "auto":
         backend = gl_backend()
