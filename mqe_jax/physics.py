@@ -1,0 +1,214 @@
+"""Physics on three engines behind one function; the state is always an `mjx.Data`.
+
+| impl | engine | hardware |
+|---|---|---|
+| `jax` | MJX, JAX implementation | CPU, GPU, TPU |
+| `warp` | MJX, Warp implementation | NVIDIA GPU (CPU for tests) |
+| `c` | MuJoCo's own C engine on all cores, called through `jax.pure_callback` | CPU |
+
+The functions are written for one world and batched by `jax.vmap`. What differs between worlds beyond the
+state (friction, masses, motor strength) is passed to `Physics.step` as arrays named after `mjModel` fields.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax.terrain import nearest
+
+IMPLS = ("auto", "jax", "warp", "c")
+
+# What a step carries from one physics step to the next; everything else in `mjx.Data` is derived from it.
+STATE_FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied", "time", "sensordata")
+
+
+def resolve_impl(impl: str = "auto") -> str:
+    """Chooses the engine: warp where there is an NVIDIA GPU and warp-lang, c on a CPU, else jax.
+
+    Raises:
+        ValueError: for an unknown engine, or one that this machine cannot run, naming what is missing.
+    """
+    if impl not in IMPLS:
+        raise ValueError(f"impl: unknown engine {impl!r}{nearest(impl, IMPLS)}; allowed: {', '.join(IMPLS)}")
+    platform = jax.default_backend()
+    if impl == "auto":
+        if platform == "gpu" and _has_warp() and _has_cuda():
+            return "warp"
+        return "c" if platform == "cpu" else "jax"
+    if impl == "warp" and not _has_warp():
+        raise ValueError("impl 'warp' needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'")
+    if impl == "c" and platform != "cpu":
+        raise ValueError(f"impl 'c' runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'")
+    return impl
+
+
+def _has_warp() -> bool:
+    from mujoco.mjx import warp as mjx_warp
+
+    return bool(mjx_warp.WARP_INSTALLED)
+
+
+def _has_cuda() -> bool:
+    return any("cuda" in device.device_kind.lower() or "nvidia" in device.device_kind.lower() for device in jax.devices())
+
+
+class Physics:
+    """Steps one world of a compiled model on one engine; batch with `jax.vmap`.
+
+    Attributes:
+        model: the compiled `mujoco.MjModel`.
+        impl: 'jax', 'warp' or 'c'.
+        num_substeps: physics steps a call of `step`.
+        num_envs: how many worlds the Warp engine's contact buffer has room for.
+        contacts_per_env: how many contacts a world may have on average on Warp.
+        rows_per_env: how many constraint rows a world may have on Warp.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        impl: str = "auto",
+        num_substeps: int = 4,
+        num_envs: int = 4096,
+        contacts_per_env: int = 32,
+        rows_per_env: int = 160,
+    ) -> None:
+        self.model = model
+        self.impl = resolve_impl(impl)
+        self.num_substeps = num_substeps
+        self.num_envs = num_envs
+        self.contacts_per_env = contacts_per_env
+        self.rows_per_env = rows_per_env
+        if self.impl == "c":
+            self._engine = _CEngine(model, num_substeps)
+            self._template = mjx.make_data(model, impl="cpp")
+        elif self.impl == "warp":
+            self._mjx_model = mjx.put_model(model, impl="warp")
+            self._template = mjx.make_data(
+                model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env
+            )
+        else:
+            self._mjx_model = mjx.put_model(model, impl="jax")
+            self._template = mjx.make_data(model, impl="jax")
+
+    def init(self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array) -> mjx.Data:
+        """Makes the state of one world without a forward pass.
+
+        Args:
+            qpos: (nq,).
+            qvel: (nv,).
+            mocap_pos: positions of the mocap bodies (nmocap, 3), m.
+            ctrl: (nu,).
+        """
+        as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+        return self._template.replace(
+            qpos=as_float(qpos), qvel=as_float(qvel), mocap_pos=as_float(mocap_pos), ctrl=as_float(ctrl),
+            qacc_warmstart=jnp.zeros(self.model.nv), xfrc_applied=jnp.zeros((self.model.nbody, 6)),
+            sensordata=jnp.zeros(self.model.nsensordata), time=jnp.zeros(()),
+        )  # fmt: skip
+
+    def step(
+        self,
+        data: mjx.Data,
+        ctrl: jax.Array,
+        *,
+        fields: Mapping[str, jax.Array] | None = None,
+        xfrc_applied: jax.Array | None = None,
+        num_substeps: int | None = None,
+    ) -> mjx.Data:
+        """Advances one world by `num_substeps` physics steps under a constant control.
+
+        Args:
+            data: the world's state.
+            ctrl: (nu,), joint targets (rad) or torques (N m).
+            fields: model fields of this world in place of the model's, by their `mjModel` names.
+            xfrc_applied: external forces and torques on the bodies (nbody, 6), N and N m, world frame.
+            num_substeps: physics steps; the engine's own number if None.
+        """
+        substeps = self.num_substeps if num_substeps is None else num_substeps
+        data = data.replace(ctrl=ctrl.astype(jnp.float32))
+        if xfrc_applied is not None:
+            data = data.replace(xfrc_applied=xfrc_applied.astype(jnp.float32))
+        if self.impl == "c":
+            return self._engine.step(data, dict(fields or {}), xfrc_applied is not None, substeps)
+        model = self._mjx_model.replace(**fields) if fields else self._mjx_model
+        return jax.lax.scan(lambda state, _: (mjx.step(model, state), None), data, None, substeps)[0]
+
+    def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
+        """Returns `first` where `choose` () is true, else `second`; copies only what a step carries."""
+        merged = {name: jnp.where(choose, getattr(first, name), getattr(second, name)) for name in STATE_FIELDS}
+        return second.replace(**merged)
+
+    def overflow(self, data: mjx.Data) -> jax.Array:
+        """Returns whether Warp dropped contacts or constraint rows in the last step, () bool; else false."""
+        if self.impl != "warp":
+            return jnp.zeros((), bool)
+        return jnp.any(data._impl.overflow != 0)
+
+
+class _CEngine:
+    """MuJoCo's C engine as a pure JAX function: state in, state out, all worlds of a batch in one call."""
+
+    def __init__(self, model: mujoco.MjModel, num_substeps: int) -> None:
+        from mujoco.batch import Batch
+
+        self._model = model.__copy__()
+        # A diverged world keeps its non-finite numbers (the environment ends it) instead of starting over unseen.
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._make = Batch
+        self._batches: dict[tuple[int, tuple[str, ...]], Any] = {}
+        self._lock = threading.Lock()
+        m = model
+        self._sizes = (m.nq, m.nv, m.nv, m.nsensordata)
+
+    def step(self, data: mjx.Data, fields: dict[str, jax.Array], forced: bool, substeps: int) -> mjx.Data:
+        names = tuple(sorted(fields))
+        out = jax.ShapeDtypeStruct((sum(self._sizes),), jnp.float32)
+        forces = (data.xfrc_applied,) if forced else ()
+        mocap = (data.mocap_pos, data.mocap_quat) if self._model.nmocap else ()
+
+        def call(qpos: Any, *rest: Any) -> np.ndarray:
+            return self._call(names, forced, substeps, qpos, *rest)
+
+        row = jax.pure_callback(
+            call, out, data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, *mocap, *forces,
+            *(fields[name] for name in names), vmap_method="broadcast_all",
+        )  # fmt: skip
+        qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
+        return data.replace(
+            qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, sensordata=sensordata,
+            time=data.time + substeps * self._model.opt.timestep,
+        )  # fmt: skip
+
+    def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
+        qpos, *rest = (np.asarray(array) for array in arrays)
+        lead = qpos.shape[:-1]
+        count = int(np.prod(lead)) if lead else 1
+        flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
+        with self._lock:
+            batch = self._batches.get((count, names))
+            if batch is None:
+                batch = self._batches[count, names] = self._make(self._model, nsim=count)
+            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
+                batch.bind(name)[:] = next(flat)
+            if self._model.nmocap:
+                batch.bind("mocap_pos")[:] = next(flat)
+                batch.bind("mocap_quat")[:] = next(flat)
+            batch.bind("xfrc_applied")[:] = next(flat) if forced else 0.0
+            batch.bind("time")[:] = 0.0
+            for name in names:
+                batch.expand(name)[:] = next(flat)
+            sensordata = batch.bind("sensordata")
+            batch.step(nstep=substeps)
+            parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
+            row = np.concatenate(parts, axis=1).astype(np.float32)
+        return row.reshape(*lead, -1)

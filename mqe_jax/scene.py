@@ -1,0 +1,133 @@
+"""A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index tables."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mqe_jax import robot as robots
+from mqe_jax.robot import Contacts, RobotIndex
+from mqe_jax.terrain import Layout, Track, build_terrain
+
+# A function that adds bodies (objects, NPCs, ramps, platforms) to the scene after the robots.
+# It is called with the spec and whether to add geoms that are only looked at.
+AddBodies = Callable[[mujoco.MjSpec, bool], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What to build.
+
+    Attributes:
+        track: ground, walls and spawn poses.
+        num_robots: A.
+        contacts: which parts of the robots touch what.
+        objects: called in order to add further bodies.
+        friction: sliding friction of the robots' shapes and the ground.
+        torque_control: the actuators take torques (N m) instead of PD joint targets (rad).
+        timestep: physics step, s.
+        solver_iterations: at most so many Newton iterations per physics step.
+        line_search_iterations: at most so many line search steps per iteration.
+    """
+
+    track: Track
+    num_robots: int = 2
+    contacts: Contacts = Contacts()
+    objects: tuple[AddBodies, ...] = ()
+    friction: float = 1.0
+    torque_control: bool = False
+    timestep: float = 0.005
+    solver_iterations: int = 4
+    line_search_iterations: int = 8
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.num_robots <= robots.MAX_ROBOTS:
+            raise ValueError(f"Scene.num_robots: {self.num_robots} is not between 1 and {robots.MAX_ROBOTS}")
+
+
+@dataclasses.dataclass(frozen=True)
+class CompiledScene:
+    """A compiled scene.
+
+    Attributes:
+        scene: what it was built from.
+        model: for the physics, without the geoms that are only looked at.
+        robot: index tables of the robots.
+        layout: the track's walls, anchors and spawn poses.
+        mocap_offset: of each moving wall from its anchor (W, 3), m; the anchor's z is 0.
+        mocap_anchor: the anchor of each moving wall (W,).
+    """
+
+    scene: Scene
+    model: mujoco.MjModel
+    robot: RobotIndex
+    layout: Layout
+    mocap_offset: np.ndarray
+    mocap_anchor: np.ndarray
+
+    @property
+    def anchor_mean(self) -> np.ndarray:
+        """Mean anchor positions (G, 2), m."""
+        return np.array([anchor.position for anchor in self.layout.anchors]).reshape(-1, 2)
+
+    @property
+    def anchor_spread(self) -> np.ndarray:
+        """Half-widths of the anchors' ranges (G, 2), m."""
+        return np.array([anchor.spread for anchor in self.layout.anchors]).reshape(-1, 2)
+
+    def wall_positions(self, anchors: jax.Array) -> jax.Array:
+        """Places the moving walls (W, 3) around anchors (G, 2), m: what goes into `mocap_pos`."""
+        if not len(self.mocap_anchor):
+            return jnp.zeros((0, 3))
+        return jnp.pad(anchors, ((0, 0), (0, 1)))[self.mocap_anchor] + self.mocap_offset
+
+
+def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
+    """Compiles a scene; without `visual` only what the physics needs."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = scene.timestep
+    spec.option.iterations = scene.solver_iterations
+    spec.option.ls_iterations = scene.line_search_iterations
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    layout = build_terrain(spec, scene.track, visual=visual)
+    for robot in range(scene.num_robots):
+        body = robots.build_robot(
+            robot, scene.num_robots, scene.contacts, visual=visual, friction=scene.friction,
+            torque_control=scene.torque_control,
+        )  # fmt: skip
+        spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
+    for add in scene.objects:
+        add(spec, visual)
+    robots.add_sensors(spec, scene.num_robots, scene.contacts)
+    if visual:
+        spec.worldbody.add_light(
+            pos=(scene.track.length / 2, 0, 8), dir=(0.2, 0.3, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            castshadow=True, diffuse=(0.6, 0.6, 0.6),
+        )  # fmt: skip
+        spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
+        spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
+        spec.visual.quality.shadowsize = 4096
+        spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
+    return spec.compile(), layout
+
+
+def compile_scene(scene: Scene) -> CompiledScene:
+    """Compiles a scene for the physics and looks its names up."""
+    model, layout = build_model(scene, visual=False)
+    moving = [wall for wall in layout.walls if wall.anchor is not None]
+    return CompiledScene(
+        scene=scene,
+        model=model,
+        robot=robots.index_robots(model, scene.num_robots, scene.contacts),
+        layout=layout,
+        mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),
+        mocap_anchor=np.array([wall.anchor for wall in moving], np.int32),
+    )

@@ -1,0 +1,405 @@
+"""Terrain: a track is a row of named blocks along x, each as wide as the track.
+
+A block is a small frozen dataclass with a length and a `layout` method; it is registered by name in one line.
+Blocks say where their walls are; a block whose walls differ between environments gives them as moving walls
+around an anchor, and the anchor's position is drawn at reset and lives in the state (mocap bodies), because
+that works alike on all engines.
+
+Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z up; metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+
+from mqe_jax.robot import GROUND_BIT, WALL_BIT
+
+# A block parameter that may be given as (easy, hard): its value is interpolated by the track's difficulty in [0, 1].
+Ranged = float | tuple[float, float]
+
+WALL_COLOR = (0.17, 0.17, 0.2, 1.0)
+FLOOR_COLOR = (0.69, 0.69, 0.77, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Wall:
+    """A box-shaped wall.
+
+    Attributes:
+        name: unique in the track.
+        center: (3,) m; relative to the anchor (z to the ground) if `anchor` is not None.
+        size: full extents (3,) m.
+        anchor: index of the moving anchor that carries it, or None for a fixed wall.
+    """
+
+    name: str
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    anchor: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Barrier:
+    """An endless vertical wall that faces along `normal`, which nothing can pass; drawn as a box.
+
+    Attributes:
+        name: unique in the track.
+        point: a point on its face (2,), m.
+        normal: direction it faces (2,), a unit vector.
+        length: how much of it is drawn, m.
+    """
+
+    name: str
+    point: tuple[float, float]
+    normal: tuple[float, float]
+    length: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Anchor:
+    """A point that is drawn anew at every reset and carries moving walls.
+
+    Attributes:
+        name: the block's name and number, such as `gate1`.
+        position: its mean (2,), m.
+        spread: half-widths of the uniform range in x and y (2,), m.
+    """
+
+    name: str
+    position: tuple[float, float]
+    spread: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What one block adds to the track; positions in the environment frame, m.
+
+    Attributes:
+        walls: fixed and moving walls; `anchor` counts within this block.
+        barriers: endless walls.
+        anchors: the block's own anchors.
+        spawn: poses (x, y, yaw) where robots start, agent by agent.
+    """
+
+    walls: tuple[Wall, ...] = ()
+    barriers: tuple[Barrier, ...] = ()
+    anchors: tuple[Anchor, ...] = ()
+    spawn: tuple[tuple[float, float, float], ...] = ()
+
+
+BLOCKS: dict[str, type[Block]] = {}
+
+
+def register_block(name: str) -> Callable[[type[Block]], type[Block]]:
+    """Registers a block class under `name`, for `block(name, ...)` and configuration files."""
+
+    def register(cls: type[Block]) -> type[Block]:
+        cls.name = name
+        BLOCKS[name] = cls
+        return cls
+
+    return register
+
+
+def block(name: str, **parameters: Any) -> Block:
+    """Makes a block by its registered name.
+
+    Raises:
+        ValueError: for an unknown block or parameter, with the nearest match.
+    """
+    if name not in BLOCKS:
+        raise ValueError(f"terrain block: unknown name {name!r}{nearest(name, BLOCKS)}; allowed: {', '.join(BLOCKS)}")
+    fields = [field.name for field in dataclasses.fields(BLOCKS[name])]
+    for key in parameters:
+        if key not in fields:
+            raise ValueError(f"terrain block {name}: unknown parameter {key!r}{nearest(key, fields)}; allowed: {', '.join(fields)}")
+    return BLOCKS[name](**parameters)
+
+
+def nearest(word: str, known: Any) -> str:
+    """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
+    match = difflib.get_close_matches(str(word), [str(name) for name in known], 1, 0.5)
+    return f" (did you mean {match[0]!r}?)" if match else ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Base of all blocks.
+
+    Attributes:
+        length: extent along x, m.
+    """
+
+    name: ClassVar[str] = ""
+    length: Ranged = 1.0
+
+    def layout(self, start: float, track: Track, number: int) -> Layout:
+        """Lays the block out from x = `start`; `number` counts the track's blocks."""
+        raise TypeError(f"terrain block {type(self).__name__}: layout() is not defined")
+
+    def at(self, difficulty: float) -> Block:
+        """Returns the block with every (easy, hard) parameter fixed at a difficulty in [0, 1]."""
+        ranged = {field.name for field in dataclasses.fields(self) if "Ranged" in str(field.type)}
+        fixed = {}
+        for name in ranged:
+            value = getattr(self, name)
+            if isinstance(value, tuple | list):
+                fixed[name] = value[0] + difficulty * (value[1] - value[0])
+        return dataclasses.replace(self, **fixed)
+
+
+def _number(value: Ranged) -> float:
+    if isinstance(value, tuple | list):
+        raise ValueError(f"terrain block: the range {value} has no value; give the track a difficulty in [0, 1]")
+    return float(value)
+
+
+@register_block("init")
+@dataclasses.dataclass(frozen=True)
+class Init(Block):
+    """Spawn rooms, one a robot side by side across the track, with a wall behind them.
+
+    Attributes:
+        spawn_x: x of the spawn poses from the block's start, m; half its length if None.
+        room_width: width of one room, m; the track's width shared out if None.
+    """
+
+    length: Ranged = 2.0
+    spawn_x: float | None = None
+    room_width: float | None = None
+
+    def layout(self, start: float, track: Track, number: int) -> Layout:
+        """Lays the block out from x = `start`."""
+        x = start + (_number(self.length) / 2 if self.spawn_x is None else self.spawn_x)
+        room = track.width / track.num_robots if self.room_width is None else self.room_width
+        middle = (track.num_robots - 1) / 2
+        spawn = tuple((x, (robot - middle) * room, 0.0) for robot in range(track.num_robots))
+        return Layout(barriers=(Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),), spawn=spawn)
+
+
+@register_block("plane")
+@dataclasses.dataclass(frozen=True)
+class Plane(Block):
+    """Free ground."""
+
+    def layout(self, start: float, track: Track, number: int) -> Layout:
+        """Adds nothing."""
+        return Layout()
+
+
+@register_block("wall")
+@dataclasses.dataclass(frozen=True)
+class Closing(Block):
+    """The wall that closes the track."""
+
+    length: Ranged = 0.0
+
+    def layout(self, start: float, track: Track, number: int) -> Layout:
+        """Lays the block out from x = `start`."""
+        return Layout(barriers=(Barrier(f"end{number}", (start, 0.0), (-1.0, 0.0), track.width),))
+
+
+@register_block("gate")
+@dataclasses.dataclass(frozen=True)
+class Gate(Block):
+    """A wall across the middle of the block with a gap.
+
+    Attributes:
+        width: of the gap, m.
+        depth: thickness of the wall along x, m.
+        offset: of the gap's centre from the block's centre (x, y), m.
+        random: half-widths of the range from which the centre is drawn at reset (x, y), m.
+    """
+
+    length: Ranged = 3.0
+    width: Ranged = 0.6
+    depth: Ranged = 0.1
+    offset: tuple[float, float] = (0.0, 0.0)
+    random: tuple[float, float] = (0.0, 0.0)
+
+    def layout(self, start: float, track: Track, number: int) -> Layout:
+        """Lays the block out from x = `start`."""
+        gap, depth, height = _number(self.width), _number(self.depth), track.wall_height
+        if not 0 < gap < track.width:
+            raise ValueError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")
+        center = (start + _number(self.length) / 2 + self.offset[0], self.offset[1])
+        # Long enough to reach the side wall wherever the gap is drawn; what stands out beyond it is not drawn.
+        reach = (track.width - gap) / 2 + abs(self.offset[1]) + self.random[1]
+        walls = tuple(
+            Wall(f"gate{number}_{side}", (0.0, sign * (gap + reach) / 2, height / 2), (depth, reach, height), anchor=0)
+            for side, sign in (("right", -1.0), ("left", 1.0))
+        )
+        return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))
+
+
+@register_block("rotation")
+@dataclasses.dataclass(frozen=True)
+class Rotation(Gate):
+    """A gate for the revolving door: a fixed gap whose middle holds the door's hinge."""
+
+    length: Ranged = 1.0
+    width: Ranged = 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class RoughGround:
+    """Perlin-noise ground in place of the flat floor.
+
+    Attributes:
+        amplitude: greatest height above the flat ground, m.
+        wavelength: size of the largest bumps, m.
+        octaves: how many times finer noise of half the height is added.
+        resolution: grid spacing, m.
+        seed: of the noise.
+    """
+
+    amplitude: Ranged = 0.03
+    wavelength: float = 1.0
+    octaves: int = 2
+    resolution: float = 0.1
+    seed: int = 0
+
+    def heights(self, length: float, width: float, difficulty: float = 1.0) -> np.ndarray:
+        """Returns heights in [0, amplitude] (rows along y, columns along x), m."""
+        amplitude = self.amplitude
+        if isinstance(amplitude, tuple | list):
+            amplitude = amplitude[0] + difficulty * (amplitude[1] - amplitude[0])
+        rows, columns = (round(extent / self.resolution) + 1 for extent in (width, length))
+        total = np.zeros((rows, columns))
+        for octave in range(self.octaves):
+            cell = self.wavelength / 2**octave
+            y, x = np.arange(rows) * self.resolution / cell, np.arange(columns) * self.resolution / cell
+            total += _perlin(y, x, np.random.default_rng((self.seed, octave))) / 2**octave
+        low, high = total.min(), total.max()
+        return amplitude * (total - low) / max(high - low, 1e-9)
+
+
+def _perlin(y: np.ndarray, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Gradient noise at the grid points (len(y), len(x)); unit cells."""
+    angle = random.uniform(0, 2 * np.pi, (int(y.max()) + 2, int(x.max()) + 2))
+    gradient = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    row, column = y.astype(int)[:, None], x.astype(int)[None, :]
+    fy, fx = (y - y.astype(int))[:, None], (x - x.astype(int))[None, :]
+    corners = [
+        [gradient[row + i, column + j, 0] * (fx - j) + gradient[row + i, column + j, 1] * (fy - i) for j in (0, 1)]
+        for i in (0, 1)
+    ]
+    fade_x, fade_y = (t**3 * (t * (6 * t - 15) + 10) for t in (fx, fy))
+    near, far = (a + fade_x * (b - a) for a, b in corners)
+    return near + fade_y * (far - near)
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """A row of blocks between two side walls.
+
+    Attributes:
+        blocks: in order along x.
+        width: between the side walls, m.
+        num_robots: how many spawn rooms the init block has.
+        wall_height: of every wall, m.
+        wall_thickness: of the side walls, m.
+        difficulty: in [0, 1]; fixes block parameters that are given as (easy, hard) ranges.
+        rough: Perlin-noise ground, or None for a flat floor.
+        walled: whether there are side walls at all.
+    """
+
+    blocks: tuple[Block, ...] = ()
+    width: float = 3.0
+    num_robots: int = 2
+    wall_height: float = 0.5
+    wall_thickness: float = 0.04
+    difficulty: float = 1.0
+    rough: RoughGround | None = None
+    walled: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.difficulty <= 1.0:
+            raise ValueError(f"Track.difficulty: {self.difficulty} is not in [0, 1]")
+        if self.width <= 0:
+            raise ValueError(f"Track.width: {self.width} must be positive")
+
+    @property
+    def length(self) -> float:
+        """Sum of the blocks' lengths, m."""
+        return sum(_number(block.at(self.difficulty).length) for block in self.blocks)
+
+    def layout(self) -> Layout:
+        """Lays all blocks out; anchors are numbered over the whole track."""
+        walls, barriers, anchors, spawn = [], [], [], []
+        start = 0.0
+        for number, piece in enumerate(self.blocks):
+            fixed = piece.at(self.difficulty)
+            part = fixed.layout(start, self, number)
+            for wall in part.walls:
+                anchor = None if wall.anchor is None else wall.anchor + len(anchors)
+                walls.append(dataclasses.replace(wall, anchor=anchor))
+            barriers += part.barriers
+            anchors += part.anchors
+            spawn += part.spawn
+            start += _number(fixed.length)
+        if self.walled:
+            middle, half = start / 2, self.width / 2
+            barriers.append(Barrier("side_right", (middle, -half), (0.0, 1.0), start))
+            barriers.append(Barrier("side_left", (middle, half), (0.0, -1.0), start))
+        return Layout(tuple(walls), tuple(barriers), tuple(anchors), tuple(spawn))
+
+
+def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> Layout:
+    """Adds a track's ground and walls to a scene; returns the layout it was built from.
+
+    Moving walls become mocap bodies named `wall/<name>`, in the order of the layout's walls.
+    """
+    layout = track.layout()
+    world = spec.worldbody
+    _add_ground(spec, track, visual)
+    for barrier in layout.barriers:
+        normal = np.array([*barrier.normal, 0.0])
+        world.add_geom(
+            name=f"barrier/{barrier.name}", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1),
+            pos=(*barrier.point, 0.0), zaxis=normal, contype=WALL_BIT, conaffinity=0, group=3,
+        )  # fmt: skip
+        if visual:
+            half = (track.wall_thickness / 2, barrier.length / 2 + track.wall_thickness, track.wall_height / 2)
+            center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
+            yaw = np.arctan2(normal[1], normal[0])
+            world.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=center, rgba=WALL_COLOR, contype=0, conaffinity=0,
+                quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)), group=1,
+            )  # fmt: skip
+    for wall in layout.walls:
+        half = np.array(wall.size) / 2
+        if wall.anchor is None:
+            body, position = world, wall.center
+        else:
+            anchor = layout.anchors[wall.anchor]
+            start = np.array(wall.center) + (*anchor.position, 0.0)
+            body, position = world.add_body(name=f"wall/{wall.name}", mocap=True, pos=start), (0, 0, 0)
+        body.add_geom(
+            name=f"wall/{wall.name}", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=position, rgba=WALL_COLOR,
+            contype=WALL_BIT, conaffinity=0, group=1,
+        )  # fmt: skip
+    return layout
+
+
+def _add_ground(spec: mujoco.MjSpec, track: Track, visual: bool) -> None:
+    ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": FLOOR_COLOR, "group": 0}
+    if track.rough is None:
+        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
+        return
+    length, width = track.length, track.width
+    heights = track.rough.heights(length, width, track.difficulty)
+    top = max(float(heights.max()), 1e-6)
+    spec.add_hfield(
+        name="ground", nrow=heights.shape[0], ncol=heights.shape[1], size=(length / 2, width / 2, top, 0.1),
+        userdata=(heights / top).ravel(),
+    )  # fmt: skip
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=(length / 2, 0, 0), **ground
+    )

@@ -1,0 +1,1 @@
+"""The learner: pure JAX, no knowledge of any task."""

@@ -1,0 +1,137 @@
+"""Fair evaluation: the first episodes of every world, however long each of them takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.train.types import Memory, VectorEnv
+
+Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
+"""`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable by JAX."""
+
+
+@dataclass(frozen=True)
+class EvalResult:
+    """What an evaluation measured; means are over the steps of the counted episodes or over episodes."""
+
+    task: str
+    episodes: int
+    success_rate: float  # share of episodes, 0 to 1
+    average_step_reward: float  # mean over steps of the sum of reward terms
+    terms: dict[str, float]  # mean over steps of each reward term
+    mean_length: float  # steps per episode
+    diverged: int  # episodes ended by the guard against divergence
+    success: dict[str, float]  # other ends by name, mean over episodes, from metrics `success/<name>`
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values for JSON; further successes become `success/<name>`."""
+        values = {k: v for k, v in vars(self).items() if k != "success"}
+        return {**values, **{f"success/{name}": value for name, value in self.success.items()}}
+
+
+class _Progress(NamedTuple):
+    env_state: Any
+    memory: Memory
+    finished: jax.Array  # (N,) int32, episodes that the world has finished
+    steps: jax.Array  # (N,) int32, counted steps
+    step_sums: dict[str, jax.Array]  # (N,) each, over counted steps
+    end_sums: dict[str, jax.Array]  # (N,) each, over ends of counted episodes
+
+
+def evaluate(
+    env: VectorEnv,
+    act: Act,
+    episodes: int,
+    key: jax.Array,
+    *,
+    memory: Memory = (),
+    block: int = 50,
+    max_steps: int = 1_000_000,
+) -> EvalResult:
+    """Plays `episodes` episodes from fresh resets and returns their means.
+
+    World i counts its first `episodes // N` episodes (one more where i < `episodes % N`) and nothing
+    after: which episodes count does not depend on how long they are. `memory` is what `act` remembers at an
+    episode's start, leading axis N. `block` steps run per compiled call.
+    Raises ValueError for `episodes` < 1 or where the worlds do not finish in `max_steps` steps.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes: {episodes} is not allowed; it must be at least 1")
+    count = env.num_envs
+    quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
+    reset_key, key = jax.random.split(key)
+    progress = jax.jit(lambda k: _begin(env, k, memory))(reset_key)
+    run = jax.jit(lambda p, k: _run_block(env, act, p, k, memory, jnp.asarray(quota), block))
+    for done_steps in range(0, max_steps, block):
+        progress = run(progress, jax.random.fold_in(key, done_steps))
+        if np.all(np.asarray(progress.finished) >= quota):
+            return _result(env.name, episodes, progress)
+    raise ValueError(f"episodes: {episodes} episodes of {env.name} are not finished after {max_steps} steps")
+
+
+def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:
+    state = env.reset(key)
+    zeros = {name: jnp.zeros((env.num_envs,)) for name in state.metrics}
+    none = jnp.zeros((env.num_envs,), jnp.int32)
+    return _Progress(state, memory, none, none, zeros, zeros)
+
+
+def _run_block(
+    env: VectorEnv,
+    act: Act,
+    progress: _Progress,
+    key: jax.Array,
+    initial_memory: Memory,
+    quota: jax.Array,
+    block: int,
+) -> _Progress:
+    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
+        action, memory = act(p.env_state.obs, p.memory, step_key)
+        state = env.step(p.env_state, action)
+        done = state.terminated | state.truncated
+        counted = p.finished < quota
+
+        def restart(now: jax.Array, at_start: jax.Array) -> jax.Array:
+            return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), at_start, now)
+
+        step_sums = {n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()}
+        end_sums = {n: s + jnp.where(counted & done, state.metrics[n], 0.0) for n, s in p.end_sums.items()}
+        return (
+            _Progress(
+                env_state=state,
+                memory=jax.tree.map(restart, memory, initial_memory),
+                finished=p.finished + (counted & done),
+                steps=p.steps + counted,
+                step_sums=step_sums,
+                end_sums=end_sums,
+            ),
+            None,
+        )
+
+    progress, _ = jax.lax.scan(one_step, progress, jax.random.split(key, block))
+    return progress
+
+
+def _result(task: str, episodes: int, progress: _Progress) -> EvalResult:
+    def total(x: jax.Array) -> float:
+        return float(np.sum(np.asarray(x, np.float64)))
+
+    steps = total(progress.steps)
+    per_step = {name: total(x) / steps for name, x in progress.step_sums.items()}
+    per_episode = {name: total(x) / episodes for name, x in progress.end_sums.items()}
+    return EvalResult(
+        task=task,
+        episodes=episodes,
+        success_rate=per_episode.get("success", float("nan")),
+        average_step_reward=per_step.get("average_step_reward", float("nan")),
+        terms={n.removeprefix("reward/"): v for n, v in per_step.items() if n.startswith("reward/")},
+        mean_length=steps / episodes,
+        diverged=round(per_episode.get("diverged", 0.0) * episodes),
+        success={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
+    )

@@ -1,0 +1,179 @@
+"""What a training tells: a CSV file, TensorBoard events, progress on the terminal."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import math
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mqe_jax.train.checkpoint import write_atomically
+
+CSV_FILE = "metrics.csv"
+_PLAIN_SECONDS = 10.0
+
+
+class CsvLog:
+    """Rows of `metrics.csv`, one per update; those past `env_steps` are dropped when a run goes on."""
+
+    def __init__(self, run_dir: Path, env_steps: int) -> None:
+        self._path = run_dir / CSV_FILE
+        self._columns, rows = _read_rows(self._path, env_steps) if env_steps else ([], [])
+        self._file: TextIO | None = None
+        if self._columns:
+            self._rewrite(rows)
+        else:
+            self._path.unlink(missing_ok=True)
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Appends one row and flushes it; a name not seen before adds a column."""
+        new = [name for name in row if name not in self._columns]
+        if new and self._columns:
+            _, rows = _read_rows(self._path, None)
+            self._columns += new
+            self._rewrite(rows)
+        elif new:
+            self._columns = new
+            self._rewrite([])
+        if self._file is None:
+            self._file = self._path.open("a", encoding="utf-8", newline="")
+        csv.writer(self._file, lineterminator="\n").writerow(
+            [_text(row.get(name, math.nan)) for name in self._columns]
+        )
+        self._file.flush()
+
+    def close(self) -> None:
+        """Closes the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        self.close()
+        text = io.StringIO()
+        writer = csv.DictWriter(text, self._columns, restval="nan", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        write_atomically(self._path, text.getvalue().encode())
+
+
+def _text(value: float) -> str:
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.8g}"
+
+
+def _read_rows(path: Path, env_steps: int | None) -> tuple[list[str], list[dict[str, str]]]:
+    """Returns columns and whole rows up to `env_steps`; a half-written last row is left out."""
+    if not path.is_file():
+        return [], []
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        columns = list(reader.fieldnames or [])
+        rows = []
+        for row in reader:
+            try:
+                step = int(row["env_steps"])
+            except (KeyError, TypeError, ValueError):
+                continue
+            whole = None not in row and None not in row.values()
+            if whole and (env_steps is None or step <= env_steps):
+                rows.append(row)
+    return columns, rows
+
+
+class TensorBoardLog:
+    """TensorBoard events where tensorboardX is installed, otherwise nothing."""
+
+    def __init__(self, run_dir: Path, env_steps: int) -> None:
+        try:
+            module = importlib.import_module("tensorboardX")
+        except ImportError:
+            self._writer: Any = None
+        else:
+            purge = {"purge_step": env_steps + 1} if env_steps else {}
+            self._writer = module.SummaryWriter(str(run_dir / "tensorboard"), **purge)
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Adds every finite number of the row at its `env_steps`."""
+        if self._writer is None:
+            return
+        step = int(row["env_steps"])
+        for name, value in row.items():
+            if name != "env_steps" and math.isfinite(value):
+                self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Writes what is pending."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+class ProgressLog:
+    """Progress on standard error: a live bar on a terminal, otherwise a plain line every ten seconds."""
+
+    def __init__(self, title: str, env_steps: int, total_steps: int) -> None:
+        self._title, self._first, self._total = title, env_steps, total_steps
+        self._began = time.perf_counter()
+        self._last_line = -math.inf
+        self._bar: Progress | None = None
+        console = Console(stderr=True)
+        if console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[numbers]}"),
+                TimeRemainingColumn(),
+                console=console,
+            )
+            self._task = self._bar.add_task(title, total=total_steps, completed=env_steps, numbers="")
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Shows steps, reward, speed and the time left."""
+        step = int(row["env_steps"])
+        numbers = f"reward {row.get('average_step_reward', math.nan):.4g}"
+        if math.isfinite(row.get("success", math.nan)):
+            numbers += f", success {row['success']:.0%}"
+        numbers += f", {row['fps']:,.0f} steps/s"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=step, numbers=numbers)
+            return
+        now = time.perf_counter()
+        if now - self._last_line < _PLAIN_SECONDS and step < self._total:
+            return
+        self._last_line = now
+        speed = (step - self._first) / max(now - self._began, 1e-9)
+        left = max(self._total - step, 0) / max(speed, 1e-9)
+        print(
+            f"{self._title}: {step:,} of {self._total:,} steps, {numbers}, {_clock(left)} left",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"

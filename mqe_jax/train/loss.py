@@ -1,0 +1,105 @@
+"""The terms of the PPO loss, element by element; the caller takes the mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+_LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+    """Returns the log-density of a diagonal Gaussian per dimension, (..., D); their sum is the joint one."""
+    z = (action - mean) * jnp.exp(-log_std)
+    return -0.5 * jnp.square(z) - log_std - _LOG_SQRT_2PI
+
+
+def entropy(log_std: jax.Array) -> jax.Array:
+    """Returns the entropy of a diagonal Gaussian summed over the last axis: (..., D) -> (...), nats."""
+    return jnp.sum(log_std + 0.5 + _LOG_SQRT_2PI, axis=-1)
+
+
+def kl_divergence(
+    old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, log_std: jax.Array
+) -> jax.Array:
+    """Returns KL(old || new) of diagonal Gaussians summed over the last axis: (..., D) -> (...), nats."""
+    variance_ratio = jnp.exp(2.0 * (old_log_std - log_std))
+    shift = jnp.square((old_mean - mean) * jnp.exp(-log_std))
+    return jnp.sum(log_std - old_log_std + 0.5 * (variance_ratio + shift - 1.0), axis=-1)
+
+
+def clipped_surrogate(
+    log_ratio: jax.Array, advantage: jax.Array, clip: float, dual_clip: float | None = None
+) -> jax.Array:
+    """Returns the PPO policy loss per element, to be minimised; arguments broadcast.
+
+    loss = -min(ratio A, clip(ratio, 1 - clip, 1 + clip) A), ratio = exp(log_ratio). With `dual_clip` c > 1
+    the loss of a negative advantage is at most c |A|.
+    Source: Schulman et al., arXiv 1707.06347; dual clip: Ye et al., arXiv 1912.09729.
+    """
+    ratio = jnp.exp(log_ratio)
+    objective = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
+    if dual_clip is not None:
+        objective = jnp.where(advantage < 0.0, jnp.maximum(objective, dual_clip * advantage), objective)
+    return -objective
+
+
+def huber(error: jax.Array, delta: float) -> jax.Array:
+    """Returns error^2 / 2 within +-delta and the tangent line beyond it."""
+    size = jnp.abs(error)
+    return jnp.where(size <= delta, 0.5 * jnp.square(error), delta * (size - 0.5 * delta))
+
+
+def value_loss(
+    value: jax.Array,
+    old_value: jax.Array,
+    target: jax.Array,
+    clip: float | None,
+    huber_delta: float | None,
+) -> jax.Array:
+    """Returns the value loss per element: Huber (or half the square), clipped around `old_value`.
+
+    With `clip`, the larger of the loss of `value` and of `value` kept within `old_value` +- clip.
+    Shapes: all the same. Source: Yu et al., arXiv 2103.01955.
+    """
+
+    def loss(error: jax.Array) -> jax.Array:
+        return 0.5 * jnp.square(error) if huber_delta is None else huber(error, huber_delta)
+
+    free = loss(value - target)
+    if clip is None:
+        return free
+    kept = old_value + jnp.clip(value - old_value, -clip, clip)
+    return jnp.maximum(free, loss(kept - target))
+
+
+def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns one log-ratio per agent from log-densities per dimension: (..., A, D) -> (..., A, 1).
+
+    Source: MAPPO, Yu et al., arXiv 2103.01955.
+    """
+    return jnp.sum(new - old, axis=-1, keepdims=True)
+
+
+def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns one log-ratio per action dimension, as OpenRL clips them: (..., A, D) -> (..., A, D)."""
+    return new - old
+
+
+def ratio_joint(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns the log of the product of all agents' ratios: (..., A, D) -> (..., 1, 1).
+
+    Source: JRPO, PPO on the joint policy of a team.
+    """
+    return jnp.sum(new - old, axis=(-2, -1), keepdims=True)
+
+
+RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+    "agent": ratio_per_agent,
+    "dimension": ratio_per_dimension,
+    "joint": ratio_joint,
+}
+"""What PPO clips, by the name that the settings give it."""

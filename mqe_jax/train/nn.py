@@ -1,0 +1,101 @@
+"""Network layers as `init` / `apply` pairs over nested dicts of arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+Params = dict[str, Any]
+
+PRECISION = "highest"
+"""Matrix products of the learner: full float32 on every device, so that results do not depend on the card."""
+
+
+def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Array:
+    """Draws a matrix with orthonormal rows or columns, whichever are fewer, times `scale`.
+
+    Shapes: (n_in, n_out) float32. Source: Saxe et al., arXiv 1312.6120.
+    """
+    rows, columns = shape
+    normal = jax.random.normal(key, (max(shape), min(shape)), jnp.float32)
+    q, r = jnp.linalg.qr(normal)
+    q = q * jnp.where(jnp.diagonal(r) < 0, -1.0, 1.0)
+    return scale * (q if rows >= columns else q.T)
+
+
+def dense_init(key: jax.Array, n_in: int, n_out: int, scale: float = math.sqrt(2.0)) -> Params:
+    """Makes an affine layer: orthogonal weight (n_in, n_out) of gain `scale`, zero bias (n_out,)."""
+    return {"weight": orthogonal(key, (n_in, n_out), scale), "bias": jnp.zeros((n_out,), jnp.float32)}
+
+
+def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) -> jax.Array:
+    """Applies an affine layer to the last axis: (..., n_in) -> (..., n_out)."""
+    return jnp.matmul(x, params["weight"], precision=precision) + params["bias"]
+
+
+def mlp_init(
+    key: jax.Array, sizes: Sequence[int], *, scale: float = math.sqrt(2.0), final_scale: float = 1.0
+) -> Params:
+    """Makes a chain of affine layers `"0"`, `"1"`, ... of widths `sizes`; the last has gain `final_scale`.
+
+    Shapes: layer i is (sizes[i], sizes[i + 1]). `sizes` holds at least two widths.
+    """
+    if len(sizes) < 2:
+        raise ValueError(f"sizes: {tuple(sizes)}; at least an input and an output width are needed")
+    count = len(sizes) - 1
+    keys = jax.random.split(key, count)
+    return {
+        str(i): dense_init(keys[i], sizes[i], sizes[i + 1], final_scale if i == count - 1 else scale)
+        for i in range(count)
+    }
+
+
+def mlp(
+    params: Params,
+    x: jax.Array,
+    activation: Callable[[jax.Array], jax.Array] = jax.nn.relu,
+    *,
+    activate_last: bool = False,
+    precision: str | None = PRECISION,
+) -> jax.Array:
+    """Applies the layers in order with `activation` between them (and after the last with `activate_last`).
+
+    Shapes: (..., sizes[0]) -> (..., sizes[-1]).
+    """
+    count = len(params)
+    for i in range(count):
+        x = dense(params[str(i)], x, precision=precision)
+        if i < count - 1 or activate_last:
+            x = activation(x)
+    return x
+
+
+def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
+    """Makes a gated recurrent unit: gates reset, update, candidate side by side, each orthogonal.
+
+    Shapes: `input.weight` (n_in, 3 n_hidden), `hidden.weight` (n_hidden, 3 n_hidden), biases (3 n_hidden,).
+    """
+    keys = jax.random.split(key, 6)
+
+    def three_gates(gate_keys: jax.Array, rows: int) -> Params:
+        weight = jnp.concatenate([orthogonal(k, (rows, n_hidden), 1.0) for k in gate_keys], axis=1)
+        return {"weight": weight, "bias": jnp.zeros((3 * n_hidden,), jnp.float32)}
+
+    return {"input": three_gates(keys[:3], n_in), "hidden": three_gates(keys[3:], n_hidden)}
+
+
+def gru(params: Params, h: jax.Array, x: jax.Array, *, precision: str | None = PRECISION) -> jax.Array:
+    """Returns the next hidden state: h (..., n_hidden), x (..., n_in) -> (..., n_hidden).
+
+    Source: Cho et al., arXiv 1406.1078, with the reset gate applied after the hidden product.
+    """
+    reset_x, update_x, candidate_x = jnp.split(dense(params["input"], x, precision=precision), 3, axis=-1)
+    reset_h, update_h, candidate_h = jnp.split(dense(params["hidden"], h, precision=precision), 3, axis=-1)
+    reset = jax.nn.sigmoid(reset_x + reset_h)
+    update = jax.nn.sigmoid(update_x + update_h)
+    candidate = jnp.tanh(candidate_x + reset * candidate_h)
+    return (1.0 - update) * candidate + update * h

@@ -1,0 +1,69 @@
+"""The optimiser: Adam with clipping by global norm, as an `init` / `update` pair."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+PyTree = Any
+
+
+class AdamState(NamedTuple):
+    """First and second moments (shaped as the parameters) and the number of updates, () int32."""
+
+    mean: PyTree
+    square: PyTree
+    updates: jax.Array
+
+
+class Optimizer(NamedTuple):
+    """`init(params) -> state`; `update(grads, state, params, rate) -> (params, state, grad_norm)`."""
+
+    init: Callable[[PyTree], AdamState]
+    update: Callable[[PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]]
+
+
+def global_norm(tree: PyTree) -> jax.Array:
+    """Returns the Euclidean norm () of all leaves taken as one vector."""
+    return jnp.sqrt(sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.float32(0.0)))
+
+
+def adam(
+    eps: float = 1e-5, b1: float = 0.9, b2: float = 0.999, max_grad_norm: float | None = None
+) -> Optimizer:
+    """Makes Adam; gradients whose global norm exceeds `max_grad_norm` are first scaled down to it.
+
+    `grad_norm` is the norm before the scaling. Source: Kingma and Ba, arXiv 1412.6980.
+    """
+
+    def init(params: PyTree) -> AdamState:
+        return AdamState(
+            mean=jax.tree.map(jnp.zeros_like, params),
+            square=jax.tree.map(jnp.zeros_like, params),
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def update(
+        grads: PyTree, state: AdamState, params: PyTree, learning_rate: jax.Array | float
+    ) -> tuple[PyTree, AdamState, jax.Array]:
+        grad_norm = global_norm(grads)
+        if max_grad_norm is not None:
+            scale = jnp.minimum(1.0, max_grad_norm / jnp.maximum(grad_norm, 1e-12))
+            grads = jax.tree.map(lambda g: g * scale, grads)
+        updates = state.updates + 1
+        steps = updates.astype(jnp.float32)
+        mean = jax.tree.map(lambda m, g: b1 * m + (1.0 - b1) * g, state.mean, grads)
+        square = jax.tree.map(lambda s, g: b2 * s + (1.0 - b2) * jnp.square(g), state.square, grads)
+        mean_scale = 1.0 / (1.0 - b1**steps)
+        square_scale = 1.0 / (1.0 - b2**steps)
+
+        def move(p: jax.Array, m: jax.Array, s: jax.Array) -> jax.Array:
+            return p - learning_rate * (m * mean_scale) / (jnp.sqrt(s * square_scale) + eps)
+
+        params = jax.tree.map(move, params, mean, square)
+        return params, AdamState(mean, square, updates), grad_norm
+
+    return Optimizer(init, update)

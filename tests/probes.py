@@ -1,0 +1,143 @@
+"""Physics-free environments whose right answer is known, for the learner's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ProbeState:
+    """The fields that the learner reads; leading axis N. `hidden` (N, 1) is what the task remembers."""
+
+    hidden: jax.Array
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    key: jax.Array
+    step: jax.Array
+
+
+@dataclass(frozen=True)
+class Probe:
+    """N worlds with one random sign `hidden` per episode.
+
+    `show(hidden (N,), step (N,)) -> (N, F)` is what agents see besides their id;
+    `pay(hidden, action (N, A, D)) -> (N,)` the team's reward; `ends` (first, second world parity) the
+    lengths after which an episode ends; `terminates` says whether that is a termination.
+    """
+
+    show: Callable[[jax.Array, jax.Array], jax.Array]
+    pay: Callable[[jax.Array, jax.Array], jax.Array]
+    num_envs: int = 16
+    num_agents: int = 2
+    action_size: int = 1
+    features: int = 1
+    max_episode_steps: int = 4
+    odd_episode_steps: int | None = None
+    terminates: bool = True
+    name: str = "probe"
+
+    @property
+    def observation_size(self) -> int:
+        return self.num_agents + self.features
+
+    @property
+    def privileged_observation_size(self) -> int:
+        return self.features
+
+    def _observe(self, hidden: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+        seen = self.show(hidden, step)
+        ids = jnp.broadcast_to(jnp.eye(self.num_agents), (self.num_envs, self.num_agents, self.num_agents))
+        spread = jnp.broadcast_to(seen[:, None], (self.num_envs, self.num_agents, self.features))
+        return jnp.concatenate([ids, spread], axis=-1), seen
+
+    def reset(self, key: jax.Array) -> ProbeState:
+        key, draw = jax.random.split(key)
+        n = self.num_envs
+        hidden = jax.random.rademacher(draw, (n,), jnp.float32)
+        step = jnp.zeros((n,), jnp.int32)
+        obs, privileged = self._observe(hidden, step)
+        zero = jnp.zeros((n,))
+        return ProbeState(
+            hidden=hidden,
+            obs=obs,
+            privileged_obs=privileged,
+            final_obs=obs,
+            final_privileged_obs=privileged,
+            reward=jnp.zeros((n, self.num_agents)),
+            terminated=zero > 0,
+            truncated=zero > 0,
+            metrics={"reward/pay": zero, "average_step_reward": zero, "success": zero, "diverged": zero},
+            key=key,
+            step=step,
+        )
+
+    def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
+        key, draw = jax.random.split(state.key)
+        pay = self.pay(state.hidden, action)
+        step = state.step + 1
+        odd = self.odd_episode_steps or self.max_episode_steps
+        limit = jnp.where(jnp.arange(self.num_envs) % 2, odd, self.max_episode_steps)
+        done = step >= limit
+        final_obs, final_privileged = self._observe(state.hidden, step)
+        hidden = jnp.where(done, jax.random.rademacher(draw, done.shape, jnp.float32), state.hidden)
+        step = jnp.where(done, 0, step)
+        obs, privileged = self._observe(hidden, step)
+        short = done & (limit == jnp.minimum(odd, self.max_episode_steps))
+        return ProbeState(
+            hidden=hidden,
+            obs=obs,
+            privileged_obs=privileged,
+            final_obs=final_obs,
+            final_privileged_obs=final_privileged,
+            reward=jnp.broadcast_to(pay[:, None], (self.num_envs, self.num_agents)),
+            terminated=done & self.terminates,
+            truncated=done & (not self.terminates),
+            metrics={
+                "reward/pay": pay,
+                "average_step_reward": pay,
+                "success": short.astype(jnp.float32),
+                "diverged": jnp.zeros(done.shape),
+            },
+            key=key,
+            step=step,
+        )
+
+
+def constant_feature(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    return jnp.ones((hidden.shape[0], 1))
+
+
+def show_hidden(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    return hidden[:, None]
+
+
+def show_hidden_first(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    return jnp.where(step == 0, hidden, 0.0)[:, None]
+
+
+def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    return jnp.ones_like(hidden)
+
+
+def pay_near_half(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    return -jnp.mean(jnp.square(action - 0.5), axis=(1, 2))
+
+
+def pay_near_hidden(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    return -jnp.mean(jnp.square(action - 0.5 * hidden[:, None, None]), axis=(1, 2))
+
+
+def pay_opposite(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays most when agent 0 does +0.5 and agent 1 -0.5."""
+    return -jnp.mean(jnp.square(action - jnp.array([[0.5], [-0.5]])), axis=(1, 2))
