@@ -276,6 +276,8 @@ class RobotIndex:
         trunk_geom: trunk shape ids (A,).
         geoms: collision shape ids of each robot (A, G).
         trunk_force: addresses in sensordata of the trunk's strongest contact force (A, 3), contact frame, N.
+        foot_force: addresses of each foot's strongest contact force (A, 4, 3), contact frame, N; (0, 4, 3) unless
+            the scene has foot sensors.
         touch: (robot, robot, address in sensordata) of each robot-robot contact counter (T, 3).
     """
 
@@ -290,6 +292,7 @@ class RobotIndex:
     trunk_geom: np.ndarray
     geoms: np.ndarray
     trunk_force: np.ndarray
+    foot_force: np.ndarray
     touch: np.ndarray
 
     @property
@@ -303,17 +306,19 @@ def prefix(robot: int) -> str:
     return f"robot{robot}/"
 
 
-def add_sensors(spec: mujoco.MjSpec, num_robots: int, contacts: Contacts) -> None:
-    """Adds the trunk contact force and robot-robot contact sensors, which all engines compute alike."""
+def add_sensors(spec: mujoco.MjSpec, num_robots: int, contacts: Contacts, *, feet: bool = False) -> None:
+    """Adds the trunk (and foot) contact force and robot-robot contact sensors, which all engines compute alike."""
     geom = mujoco.mjtObj.mjOBJ_GEOM
     force_bits, found_bits, strongest = 1 << 1, 1 << 0, 2
     if "trunk" not in contacts.parts():
         raise ValueError("Contacts: the trunk must collide with something; add 'trunk' to ground, wall, robot or object")
+    shapes = ["trunk"] + [f"{leg}_foot" for leg in LEGS if feet]
     for robot in range(num_robots):
-        spec.add_sensor(
-            name=f"{prefix(robot)}trunk_force", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom,
-            objname=f"{prefix(robot)}trunk", intprm=(force_bits, strongest, 1),
-        )  # fmt: skip
+        for shape in shapes:
+            spec.add_sensor(
+                name=f"{prefix(robot)}{shape}_force", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom,
+                objname=prefix(robot) + shape, intprm=(force_bits, strongest, 1),
+            )  # fmt: skip
     for name, first, second in _touch_pairs(num_robots, contacts):
         spec.add_sensor(
             name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname=first, reftype=geom,
@@ -334,10 +339,10 @@ def _touch_pairs(num_robots: int, contacts: Contacts) -> list[tuple[str, str, st
     return pairs
 
 
-def index_robots(model: mujoco.MjModel, num_robots: int, contacts: Contacts) -> RobotIndex:
+def index_robots(model: mujoco.MjModel, num_robots: int, contacts: Contacts, *, feet: bool = False) -> RobotIndex:
     """Looks up by name, once, where every robot of a compiled model is."""
     base_qpos, base_qvel, joint_qpos, joint_qvel, actuator, trunk, bodies = ([] for _ in range(7))
-    feet, trunk_geom, geoms, force = [], [], [], []
+    foot_geom, trunk_geom, geoms, force, foot_force = [], [], [], [], []
     body_names = ["trunk"] + [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
     for robot in range(num_robots):
         name = prefix(robot)
@@ -352,8 +357,10 @@ def index_robots(model: mujoco.MjModel, num_robots: int, contacts: Contacts) -> 
         shapes = ["trunk"] + [f"{leg}_{part}" for part in PARTS[1:] if part in contacts.parts() for leg in LEGS]
         geoms.append([model.geom(name + shape).id for shape in shapes])
         trunk_geom.append(model.geom(name + "trunk").id)
-        feet.append([model.geom(f"{name}{leg}_foot").id for leg in LEGS])
+        foot_geom.append([model.geom(f"{name}{leg}_foot").id for leg in LEGS])
         force.append(model.sensor(name + "trunk_force").adr[0] + np.arange(3))
+        if feet:
+            foot_force.append([model.sensor(f"{name}{leg}_foot_force").adr[0] + np.arange(3) for leg in LEGS])
     touch = [
         (*map(int, sensor.split("/")[1:3]), model.sensor(sensor).adr[0])
         for sensor, _, _ in _touch_pairs(num_robots, contacts)
@@ -361,8 +368,8 @@ def index_robots(model: mujoco.MjModel, num_robots: int, contacts: Contacts) -> 
     as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
     return RobotIndex(
         as_int(base_qpos), as_int(base_qvel), as_int(joint_qpos), as_int(joint_qvel), as_int(actuator),
-        as_int(trunk), as_int(bodies), as_int(feet), as_int(trunk_geom), as_int(geoms), as_int(force),
-        as_int(touch).reshape(-1, 3),
+        as_int(trunk), as_int(bodies), as_int(foot_geom), as_int(trunk_geom), as_int(geoms), as_int(force),
+        as_int(foot_force).reshape(-1, 4, 3), as_int(touch).reshape(-1, 3),
     )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ class Scene:
         objects: called in order to add further bodies.
         friction: sliding friction of the robots' shapes and the ground.
         torque_control: the actuators take torques (N m) instead of PD joint targets (rad).
+        foot_sensors: whether the feet's contact forces are measured too.
         timestep: physics step, s.
         solver_iterations: at most so many Newton iterations per physics step.
         line_search_iterations: at most so many line search steps per iteration.
@@ -41,6 +42,7 @@ class Scene:
     objects: tuple[AddBodies, ...] = ()
     friction: float = 1.0
     torque_control: bool = False
+    foot_sensors: bool = False
     timestep: float = 0.005
     solver_iterations: int = 4
     line_search_iterations: int = 8
@@ -106,7 +108,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
         spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
     for add in scene.objects:
         add(spec, visual)
-    robots.add_sensors(spec, scene.num_robots, scene.contacts)
+    robots.add_sensors(spec, scene.num_robots, scene.contacts, feet=scene.foot_sensors)
     if visual:
         spec.worldbody.add_light(
             pos=(scene.track.length / 2, 0, 8), dir=(0.2, 0.3, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -126,7 +128,7 @@ def compile_scene(scene: Scene) -> CompiledScene:
     return CompiledScene(
         scene=scene,
         model=model,
-        robot=robots.index_robots(model, scene.num_robots, scene.contacts),
+        robot=robots.index_robots(model, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),
         mocap_anchor=np.array([wall.anchor for wall in moving], np.int32),

@@ -1,0 +1,542 @@
+"""The environment in which the walk policy is trained and measured: one Go1 that follows commands.
+
+The ground is flat and the slope is in the gravity: a robot on an endless slope of angle t is the same, in the
+frame of the slope, as one on flat ground under gravity turned by t. So every world has a slope of its own
+without geometry of its own. All positions and velocities here are in the slope's frame.
+
+Rewards and randomisation follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238): positive terms times
+the exponential of the sum of the negative ones.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax import robot as go1
+from mqe_jax import walk_policy
+from mqe_jax.physics import Physics
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.terrain import Plane, Track
+from mqe_jax.walk_policy import WalkMemory
+
+GRAVITY = 9.81  # m/s^2
+DT = walk_policy.STEP
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkRewards:
+    """Weights of the reward terms; the first four are positive terms, the others go into the exponent."""
+
+    track_velocity: float = 0.6
+    track_mean_velocity: float = 0.7
+    track_yaw: float = 0.3
+    track_mean_yaw: float = 0.4
+    swing_force: float = -4.0
+    stance_speed: float = -4.0
+    body_height: float = -10.0
+    orientation: float = -5.0
+    raibert: float = -10.0
+    footswing_height: float = -30.0
+    foot_slip: float = -0.04
+    smoothness: float = -0.1
+    second_smoothness: float = -0.1
+    torque: float = -1e-4
+    joint_velocity: float = -1e-4
+    joint_limit: float = -10.0
+    low_knee: float = -5.0
+    vertical_speed: float = -0.02
+    roll_pitch_rate: float = -0.001
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkTask:
+    """Numbers of the walking task.
+
+    Attributes:
+        rewards: weights.
+        episode_length: time limit, s.
+        command_period: a new command, slope and force are drawn this often, s; 0 keeps the first.
+        body_height: of the trunk's origin at zero height command, m.
+        max_vx, max_vy, max_yaw: ranges of the velocity commands, m/s, m/s, rad/s.
+        slope: greatest slope, rad.
+        force: greatest sustained horizontal force on the trunk, N.
+        kick: greatest sudden change of the trunk's velocity, m/s.
+        kick_period: mean time between kicks, s.
+        randomize: whether friction, payload, centre of mass, motors and observations are randomised.
+        solver_iterations: of the physics.
+    """
+
+    rewards: WalkRewards = WalkRewards()
+    episode_length: float = 20.0
+    command_period: float = 8.0
+    body_height: float = 0.30
+    max_vx: float = 1.2
+    max_vy: float = 0.7
+    max_yaw: float = 1.2
+    slope: float = 0.32
+    force: float = 40.0
+    kick: float = 0.9
+    kick_period: float = 4.0
+    randomize: bool = True
+    solver_iterations: int = 4
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Condition:
+    """What one world asks of the robot.
+
+    Attributes:
+        commands: of the walk policy (15,).
+        slope: rise of the ground along x and y (2,), rad: it climbs towards +x for a positive first number.
+        force: sustained force on the trunk (2,), N, along its heading and to its left, horizontal.
+        kick: sudden change of the trunk's velocity at each kick (), m/s.
+    """
+
+    commands: jax.Array
+    slope: jax.Array
+    force: jax.Array
+    kick: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """How one world's robot differs from the model.
+
+    Attributes:
+        friction: sliding friction of its shapes ().
+        payload: extra mass of the trunk (), kg.
+        com: shift of the trunk's centre of mass (3,), m.
+        strength: factor on the motors' torques ().
+        motor_offset: error of the joint targets (12,), rad.
+    """
+
+    friction: jax.Array
+    payload: jax.Array
+    com: jax.Array
+    strength: jax.Array
+    motor_offset: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class WalkState:
+    """State of one world.
+
+    Attributes:
+        data: physics state.
+        obs: the walk policy's observation (70,), noisy if randomised.
+        privileged_obs: for the critic (P,).
+        latent_target: what the adaptation network should estimate (2,): friction and payload, scaled.
+        reward: ().
+        terminated: () bool, fallen.
+        truncated: () bool, time limit.
+        metrics: reward terms and tracking errors, () each.
+        condition: what is asked.
+        slope: the slope now, which follows the condition's slowly (2,), rad.
+        force: the force now, likewise (2,), N.
+        body: how the robot differs from the model.
+        memory: gait cycle and last actions; its history is empty.
+        mean_error: exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s.
+        step: steps since the reset () int32; may start anywhere.
+        age: steps since the reset () int32.
+        level: how much of the task's difficulty is on (), in [0, 1].
+        key: random key.
+    """
+
+    data: mjx.Data
+    obs: jax.Array
+    privileged_obs: jax.Array
+    latent_target: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    condition: Condition
+    slope: jax.Array
+    force: jax.Array
+    body: Body
+    memory: WalkMemory
+    mean_error: jax.Array
+    step: jax.Array
+    age: jax.Array
+    level: jax.Array
+    key: jax.Array
+
+
+class WalkEnv:
+    """One Go1 that follows commands on a slope under forces; batch with `jax.vmap`."""
+
+    def __init__(self, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
+        self.task = task or WalkTask()
+        scene = Scene(
+            Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1,
+            contacts=Contacts(ground=("trunk", "foot"), wall=(), robot=(), object=()), foot_sensors=True,
+            solver_iterations=self.task.solver_iterations,
+        )  # fmt: skip
+        self.compiled = compile_scene(scene)
+        self.physics = Physics(
+            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, rows_per_env=44
+        )
+        self.index = self.compiled.robot
+        self._mass = np.asarray(self.compiled.model.body_mass)
+
+    @property
+    def privileged_size(self) -> int:
+        """Length of the critic's observation."""
+        return jax.eval_shape(self.reset, jax.random.PRNGKey(0)).privileged_obs.shape[0]
+
+    # -- drawing ------------------------------------------------------------------------------------------------
+
+    def draw_condition(self, key: jax.Array, level: jax.Array) -> Condition:
+        """Draws what a training world asks; `level` in [0, 1] scales slopes, forces and kicks."""
+        task = self.task
+        keys = iter(jax.random.split(key, 24))
+        uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
+        chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
+        velocity = jnp.stack(
+            [uniform(-task.max_vx, task.max_vx), uniform(-task.max_vy, task.max_vy), uniform(-task.max_yaw, task.max_yaw)]
+        )
+        velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
+        velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
+        gaits = np.array([walk_policy.GAITS[name] for name in ("trot", "pace", "bound", "pronk")], np.float32)
+        gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.64, 0.28, 0.04, 0.04])))]
+        varied = chance(0.35)
+        vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
+        default = walk_policy.COMMAND_DEFAULT
+        rest = [
+            vary(-0.12, 0.06, default[3]), vary(2.0, 4.0, default[4]), *gait, default[8], vary(0.03, 0.16, default[9]),
+            vary(-0.25, 0.25, default[10]), vary(-0.1, 0.1, default[11]), vary(0.2, 0.35, default[12]),
+            vary(0.36, 0.44, default[13]), default[14],
+        ]  # fmt: skip
+        angle = uniform(-jnp.pi, jnp.pi)
+        slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * level
+        direction = uniform(-jnp.pi, jnp.pi)
+        force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * level
+        return Condition(
+            commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
+            slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
+            force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
+            kick=task.kick * level,
+        )
+
+    def draw_body(self, key: jax.Array) -> Body:
+        """Draws one world's robot: the model's own, or a randomised one."""
+        if not self.task.randomize:
+            one, zero = jnp.ones(()), jnp.zeros(())
+            return Body(one, zero, jnp.zeros(3), one, jnp.zeros(go1.NUM_JOINTS))
+        f, p, c, s, o = jax.random.split(key, 5)
+        return Body(
+            friction=jax.random.uniform(f, (), minval=0.35, maxval=1.8),
+            payload=jax.random.uniform(p, (), minval=-1.0, maxval=2.5),
+            com=jax.random.uniform(c, (3,), minval=-1.0, maxval=1.0) * jnp.array([0.03, 0.02, 0.02]),
+            strength=jax.random.uniform(s, (), minval=0.9, maxval=1.1),
+            motor_offset=jax.random.uniform(o, (go1.NUM_JOINTS,), minval=-0.02, maxval=0.02),
+        )
+
+    # -- reset and step -----------------------------------------------------------------------------------------
+
+    def reset(
+        self, key: jax.Array, condition: Condition | None = None, level: jax.Array | float = 1.0, step: jax.Array | int = 0
+    ) -> WalkState:
+        """Returns a fresh state; without a condition one is drawn."""
+        next_key, condition_key, body_key, pose_key, noise_key = jax.random.split(key, 5)
+        level = jnp.asarray(level, jnp.float32)
+        if condition is None:
+            condition = self.draw_condition(condition_key, level)
+        body = self.draw_body(body_key)
+        a, b, c, d = jax.random.split(pose_key, 4)
+        model, index = self.compiled.model, self.index
+        yaw = jax.random.uniform(a, (), minval=-jnp.pi, maxval=jnp.pi)
+        # A given condition is a measurement: start along +x so that slopes and headings mean what they say.
+        yaw = jnp.where(self.task.command_period > 0, yaw, 0.0)
+        joints = go1.DEFAULT_JOINTS * jax.random.uniform(b, (go1.NUM_JOINTS,), minval=0.7, maxval=1.3)
+        height = jax.random.uniform(c, (), minval=0.33, maxval=0.42)
+        quaternion = go1.euler_to_quaternion(jnp.stack([jnp.zeros(()), jnp.zeros(()), yaw]))
+        qpos = jnp.zeros(model.nq).at[index.joint_qpos[0]].set(joints)
+        qpos = qpos.at[index.base_qpos[0]].set(jnp.concatenate([jnp.stack([0.0, 0.0, height]), quaternion]))
+        speed = jax.random.uniform(d, (6,), minval=-0.5, maxval=0.5)
+        qvel = jnp.zeros(model.nv).at[index.base_qvel[0]].set(speed)
+        ctrl = jnp.zeros(model.nu).at[index.actuator[0]].set(go1.DEFAULT_JOINTS)
+        data = self.physics.init(qpos, qvel, jnp.zeros((0, 3)), ctrl)
+        zero, zeros = jnp.zeros(()), jnp.zeros(go1.NUM_JOINTS)
+        memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), zeros, zeros, zero)
+        state = WalkState(
+            data=data, obs=jnp.zeros(walk_policy.OBSERVATION_SIZE), privileged_obs=zero, reward=zero,
+            latent_target=jnp.stack([body.friction - 1.0, body.payload / 2.0]),
+            terminated=jnp.zeros((), bool), truncated=jnp.zeros((), bool), metrics=_zero_metrics(self.task.rewards),
+            condition=condition, slope=condition.slope, force=condition.force, body=body, memory=memory,
+            mean_error=jnp.zeros(3), step=jnp.asarray(step, jnp.int32), age=jnp.zeros((), jnp.int32), level=level,
+            key=next_key,
+        )  # fmt: skip
+        return self._observed(state, noise_key)
+
+    def step(self, state: WalkState, action: jax.Array) -> WalkState:
+        """Advances by one policy step with an action (12,)."""
+        task, index = self.task, self.index
+        key, kick_key, kick_time, kick_size, condition_key, noise_key = jax.random.split(state.key, 6)
+        action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
+        target = walk_policy.joint_targets(action)
+        previous_target = walk_policy.joint_targets(state.memory.action)
+        before_target = walk_policy.joint_targets(state.memory.previous_action)
+
+        # Forces follow their condition within about half a second.
+        slope = state.slope + jnp.clip(state.condition.slope - state.slope, -0.02, 0.02)
+        force = state.force + jnp.clip(state.condition.force - state.force, -2.0, 2.0)
+        if task.command_period > 0:
+            kicked = jax.random.bernoulli(kick_time, DT / task.kick_period)
+            size = state.condition.kick * jax.random.uniform(kick_size, ())
+        else:
+            kicked = (state.age + 1) % round(task.kick_period / DT) == 0
+            size = state.condition.kick
+        angle = jax.random.uniform(kick_key, (), maxval=2 * jnp.pi)
+        push = jnp.where(kicked, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
+
+        ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.body.motor_offset)
+        data = self.physics.step(
+            data, ctrl, fields=self._fields(state.body), xfrc_applied=self._forces(data, state.body, slope, force)
+        )
+        readings = self.read(data)
+        commands = state.condition.commands
+        velocity, yaw_rate = heading_velocity(readings)
+        error = jnp.stack([velocity[0] - commands[0], velocity[1] - commands[1], yaw_rate - commands[2]])
+        mean_error = state.mean_error + 0.04 * (error - state.mean_error)
+        gait = walk_policy.advance_gait(state.memory.gait, commands)
+        memory = WalkMemory(state.memory.history, action, state.memory.action, gait)
+
+        inputs = RewardInputs(
+            readings=readings, commands=commands, error=error, mean_error=mean_error, gait=gait, target=target,
+            previous_target=previous_target, before_target=before_target, body_height=task.body_height,
+            foot_force=self.foot_force(data), strength=state.body.strength,
+        )  # fmt: skip
+        terms = reward_terms(inputs)
+        reward, weighted = combine(terms, task.rewards)
+
+        up = go1.rotate_inverse(readings.quaternion, jnp.array([0.0, 0.0, 1.0]))[0]
+        finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+        fallen = (readings.trunk_force[0] > 1.0) | (up[2] < 0.5) | (readings.position_w[0, 2] < 0.1) | ~finite
+        step, age = state.step + 1, state.age + 1
+        metrics = {f"reward/{name}": value for name, value in weighted.items()} | {
+            "error_vx": jnp.square(error[0]), "error_vy": jnp.square(error[1]), "error_yaw": jnp.square(error[2]),
+        }  # fmt: skip
+        condition = state.condition
+        if task.command_period > 0:
+            renewed = step % round(task.command_period / DT) == 0
+            fresh = self.draw_condition(condition_key, state.level)
+            condition = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, condition)
+            mean_error = jnp.where(renewed, 0.0, mean_error)
+        state = dataclasses.replace(
+            state, data=data, reward=jnp.where(finite, reward, 0.0), terminated=fallen,
+            truncated=~fallen & (step >= round(task.episode_length / DT)), metrics=metrics, condition=condition,
+            slope=slope, force=force, memory=memory, mean_error=mean_error, step=step, age=age, key=key,
+        )  # fmt: skip
+        return self._observed(state, noise_key)
+
+    # -- readings -----------------------------------------------------------------------------------------------
+
+    def read(self, data: mjx.Data) -> RobotReadings:
+        """Reads the robot."""
+        return go1.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
+
+    def foot_force(self, data: mjx.Data) -> jax.Array:
+        """Strongest contact force on each foot (4,), N."""
+        return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
+
+    def _fields(self, body: Body) -> dict[str, jax.Array]:
+        if not self.task.randomize:
+            return {}
+        model, index = self.compiled.model, self.index
+        trunk = int(index.trunk_body[0])
+        friction = jnp.asarray(model.geom_friction, jnp.float32).at[index.geoms[0], 0].set(body.friction)
+        mass = jnp.asarray(model.body_mass, jnp.float32).at[trunk].add(body.payload)
+        com = jnp.asarray(model.body_ipos, jnp.float32).at[trunk].add(body.com)
+        gain = jnp.asarray(model.actuator_gainprm, jnp.float32) * body.strength
+        bias = jnp.asarray(model.actuator_biasprm, jnp.float32) * body.strength
+        return {
+            "geom_friction": friction, "body_mass": mass, "body_ipos": com, "actuator_gainprm": gain,
+            "actuator_biasprm": bias,
+        }  # fmt: skip
+
+    def _forces(self, data: mjx.Data, body: Body, slope: jax.Array, force: jax.Array) -> jax.Array:
+        """External forces on all bodies (nbody, 6): gravity's turn by the slope, and the force on the trunk."""
+        trunk = int(self.index.trunk_body[0])
+        turn = gravity_w(slope) - jnp.array([0.0, 0.0, -GRAVITY])
+        mass = jnp.asarray(self._mass, jnp.float32).at[trunk].add(body.payload)
+        quaternion = data.qpos[self.index.base_qpos[0, 3:]]
+        yaw = go1.quaternion_to_euler(quaternion)[2]
+        along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+        left = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)])
+        forces = jnp.zeros((len(self._mass), 6)).at[:, :3].set(mass[:, None] * turn)
+        return forces.at[trunk, :2].add(force[0] * along + force[1] * left)
+
+    def _observed(self, state: WalkState, key: jax.Array) -> WalkState:
+        readings = self.read(state.data)
+        quaternion = readings.quaternion[0]
+        gravity = go1.rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
+        joint_position, joint_velocity = readings.joint_position[0], readings.joint_velocity[0]
+        clean = walk_policy.observe(state.memory, state.condition.commands, gravity, joint_position, joint_velocity)
+        obs = clean
+        if self.task.randomize:
+            a, b, c = jax.random.split(key, 3)
+            obs = walk_policy.observe(
+                state.memory, state.condition.commands,
+                gravity + 0.02 * jax.random.normal(a, (3,)),
+                joint_position + 0.005 * jax.random.normal(b, (go1.NUM_JOINTS,)),
+                joint_velocity + 0.5 * jax.random.normal(c, (go1.NUM_JOINTS,)),
+            )  # fmt: skip
+        velocity = go1.rotate_inverse(quaternion, readings.linear_velocity_w[0])
+        up = go1.rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
+        feet = go1.foot_positions(joint_position)
+        foot_height = go1.rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
+        phases = walk_policy.foot_phases(state.memory.gait, state.condition.commands)
+        body = state.body
+        privileged = jnp.concatenate([
+            clean, 2.0 * velocity, 0.25 * readings.angular_velocity_b[0], up, 5.0 * readings.position_w[0, 2:] - 1.5,
+            10.0 * foot_height, jnp.cos(2 * jnp.pi * phases), jnp.tanh(self.foot_force(state.data) / 50.0),
+            2.0 * state.mean_error, state.force / 20.0, state.slope * 4.0, body.com * 20.0,
+            jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
+        ])  # fmt: skip
+        obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))
+        privileged = jnp.nan_to_num(jnp.clip(privileged, -100.0, 100.0))
+        return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
+
+    def autoreset(self, state: WalkState) -> WalkState:
+        """Replaces a finished state by a fresh one, keeping what tells how it finished."""
+        done = state.terminated | state.truncated
+        key, reset_key = jax.random.split(state.key)
+        fresh = self.reset(reset_key, None, state.level)
+        data = self.physics.merge(done, fresh.data, state.data)
+        keep = {
+            name: getattr(state, name) for name in ("reward", "terminated", "truncated", "metrics", "level")
+        }  # fmt: skip
+        others = [field.name for field in dataclasses.fields(state) if field.name not in ("data", "key", *keep)]
+        pick = lambda new, old: jnp.where(done, new, old)  # noqa: E731
+        merged = {name: jax.tree.map(pick, getattr(fresh, name), getattr(state, name)) for name in others}
+        return WalkState(data=data, key=key, **keep, **merged)
+
+
+def gravity_w(slope: jax.Array) -> jax.Array:
+    """Gravity (3,), m/s^2, in the frame of a ground that rises by `slope` (2,), rad, along x and y."""
+    angle = jnp.linalg.norm(slope + 1e-12)
+    along = slope / jnp.maximum(angle, 1e-9)
+    return GRAVITY * jnp.concatenate([-jnp.sin(angle) * along, -jnp.cos(angle)[None]])
+
+
+def heading_velocity(readings: RobotReadings) -> tuple[jax.Array, jax.Array]:
+    """Returns the first robot's velocity along its heading and to its left (2,), m/s, and yaw rate (), rad/s."""
+    velocity = go1.rotate_inverse(readings.quaternion[0], readings.linear_velocity_w[0])
+    return velocity[:2], readings.angular_velocity_b[0, 2]
+
+
+# -- rewards ----------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardInputs:
+    """What the reward terms are functions of; see `WalkState` for shapes and units."""
+
+    readings: RobotReadings
+    commands: jax.Array
+    error: jax.Array
+    mean_error: jax.Array
+    gait: jax.Array
+    target: jax.Array
+    previous_target: jax.Array
+    before_target: jax.Array
+    body_height: float
+    foot_force: jax.Array
+    strength: jax.Array
+
+
+def desired_contact(phases: jax.Array, width: float = 0.07) -> jax.Array:
+    """Returns how much each foot should be on the ground, in [0, 1], from its phase (4,): smooth at the switches."""
+    cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=width)  # noqa: E731
+    return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
+
+
+def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
+    """Computes every term (), named as its weight in `WalkRewards`."""
+    readings, commands = inputs.readings, inputs.commands
+    quaternion, height = readings.quaternion[0], readings.position_w[0, 2]
+    joint_position, joint_velocity = readings.joint_position[0], readings.joint_velocity[0]
+    phases = walk_policy.foot_phases(inputs.gait, commands)
+    contact = desired_contact(phases)
+    velocity_b = go1.rotate_inverse(quaternion, readings.linear_velocity_w[0])
+    rate = readings.angular_velocity_b[0]
+
+    feet, feet_velocity = jax.jvp(go1.foot_positions, (joint_position,), (joint_velocity,))
+    feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
+    turn = jnp.broadcast_to(quaternion, (4, 4))
+    feet_w, feet_velocity = go1.rotate(turn, feet), go1.rotate(turn, feet_velocity)
+    foot_height = feet_w[:, 2] + height
+    yaw = go1.quaternion_to_euler(quaternion)[2]
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    feet_heading = jnp.stack([cos * feet_w[:, 0] + sin * feet_w[:, 1], -sin * feet_w[:, 0] + cos * feet_w[:, 1]], -1)
+
+    # Where the gait wants the feet: the stance corners, shifted by half a stance's travel over the cycle.
+    stance = jnp.stack(
+        [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]], -1
+    )
+    shift = jnp.abs(1.0 - 2.0 * phases) - 0.5
+    speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)
+    place = stance + shift[:, None] * speed * 0.5 / commands[4]
+    swing = 1.0 - jnp.abs(1.0 - 2.0 * jnp.clip(2.0 * phases - 1.0, 0.0, 1.0))
+    wanted_height = commands[9] * swing + go1.FOOT_RADIUS
+
+    up = go1.rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
+    tilt = go1.euler_to_quaternion(jnp.stack([commands[11], commands[10], jnp.zeros(())]))
+    wanted_up = go1.rotate_inverse(tilt, jnp.array([0.0, 0.0, 1.0]))
+    torque = inputs.strength * (go1.KP * (inputs.target - joint_position) - go1.KD * joint_velocity)
+    torque = jnp.clip(torque, -go1.TORQUE_LIMIT, go1.TORQUE_LIMIT)
+    margin = 0.05 * (go1.JOINT_UPPER - go1.JOINT_LOWER)
+    beyond = jnp.maximum(joint_position - go1.JOINT_UPPER + margin, 0)
+    beyond += jnp.maximum(go1.JOINT_LOWER + margin - joint_position, 0)
+    knees = go1.rotate(turn, go1.knee_positions(joint_position))[:, 2] + height
+    on_ground = inputs.foot_force > 1.0
+    foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
+    return {
+        "track_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.error[:2])) / 0.25),
+        "track_mean_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.mean_error[:2])) / 0.02),
+        "track_yaw": jnp.exp(-jnp.square(inputs.error[2]) / 0.25),
+        "track_mean_yaw": jnp.exp(-jnp.square(inputs.mean_error[2]) / 0.04),
+        "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
+        "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
+        "body_height": jnp.square(height - inputs.body_height - commands[3]),
+        "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
+        "raibert": jnp.sum(jnp.square(feet_heading - place)),
+        "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
+        "foot_slip": jnp.sum(on_ground * jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1)),
+        "smoothness": jnp.sum(jnp.square(inputs.target - inputs.previous_target)),
+        "second_smoothness": jnp.sum(jnp.square(inputs.target - 2 * inputs.previous_target + inputs.before_target)),
+        "torque": jnp.sum(jnp.square(torque)),
+        "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
+        "joint_limit": jnp.sum(beyond),
+        "low_knee": jnp.sum(jnp.maximum(0.06 - knees, 0.0) > 0).astype(jnp.float32),
+        "vertical_speed": jnp.square(readings.linear_velocity_w[0, 2]),
+        "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
+    }
+
+
+POSITIVE_TERMS = ("track_velocity", "track_mean_velocity", "track_yaw", "track_mean_yaw")
+
+
+def combine(terms: dict[str, jax.Array], weights: WalkRewards) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Returns the reward () and the weighted terms: (sum of positive) x exp(sum of negative), times the step."""
+    weighted = {name: getattr(weights, name) * value for name, value in terms.items()}
+    positive = sum(weighted[name] for name in POSITIVE_TERMS)
+    negative = sum(value for name, value in weighted.items() if name not in POSITIVE_TERMS)
+    return DT * positive * jnp.exp(negative), weighted
+
+
+def _zero_metrics(weights: WalkRewards) -> dict[str, Any]:
+    names = [f"reward/{field.name}" for field in dataclasses.fields(weights)]
+    return {name: jnp.zeros(()) for name in [*names, "error_vx", "error_vy", "error_yaw"]}
