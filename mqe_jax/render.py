@@ -63,7 +63,7 @@ class Camera:
     lookat: tuple[float, float, float]  # metre
     distance: float  # metre
     azimuth: float = 60.0  # 0 looks along +x, 90 along +y
-    elevation: float = -40.0  # -90 looks straight down
+    elevation: float = -46.0  # -90 looks straight down
 
 
 def record(
@@ -189,14 +189,14 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
     up = np.cross(right, forward)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     lookat, distance = np.array(camera.lookat), 1.0
-    for _ in range(8):  # put the middle of what is seen into the middle of the picture, then step back or forth
+    for _ in range(60):  # put the middle of what is seen into the middle of the picture, then step back or forth
         offset = corners - lookat
         # A corner is inside the picture when |offset . right| <= depth tan aspect and |offset . up| <= depth tan.
         need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
         distance = need.max()
         depth = distance + offset @ forward
         across, along = offset @ right / depth, offset @ up / depth
-        shift = distance * ((across.max() + across.min()) * right + (along.max() + along.min()) * up) / 2
+        shift = distance * ((across.max() + across.min()) * right + (along.max() + along.min()) * up) / 4
         lookat = lookat + shift
     distance = float(np.clip(1.04 * distance, 1.5, 60.0))
     return replace(camera, lookat=(float(lookat[0]), float(lookat[1]), float(lookat[2])), distance=distance)
@@ -221,9 +221,10 @@ def _drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
         if model.body_mocapid[model.geom_bodyid[geom]] < 0:
             continue
         wall = _box_corners(model, data, geom)[:, 1]
-        low, high = max(wall.min(), sides.min()), min(wall.max(), sides.max())
+        low, high = max(wall.min(), sides.min() + 0.005), min(wall.max(), sides.max() - 0.005)
         if low < high and (low, high) != (wall.min(), wall.max()):
             model.geom_pos[geom, 1] += (low + high) / 2 - data.geom_xpos[geom, 1]
+            model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's pose for the geom's
             model.geom_size[geom, 1] = model.geom_aabb[geom, 4] = (high - low) / 2
     return model
 
@@ -480,7 +481,7 @@ def render_episode(
     if backend is None:
         print(f"mqe: no GL library, drawn from above instead; for the 3-D picture install {GL_PACKAGES}", file=sys.stderr)
     if suffix == ".png":
-        camera = camera or default_camera(env.mj_model, episode, size[0] / size[1])
+        camera = camera or default_camera(_drawn_model(env.mj_model, episode), episode, size[0] / size[1])
         middle = len(episode) // 2
         if backend is not None:
             episode = replace(
