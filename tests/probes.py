@@ -32,8 +32,9 @@ class Probe:
     """N worlds with one random sign `hidden` per episode.
 
     `show(hidden (N,), step (N,)) -> (N, F)` is what agents see besides their id;
-    `pay(hidden, action (N, A, D)) -> (N,)` the team's reward; `ends` (first, second world parity) the
-    lengths after which an episode ends; `terminates` says whether that is a termination.
+    `pay(hidden, action (N, A, D)) -> (N,)` is the team's reward. Episodes of even worlds end after
+    `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates` says whether
+    that is a termination (with `even_truncate` only in odd worlds). The shorter kind is a success.
     """
 
     show: Callable[[jax.Array, jax.Array], jax.Array]
@@ -45,6 +46,7 @@ class Probe:
     max_episode_steps: int = 4
     odd_episode_steps: int | None = None
     terminates: bool = True
+    even_truncate: bool = False
     name: str = "probe"
 
     @property
@@ -93,6 +95,9 @@ class Probe:
         hidden = jnp.where(done, jax.random.rademacher(draw, done.shape, jnp.float32), state.hidden)
         step = jnp.where(done, 0, step)
         obs, privileged = self._observe(hidden, step)
+        terminates = jnp.full(done.shape, self.terminates)
+        if self.even_truncate:
+            terminates &= jnp.arange(self.num_envs) % 2 == 1
         short = done & (limit == jnp.minimum(odd, self.max_episode_steps))
         return ProbeState(
             hidden=hidden,
@@ -101,8 +106,8 @@ class Probe:
             final_obs=final_obs,
             final_privileged_obs=final_privileged,
             reward=jnp.broadcast_to(pay[:, None], (self.num_envs, self.num_agents)),
-            terminated=done & self.terminates,
-            truncated=done & (not self.terminates),
+            terminated=done & terminates,
+            truncated=done & ~terminates,
             metrics={
                 "reward/pay": pay,
                 "average_step_reward": pay,
@@ -114,30 +119,33 @@ class Probe:
         )
 
 
-def constant_feature(hidden: jax.Array, step: jax.Array) -> jax.Array:
-    return jnp.ones((hidden.shape[0], 1))
-
-
 def show_hidden(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    """Shows the sign in every step."""
     return hidden[:, None]
 
 
 def show_hidden_first(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    """Shows the sign in an episode's first step only."""
     return jnp.where(step == 0, hidden, 0.0)[:, None]
 
 
+def show_step_and_parity(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    """Shows the step modulo 4, one-hot, and whether the world is odd."""
+    parity = (jnp.arange(hidden.shape[0]) % 2).astype(jnp.float32)
+    return jnp.concatenate([jax.nn.one_hot(step % 4, 4), parity[:, None]], axis=-1)
+
+
 def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays 1 whatever is done."""
     return jnp.ones_like(hidden)
 
 
-def pay_near_half(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    return -jnp.mean(jnp.square(action - 0.5), axis=(1, 2))
-
-
 def pay_near_hidden(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays most where all agents do half the sign."""
     return -jnp.mean(jnp.square(action - 0.5 * hidden[:, None, None]), axis=(1, 2))
 
 
-def pay_opposite(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays most when agent 0 does +0.5 and agent 1 -0.5."""
-    return -jnp.mean(jnp.square(action - jnp.array([[0.5], [-0.5]])), axis=(1, 2))
+def pay_sum_and_difference(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays most where agent 0 does half the sign and agent 1 the opposite: no agent's best act is its own."""
+    first, second = action[:, 0, 0], action[:, 1, 0]
+    return -jnp.square(first + second) - 0.25 * jnp.square(first - second - hidden)

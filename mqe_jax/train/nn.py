@@ -82,7 +82,8 @@ def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
     keys = jax.random.split(key, 6)
 
     def three_gates(gate_keys: jax.Array, rows: int) -> Params:
-        weight = jnp.concatenate([orthogonal(k, (rows, n_hidden), 1.0) for k in gate_keys], axis=1)
+        gates = jax.vmap(lambda k: orthogonal(k, (rows, n_hidden), 1.0))(gate_keys)
+        weight = jnp.swapaxes(gates, 0, 1).reshape(rows, 3 * n_hidden)
         return {"weight": weight, "bias": jnp.zeros((3 * n_hidden,), jnp.float32)}
 
     return {"input": three_gates(keys[:3], n_in), "hidden": three_gates(keys[3:], n_hidden)}

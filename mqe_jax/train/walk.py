@@ -1,0 +1,300 @@
+"""Training of the walk policy: PPO with a 30-step history, as walk-these-ways does it (arXiv 2212.03238).
+
+The rollout keeps single observations of 70 numbers; the 30-step windows are gathered from them when they are
+needed, so memory grows with 70 and not with 2100 numbers a step. The adaptation network learns by regression
+of the latent target and its output is an input without gradient of the policy.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax import walk_policy
+from mqe_jax.train import nn
+from mqe_jax.train.advantage import gae
+from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
+from mqe_jax.train.optim import adam
+from mqe_jax.walk_policy import HISTORY, NUM_JOINTS, OBSERVATION_SIZE
+
+
+class WalkWorld(Protocol):
+    """What the trainer needs of the walking environment; see `mqe_jax.envs.walk.WalkEnv`."""
+
+    privileged_size: int
+
+    def reset(self, key: jax.Array, condition: Any = None, level: Any = 1.0, step: Any = 0) -> Any: ...
+    def step(self, state: Any, action: jax.Array) -> Any: ...
+    def autoreset(self, state: Any) -> Any: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkConfig:
+    """Settings of the walk policy's training; defaults as in walk-these-ways where it has them.
+
+    Attributes:
+        num_envs: worlds side by side.
+        rollout_length: steps of each world between updates.
+        iterations: updates in all.
+        epochs: passes over each rollout.
+        minibatches: parts of each pass.
+        learning_rate: at the start; adapted to `target_kl`.
+        target_kl: wanted KL divergence of one pass.
+        clip: of the policy ratio.
+        gamma: discount.
+        lam: of the advantage estimate.
+        entropy: coefficient.
+        value: coefficient of the value loss.
+        adaptation: coefficient of the adaptation network's regression.
+        max_grad_norm: gradients are scaled down to it.
+        initial_std: of the actions.
+        curriculum: iterations until slopes, forces and kicks are at their greatest.
+        seed: of everything random.
+    """
+
+    num_envs: int = 4000
+    rollout_length: int = 24
+    iterations: int = 2000
+    epochs: int = 5
+    minibatches: int = 4
+    learning_rate: float = 1e-3
+    target_kl: float = 0.01
+    clip: float = 0.2
+    gamma: float = 0.99
+    lam: float = 0.95
+    entropy: float = 0.01
+    value: float = 1.0
+    adaptation: float = 1.0
+    max_grad_norm: float = 1.0
+    initial_std: float = 1.0
+    curriculum: int = 500
+    seed: int = 0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class WalkLearner:
+    """Everything that learns.
+
+    Attributes:
+        params: {"policy": walk policy weights, "log_std": (12,), "critic": layers}.
+        optimizer: Adam's state.
+        rate: learning rate ().
+        iteration: () int32.
+        key: random key.
+    """
+
+    params: dict[str, Any]
+    optimizer: Any
+    rate: jax.Array
+    iteration: jax.Array
+    key: jax.Array
+
+
+def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index: jax.Array) -> jax.Array:
+    """Gathers flattened 30-step histories (B, 2100), zero before each episode's start.
+
+    Args:
+        buffer: observations (29 + T, N, 70): row t + 29 is that of step t.
+        age: steps since the reset at each step (T, N).
+        time_index: (B,).
+        env_index: (B,).
+    """
+    rows = time_index[:, None] + jnp.arange(HISTORY)
+    history = buffer[rows, env_index[:, None]]
+    back = HISTORY - 1 - jnp.arange(HISTORY)
+    alive = back <= age[time_index, env_index][:, None]
+    return (history * alive[..., None]).reshape(len(time_index), -1)
+
+
+def init_learner(key: jax.Array, config: WalkConfig, privileged_size: int) -> WalkLearner:
+    """Draws the weights."""
+    key, policy_key, critic_key = jax.random.split(key, 3)
+    params = {
+        "policy": walk_policy.init_params(policy_key),
+        "log_std": jnp.full(NUM_JOINTS, jnp.log(config.initial_std)),
+        "critic": nn.mlp_init(critic_key, (privileged_size, 512, 256, 128, 1), final_scale=1.0),
+    }
+    optimizer = adam(1e-8, max_grad_norm=config.max_grad_norm).init(params)
+    return WalkLearner(params, optimizer, jnp.float32(config.learning_rate), jnp.int32(0), key)
+
+
+def make_iteration(env: WalkWorld, config: WalkConfig) -> Callable[..., tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]]:
+    """Makes `iterate(learner, state, history) -> (learner, state, history, metrics)`, one rollout and update.
+
+    `state` is the batched environment state, `history` each world's last observations (N, 30, 70), the newest
+    being the state's.
+    """
+    optimizer = adam(1e-8, max_grad_norm=config.max_grad_norm)
+    step = jax.vmap(env.step)
+    autoreset = jax.vmap(env.autoreset)
+
+    def critic(params: Any, privileged: jax.Array) -> jax.Array:
+        return nn.mlp(params["critic"], privileged, jax.nn.elu)[..., 0]
+
+    def rollout(learner: WalkLearner, state: Any, history: jax.Array, key: jax.Array) -> tuple[Any, jax.Array, Any]:
+        params = learner.params
+
+        def body(carry: tuple[Any, jax.Array], step_key: jax.Array) -> tuple[tuple[Any, jax.Array], Any]:
+            state, history = carry
+            flat = history.reshape(config.num_envs, -1)
+            latent = walk_policy.infer_latent(params["policy"], flat)
+            mean = walk_policy.infer_action(params["policy"], flat, latent)
+            action = mean + jnp.exp(params["log_std"]) * jax.random.normal(step_key, mean.shape)
+            next_state = step(state, action)
+            # The critic has no history, so the value of the state reached is known before a reset replaces it.
+            record = {
+                "obs": state.obs, "privileged": state.privileged_obs, "age": state.age, "action": action,
+                "mean": mean, "log_prob": jnp.sum(log_prob(action, mean, params["log_std"]), -1),
+                "next_privileged": next_state.privileged_obs, "reward": next_state.reward,
+                "terminated": next_state.terminated, "truncated": next_state.truncated,
+                "latent_target": state.latent_target, "length": next_state.age, "metrics": next_state.metrics,
+            }  # fmt: skip
+            next_state = autoreset(next_state)
+            fresh = (next_state.age == 0)[:, None, None]
+            history = jnp.concatenate([jnp.where(fresh, 0.0, history[:, 1:]), next_state.obs[:, None]], axis=1)
+            return (next_state, history), record
+
+        (state, history), records = jax.lax.scan(
+            body, (state, history), jax.random.split(key, config.rollout_length)
+        )
+        return state, history, records
+
+    def iterate(
+        learner: WalkLearner, state: Any, history: jax.Array
+    ) -> tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]:
+        key, rollout_key, shuffle_key = jax.random.split(learner.key, 3)
+        level = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
+        state = dataclasses.replace(state, level=jnp.full(config.num_envs, level))
+        before = jnp.moveaxis(history[:, :-1], 1, 0)
+        state, history, records = rollout(learner, state, history, rollout_key)
+        buffer = jnp.concatenate([before, records["obs"]])
+        value = critic(learner.params, records["privileged"])
+        next_value = critic(learner.params, records["next_privileged"])
+        done = records["terminated"] | records["truncated"]
+        advantage, target = gae(
+            records["reward"], value, next_value, records["terminated"], done, gamma=config.gamma, lam=config.lam
+        )
+        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+        old_log_std = learner.params["log_std"]
+
+        def loss(params: Any, t: jax.Array, n: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+            flat = windows(buffer, records["age"], t, n)
+            latent = walk_policy.infer_latent(params["policy"], flat)
+            mean = walk_policy.infer_action(params["policy"], flat, jax.lax.stop_gradient(latent))
+            new = jnp.sum(log_prob(records["action"][t, n], mean, params["log_std"]), -1)
+            policy = jnp.mean(clipped_surrogate(new - records["log_prob"][t, n], advantage[t, n], config.clip))
+            predicted = critic(params, records["privileged"][t, n])
+            near = value[t, n] + jnp.clip(predicted - value[t, n], -config.clip, config.clip)
+            wanted = target[t, n]
+            value_error = jnp.mean(jnp.maximum(jnp.square(predicted - wanted), jnp.square(near - wanted)))
+            adaptation = jnp.mean(jnp.square(latent - records["latent_target"][t, n]))
+            bonus = jnp.mean(entropy(params["log_std"]))
+            total = policy + config.value * value_error + config.adaptation * adaptation - config.entropy * bonus
+            kl = jnp.mean(kl_divergence(records["mean"][t, n], old_log_std, mean, params["log_std"]))
+            return total, {"kl": kl, "value_loss": value_error, "adaptation_loss": adaptation}
+
+        samples = config.rollout_length * config.num_envs
+        size = samples // config.minibatches
+
+        def minibatch(carry: tuple[Any, Any, jax.Array], index: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+            params, state, rate = carry
+            grads, info = jax.grad(loss, has_aux=True)(params, index // config.num_envs, index % config.num_envs)
+            rate = jnp.where(info["kl"] > 2 * config.target_kl, jnp.maximum(rate / 1.5, 1e-5), rate)
+            rate = jnp.where(info["kl"] < config.target_kl / 2, jnp.minimum(rate * 1.5, 1e-2), rate)
+            params, state, info["grad_norm"] = optimizer.update(grads, state, params, rate)
+            return (params, state, rate), info
+
+        order = jax.vmap(lambda k: jax.random.permutation(k, samples)[: size * config.minibatches])(
+            jax.random.split(shuffle_key, config.epochs)
+        )
+        (params, optimizer_state, rate), info = jax.lax.scan(
+            minibatch, (learner.params, learner.optimizer, learner.rate), order.reshape(-1, size)
+        )
+        ended = jnp.sum(done)
+        metrics = {name: jnp.mean(values) for name, values in {**info, **records["metrics"]}.items()}
+        metrics |= {
+            "reward": jnp.mean(records["reward"]), "rate": rate, "std": jnp.mean(jnp.exp(params["log_std"])),
+            "fall_per_20s": jnp.mean(records["terminated"]) * 1000.0, "level": level,
+            "episode_length": jnp.sum(records["length"] * done) / jnp.maximum(ended, 1),
+        }  # fmt: skip
+        learner = WalkLearner(params, optimizer_state, rate, learner.iteration + 1, key)
+        return learner, state, history, metrics
+
+    return iterate
+
+
+def train_walk(
+    env: WalkWorld,
+    config: WalkConfig,
+    run_dir: Path,
+    *,
+    resume: bool = False,
+    max_seconds: float | None = None,
+    save_every: int = 100,
+    report: Callable[[int, dict[str, float]], None] | None = None,
+) -> walk_policy.Params:
+    """Trains the walk policy; writes metrics.csv, checkpoints and walk.safetensors into `run_dir`.
+
+    Args:
+        env: the walking environment.
+        config: settings.
+        run_dir: folder of the run.
+        resume: goes on from the folder's checkpoint, with worlds started afresh.
+        max_seconds: stops after so long, with everything saved.
+        save_every: iterations between checkpoints.
+        report: called with the iteration and its metrics every 10 iterations.
+    """
+    from mqe_jax.train import checkpoint
+
+    run_dir.mkdir(parents=True, exist_ok=True)
+    key = jax.random.PRNGKey(config.seed)
+    learner_key, state_key, stagger_key = jax.random.split(key, 3)
+    learner = init_learner(learner_key, config, env.privileged_size)
+    newest = checkpoint.latest(run_dir) if resume else None
+    if newest is not None:
+        learner = checkpoint.load_checkpoint(newest, learner).tree
+        state_key = jax.random.fold_in(state_key, learner.iteration)
+    level = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
+    keys = jax.random.split(state_key, config.num_envs)
+    # Worlds start at different points of their time limit so that they do not all reset at once.
+    steps = jax.random.randint(stagger_key, (config.num_envs,), 0, 900)
+    reset = jax.jit(jax.vmap(lambda k, s: env.reset(k, None, level, s)))
+    state = reset(keys, steps)
+    history = jnp.zeros((config.num_envs, HISTORY, OBSERVATION_SIZE)).at[:, -1].set(state.obs)
+    iterate = jax.jit(make_iteration(env, config), donate_argnums=(2,))
+    start, first = time.monotonic(), int(learner.iteration)
+    table = run_dir / "metrics.csv"
+    fresh = first == 0 or not table.exists()
+    with table.open("w" if fresh else "a", newline="") as file:
+        writer: Any = None
+        for iteration in range(first + 1, config.iterations + 1):
+            learner, state, history, metrics = iterate(learner, state, history)
+            last = iteration == config.iterations or (
+                max_seconds is not None and time.monotonic() - start > max_seconds
+            )
+            if iteration % 10 == 0 or last:
+                row = {name: float(value) for name, value in sorted(jax.device_get(metrics).items())}
+                row = {"iteration": iteration, "seconds": round(time.monotonic() - start, 1), **row}
+                if writer is None:
+                    writer = csv.DictWriter(file, row)
+                    if fresh:
+                        writer.writeheader()
+                writer.writerow(row)
+                file.flush()
+                if report is not None:
+                    report(iteration, row)
+            if iteration % save_every == 0 or last:
+                about = {"config": dataclasses.asdict(config), "iteration": iteration}
+                checkpoint.save_checkpoint(run_dir, learner, iteration, about, keep=2)
+                walk_policy.save_params(learner.params["policy"], run_dir / "walk.safetensors", about)
+            if last:
+                break
+    return learner.params["policy"]

@@ -1,0 +1,158 @@
+"""The learner on probe environments whose right answer is known."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from probes import Probe
+
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.types import VectorEnv
+
+
+def small(**values: Any) -> TrainConfig:
+    """Returns settings that learn a probe in seconds."""
+    return TrainConfig(
+        **{
+            "num_envs": 32,
+            "total_steps": 100_000,
+            "rollout_steps": 8,
+            "epochs": 4,
+            "minibatches": 2,
+            "learning_rate": 1e-2,
+            "entropy_coef": 0.0,
+            "hidden_sizes": (16,),
+            "gru_size": 8,
+            "recurrent": False,
+            "log_std_init": -1.0,
+            **values,
+        }
+    )
+
+
+def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState, dict[str, jax.Array]]:
+    """Runs updates and returns the last state and metrics."""
+    learner = make_learner(env, config)
+    state = jax.jit(learner.init)(jax.random.PRNGKey(0))
+    update = jax.jit(learner.update)
+    metrics = {}
+    for _ in range(updates):
+        state, metrics = update(state)
+    return state, metrics
+
+
+def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
+    env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, even_truncate=True)
+    config = small(gamma=0.8, value_clip=None, value_norm_decay=0.9)
+    state, _ = learn(env, config, 60)
+    network = make_learner(env, config).network
+    seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
+    value, _ = network.value(state.params, (), jnp.zeros((4, 2), bool), jnp.zeros((4, 2, 2, 7)), seen)
+    mean = state.value_normalizer.mean / state.value_normalizer.weight
+    square = state.value_normalizer.square / state.value_normalizer.weight
+    value = value * jnp.sqrt(square - mean**2) + mean
+    for agent in range(2):
+        forever = np.full(4, 1 / (1 - 0.8))
+        ending = [(1 - 0.8 ** (4 - s)) / (1 - 0.8) for s in range(4)]
+        np.testing.assert_allclose(value[:, 0, agent], forever, atol=0.3)
+        np.testing.assert_allclose(value[:, 1, agent], ending, atol=0.3)
+
+
+VARIANTS = {
+    "mappo": {},
+    "jrpo": {"ratio": "joint", "value": "joint", "critic_input": "observations"},
+    "ippo": {
+        "share_policy": False,
+        "critic_input": "own",
+        "ratio": "dimension",
+        "dual_clip": 3.0,
+        "target_kl": 0.02,
+        "normalize_observations": True,
+        "action_mean": "tanh",
+    },
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
+    env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=32)
+    _, metrics = learn(env, small(**VARIANTS[variant]), 60)
+    assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
+    assert float(metrics["episode_length"]) == 4.0
+
+
+def test_memory_carries_a_sign_through_an_episode() -> None:
+    env = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=32)
+    config = small(recurrent=True, chunk_length=4, stagger_episodes=True)
+    _, metrics = learn(env, config, 50)
+    assert float(metrics["average_step_reward"]) > -0.06  # without memory at best -0.19
+
+
+class CountingProbe(Probe):
+    """A probe that counts how often its step is traced."""
+
+    traces = 0
+
+    def step(self, state: probes.ProbeState, action: jax.Array) -> probes.ProbeState:
+        CountingProbe.traces += 1
+        return super().step(state, action)
+
+
+class OnePass(NamedTuple):
+    """What updates of a single gradient step gave."""
+
+    traces: list[int]
+    states: list[TrainState]
+    metrics: list[dict[str, jax.Array]]
+    first_again: dict[str, jax.Array]
+
+
+@pytest.fixture(scope="module")
+def one_pass() -> OnePass:
+    """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
+    env = CountingProbe(
+        probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4
+    )
+    learner = make_learner(env, small(num_envs=4, recurrent=True, chunk_length=4, epochs=1, minibatches=1))
+    update = jax.jit(learner.update)
+    states, all_metrics, traces = [jax.jit(learner.init)(jax.random.PRNGKey(0))], [], []
+    for _ in range(3):
+        state, metrics = update(states[-1])
+        states.append(state)
+        all_metrics.append(metrics)
+        traces.append(CountingProbe.traces)
+    return OnePass(traces, states, all_metrics, update(states[0])[1])
+
+
+def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
+    """The first gradient step sees the rollout's own log-densities, memory and resets included."""
+    for metrics in one_pass.metrics:
+        assert abs(float(metrics["approx_kl"])) < 1e-6
+        assert float(metrics["clip_fraction"]) == 0.0
+
+
+def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
+    assert len(set(one_pass.traces)) == 1
+    assert [int(state.updates) for state in one_pass.states] == [0, 1, 2, 3]
+    for name, value in one_pass.metrics[0].items():
+        np.testing.assert_array_equal(value, one_pass.first_again[name])
+
+
+def test_success_is_averaged_over_episode_ends(one_pass: OnePass) -> None:
+    """Even worlds end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
+    metrics = one_pass.metrics[0]
+    assert float(metrics["episodes"]) == 2 * 4 + 2 * 2
+    assert float(metrics["success"]) == pytest.approx(2 / 3)
+    assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
+
+
+def test_settings_must_fit_the_environment() -> None:
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
+    with pytest.raises(ValueError, match="num_envs: 32; the environment given has 4"):
+        make_learner(env, small())

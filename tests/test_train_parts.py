@@ -1,0 +1,148 @@
+"""The learner's parts: numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.train import loss, nn
+from mqe_jax.train.advantage import gae
+from mqe_jax.train.normalize import (
+    running_init,
+    running_normalize,
+    running_update,
+    value_denormalize,
+    value_init,
+    value_normalize,
+    value_update,
+)
+from mqe_jax.train.optim import adam
+
+KEY = jax.random.PRNGKey(0)
+
+
+def test_gae_by_hand_with_termination_truncation_and_going_on() -> None:
+    gamma, lam = 0.5, 0.5
+    # three worlds: the step at t = 1 terminates, truncates, goes on
+    reward = jnp.ones((3, 3))
+    value = jnp.full((3, 3), 2.0)
+    next_value = jnp.full((3, 3), 4.0)
+    terminated = jnp.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]], bool)
+    done = jnp.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]], bool)
+    advantage, target = gae(reward, value, next_value, terminated, done, gamma=gamma, lam=lam)
+    # delta = 1 + 0.5 x 4 - 2 = 1, or 1 - 2 = -1 where terminated; trace decays by 0.25
+    expected = [[1 - 0.25, 1 + 0.25, 1 + 0.25 * 1.25], [-1, 1, 1.25], [1, 1, 1]]
+    np.testing.assert_allclose(advantage, expected, rtol=1e-6)
+    np.testing.assert_allclose(target, advantage + 2.0)
+
+
+def test_gae_broadcasts_world_flags_over_agents() -> None:
+    shape = (4, 3, 2)
+    done = jnp.zeros((4, 3), bool).at[1].set(True)
+    advantage, _ = gae(jnp.ones(shape), jnp.zeros(shape), jnp.ones(shape), done, done, gamma=0.9, lam=1.0)
+    assert advantage.shape == shape
+    np.testing.assert_allclose(advantage[1], 1.0)
+
+
+def test_clipped_surrogate_by_hand() -> None:
+    log_ratio = jnp.log(jnp.array([1.5, 1.5, 0.5, 0.5, 5.0]))
+    advantage = jnp.array([1.0, -1.0, 1.0, -1.0, -1.0])
+    expected = [-1.2, 1.5, -0.5, 0.8, 5.0]
+    np.testing.assert_allclose(loss.clipped_surrogate(log_ratio, advantage, 0.2), expected, rtol=1e-5)
+    dual = loss.clipped_surrogate(log_ratio, advantage, 0.2, dual_clip=3.0)
+    np.testing.assert_allclose(dual, [-1.2, 1.5, -0.5, 0.8, 3.0], rtol=1e-5)
+
+
+def test_value_loss_is_clipped_and_huber() -> None:
+    value, old, target = jnp.array([1.0, 1.0]), jnp.array([0.0, 1.0]), jnp.array([1.0, 21.0])
+    # kept to 0.2: error 0.8; free: error 20, beyond the Huber delta of 10
+    expected = [0.5 * 0.8**2, 10 * (20 - 5)]
+    np.testing.assert_allclose(loss.value_loss(value, old, target, 0.2, 10.0), expected, rtol=1e-6)
+    np.testing.assert_allclose(loss.value_loss(value, old, target, None, None), [0.0, 200.0], rtol=1e-6)
+
+
+def test_gaussian_density_entropy_and_divergence() -> None:
+    action, mean, log_std = jnp.array([0.5]), jnp.array([0.1]), jnp.array([-0.3])
+    std = math.exp(-0.3)
+    expected = -0.5 * (0.4 / std) ** 2 - math.log(std * math.sqrt(2 * math.pi))
+    np.testing.assert_allclose(loss.log_prob(action, mean, log_std), [expected], rtol=1e-5)
+    np.testing.assert_allclose(
+        loss.entropy(log_std), 0.5 * math.log(2 * math.pi * math.e * std**2), rtol=1e-5
+    )
+    divergence = loss.kl_divergence(mean, log_std, action, log_std)
+    np.testing.assert_allclose(divergence, 0.5 * (0.4 / std) ** 2, rtol=1e-5)
+
+
+def test_ratio_functions_by_hand() -> None:
+    new = jnp.array([[0.1, 0.2], [0.3, 0.4]])  # 2 agents, 2 dimensions
+    old = jnp.zeros((2, 2))
+    np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
+    np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
+
+
+def test_running_statistics_merge_as_one_batch() -> None:
+    data = 3.0 + 2.0 * jax.random.normal(KEY, (100, 3))
+    statistics = running_init(3)
+    np.testing.assert_array_equal(running_normalize(statistics, data), data)
+    for part in (data[:10], data[10:35], data[35:]):
+        statistics = running_update(statistics, part.reshape(-1, 1, 3))
+    np.testing.assert_allclose(statistics.mean, data.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(statistics.variance, data.var(axis=0), rtol=1e-4)
+    constant = running_update(running_init(1), jnp.full((10, 1), 7.0))
+    np.testing.assert_allclose(running_normalize(constant, jnp.array([7.0])), [0.0], atol=1e-4)
+
+
+def test_value_statistics_are_debiased_and_invertible() -> None:
+    target = jnp.array([1.0, 3.0])
+    statistics = value_update(value_init(), target, 0.99)
+    np.testing.assert_allclose(value_normalize(statistics, target), [-1.0, 1.0], rtol=1e-3)
+    np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target)
+    np.testing.assert_allclose(value_normalize(value_init(), target), target)
+
+
+def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:
+    params = {"a": jnp.zeros(3), "b": {"c": jnp.zeros(())}}
+    gradient = {"a": jnp.array([30.0, 0.0, -40.0]), "b": {"c": jnp.array(0.0)}}
+    optimizer = adam(eps=1e-8, max_grad_norm=1.0)
+    params, state, norm = optimizer.update(gradient, optimizer.init(params), params, 0.1)
+    assert float(norm) == pytest.approx(50.0)
+    np.testing.assert_allclose(params["a"], [-0.1, 0.0, 0.1], rtol=1e-4)
+    np.testing.assert_allclose(state.mean["a"], [0.1 * 0.6, 0.0, -0.1 * 0.8], rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(8, 3), (3, 8)])
+def test_orthogonal_columns_or_rows(shape: tuple[int, int]) -> None:
+    matrix = nn.orthogonal(KEY, shape, 2.0)
+    product = matrix.T @ matrix if shape[0] > shape[1] else matrix @ matrix.T
+    np.testing.assert_allclose(product, 4.0 * np.eye(3), atol=1e-5)
+
+
+def test_mlp_has_no_activation_after_the_last_layer() -> None:
+    params = nn.mlp_init(KEY, [2, 4, 3], final_scale=1.0)
+    x = jax.random.normal(KEY, (5, 2))
+    hidden = jnp.maximum(x @ params["0"]["weight"] + params["0"]["bias"], 0)
+    np.testing.assert_allclose(nn.mlp(params, x), hidden @ params["1"]["weight"], atol=1e-5)
+    assert float(nn.mlp(params, x, activate_last=True).min()) == 0.0
+    with pytest.raises(ValueError, match="sizes"):
+        nn.mlp_init(KEY, [2])
+
+
+def test_gru_by_hand() -> None:
+    params = nn.gru_init(KEY, 2, 3)
+    h, x = jax.random.normal(KEY, (4, 3)), jax.random.normal(KEY, (4, 2))
+
+    def gates(name: str, value: jax.Array) -> list[np.ndarray]:
+        return np.split(np.asarray(value @ params[name]["weight"]), 3, axis=-1)
+
+    def sigmoid(z: np.ndarray) -> np.ndarray:
+        return 1 / (1 + np.exp(-z))
+
+    (rx, ux, cx), (rh, uh, ch) = gates("input", x), gates("hidden", h)
+    reset, update = sigmoid(rx + rh), sigmoid(ux + uh)
+    expected = (1 - update) * np.tanh(cx + reset * ch) + update * np.asarray(h)
+    np.testing.assert_allclose(nn.gru(params, h, x), expected, atol=1e-5)

@@ -1,0 +1,278 @@
+"""A whole training: run folder, resuming, checkpoints and their damage, evaluation, loaded policies."""
+
+from __future__ import annotations
+
+import ast
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from probes import Probe
+from safetensors.numpy import save_file
+
+from mqe_jax.train import checkpoint as checkpoints
+from mqe_jax.train.checkpoint import latest, list_checkpoints, load_tree, save_checkpoint, save_tree
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.learner import TrainState
+from mqe_jax.train.policy_api import load_policy
+from mqe_jax.train.train import load_run_config, train
+
+PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
+
+
+def settings(**values: Any) -> TrainConfig:
+    defaults = {
+        "num_envs": 4,
+        "total_steps": 5 * 16,
+        "rollout_steps": 4,
+        "epochs": 2,
+        "minibatches": 2,
+        "hidden_sizes": (4,),
+        "gru_size": 4,
+        "normalize_observations": True,
+        "learning_rate_schedule": "linear",
+        "checkpoint_every": 2,
+    }
+    return TrainConfig(**{**defaults, **values})
+
+
+def rows(run_dir: Path) -> list[dict[str, str]]:
+    with (run_dir / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def assert_same(one: Any, other: Any) -> None:
+    one_leaves, one_structure = jax.tree.flatten(one)
+    other_leaves, other_structure = jax.tree.flatten(other)
+    assert one_structure == other_structure
+    for a, b in zip(one_leaves, other_leaves, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs_are_kept(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Lets the trainings of this file, which all compile the same update, compile it once."""
+    names = (
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+        "jax_persistent_cache_min_entry_size_bytes",
+    )
+    before = [getattr(jax.config, name) for name in names]
+    for name, value in zip(names, (str(tmp_path_factory.mktemp("compiled")), 0.5, -1), strict=True):
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+    yield
+    for name, value in zip(names, before, strict=True):
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
+    """A training that ran from start to end: its folder and its last state."""
+    run_dir = tmp_path_factory.mktemp("runs") / "straight"
+    return run_dir, train(PROBE, settings(), run_dir)
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_killed_training_resumes_as_if_never_stopped(
+    straight: tuple[Path, TrainState], tmp_path: Path
+) -> None:
+    straight_dir, expected = straight
+    run_dir = tmp_path / "killed"
+
+    def kill(state: TrainState, row: dict[str, float]) -> None:
+        if row["updates"] == 3:
+            raise Killed  # after the checkpoint of update 2 and the row of update 3
+
+    with pytest.raises(Killed):
+        train(PROBE, settings(), run_dir, on_update=kill)
+    assert len(rows(run_dir)) == 3
+    with (run_dir / "metrics.csv").open("a") as file:
+        file.write("64,4,0.1")  # a half-written row
+    state = train(PROBE, settings(), run_dir, resume=True)
+    assert_same(state, expected)
+    timed = {"seconds", "fps"}
+    for row, expected_row in zip(rows(run_dir), rows(straight_dir), strict=True):
+        assert {k: v for k, v in row.items() if k not in timed} == {
+            k: v for k, v in expected_row.items() if k not in timed
+        }
+    assert [int(row["env_steps"]) for row in rows(run_dir)] == [16, 32, 48, 64, 80]
+
+
+def test_what_a_run_leaves_behind(straight: tuple[Path, TrainState]) -> None:
+    run_dir, _ = straight
+    assert load_run_config(run_dir) == settings()
+    assert [p.name for p in list_checkpoints(run_dir)] == [
+        "step_000000000064.safetensors",
+        "step_000000000080.safetensors",
+    ]
+    assert not [p for p in run_dir.rglob("*") if p.name.endswith(".tmp")]
+
+
+def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:
+    run_dir, expected = straight
+    assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
+    with pytest.raises(ValueError, match="already holds a run"):
+        train(PROBE, settings(), run_dir)
+    with pytest.raises(ValueError, match=r"gamma: 0\.5 differs from the run"):
+        train(PROBE, settings(gamma=0.5), run_dir, resume=True)
+    assert load_run_config(run_dir) == settings()
+
+
+def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"run_dir: .*file.* cannot be written"):
+        train(PROBE, settings(), tmp_path / "file" / "run")
+
+
+def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState]) -> None:
+    run_dir, _ = straight
+    policy = load_policy(run_dir)
+    obs = np.zeros((3, 2, 3), np.float32)
+    memory = policy.initial_memory(3)
+    action, memory = policy.act(obs, memory, jax.random.PRNGKey(0))
+    assert action.shape == (3, 2, 1) and float(jnp.abs(action).max()) <= 1.0
+    mean, _ = policy.act(obs, policy.initial_memory(3), deterministic=True)
+    single, single_memory = policy.act(obs[0], policy.initial_memory())
+    np.testing.assert_allclose(mean[0], single, atol=1e-6)
+    assert jax.tree.leaves(single_memory)[0].shape == (2, 4)
+    assert policy.metadata["task"] == "probe"
+    with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
+        policy.act(np.zeros((3, 3, 2)), memory)
+    result = evaluate(PROBE, policy.act, 8, jax.random.PRNGKey(0), memory=policy.initial_memory(4))
+    assert result.episodes == 8 and result.mean_length == 4.0
+
+
+def test_a_policy_that_is_missing_or_of_another_kind(
+    straight: tuple[Path, TrainState], tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=r"policy.safetensors: no such file"):
+        load_policy(tmp_path)
+    newest = latest(straight[0])
+    assert newest is not None
+    with pytest.raises(ValueError, match="holds a checkpoint; a policy is needed"):
+        load_policy(newest)
+
+
+TREE = {
+    "a": jnp.arange(6.0).reshape(2, 3),
+    "b": (jnp.array(True), jnp.uint32(7)),
+    "c": [jnp.zeros((0, 2)), jnp.arange(3).astype(jnp.int8)],
+}
+
+
+def test_a_checkpoint_keeps_every_leaf(tmp_path: Path) -> None:
+    path = tmp_path / "tree.safetensors"
+    save_tree(path, TREE, {"note": "ü"}, kind="checkpoint")
+    restored = load_tree(path, jax.eval_shape(lambda: TREE), kind="checkpoint")
+    assert_same(restored.tree, TREE)
+    assert [x.dtype for x in jax.tree.leaves(restored.tree)] == [x.dtype for x in jax.tree.leaves(TREE)]
+    assert restored.metadata == {"note": "ü"}
+    assert [p.name for p in tmp_path.iterdir()] == ["tree.safetensors"]
+
+
+def test_old_checkpoints_and_left_overs_go(tmp_path: Path) -> None:
+    for step in (1, 20, 300):
+        newest = save_checkpoint(tmp_path, TREE, step, {}, keep=2)
+        (newest.parent / ".step_000000000001.safetensors.x.tmp").write_text("half")
+    save_checkpoint(tmp_path, TREE, 4000, {}, keep=2)
+    assert [p.name for p in sorted(newest.parent.iterdir())] == [
+        "step_000000000300.safetensors",
+        "step_000000004000.safetensors",
+    ]
+    assert latest(tmp_path / "nowhere") is None
+
+
+def damage_nothing_but_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoints, "VERSION", 99)
+    save_tree(path, TREE, {}, kind="checkpoint")
+    monkeypatch.setattr(checkpoints, "VERSION", 1)
+
+
+def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "x.safetensors"
+    save_tree(path, TREE, {}, kind="checkpoint")
+    whole = path.read_bytes()
+
+    def error_of(template: Any = TREE) -> str:
+        with pytest.raises(ValueError) as error:
+            load_tree(path, template, kind="checkpoint")
+        text = str(error.value)
+        assert str(path) in text and "\n" not in text
+        return text
+
+    for size in (0, 5, 100, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        assert "damaged" in error_of()
+    flipped = bytearray(whole)
+    flipped[-3] ^= 1
+    path.write_bytes(flipped)
+    assert "checksum" in error_of()
+    path.write_bytes(b"{} hello, this is something else entirely")
+    assert "damaged" in error_of()
+    save_file({"a": np.zeros(3)}, path)
+    assert "not a file of this package" in error_of()
+    damage_nothing_but_version(path, monkeypatch)
+    assert "version 99; version 1 is needed" in error_of()
+    path.write_bytes(whole)
+    assert "a has shape (2, 3); (2, 4) is needed" in error_of({**TREE, "a": jnp.zeros((2, 4))})
+    assert "a has dtype float32; int32" in error_of({**TREE, "a": jnp.zeros((2, 3), jnp.int32)})
+    assert "lacks d" in error_of({**TREE, "d": jnp.zeros(())})
+    assert "holds c/0" in error_of({k: v for k, v in TREE.items() if k != "c"})
+
+
+def test_evaluation_counts_the_first_episodes_of_every_world() -> None:
+    """Short episodes (2 steps, successes) do not crowd out long ones (30 steps)."""
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30)
+
+    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return jnp.zeros((4, 2, 1)), memory + 1
+
+    result = evaluate(env, act, 10, jax.random.PRNGKey(0), memory=jnp.zeros((4,)), block=7)
+    # 10 episodes over 4 worlds: 3, 3, 2, 2
+    assert result.episodes == 10
+    assert result.success_rate == pytest.approx(5 / 10)
+    assert result.mean_length == pytest.approx((5 * 2 + 5 * 30) / 10)
+    assert result.average_step_reward == pytest.approx(1.0)
+    assert result.terms == {"pay": pytest.approx(1.0)}
+    assert result.to_dict()["diverged"] == 0
+    with pytest.raises(ValueError, match="episodes: 0"):
+        evaluate(env, act, 0, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+
+
+def test_memory_starts_anew_with_every_counted_episode() -> None:
+    def pay_memory(hidden: jax.Array, action: jax.Array) -> jax.Array:
+        return action[:, 0, 0]
+
+    def act(obs: jax.Array, memory: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.broadcast_to(memory[:, None, None], (4, 2, 1)), memory + 1
+
+    env = Probe(probes.show_hidden, pay_memory, num_envs=4, max_episode_steps=4)
+    result = evaluate(env, act, 8, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+    assert result.average_step_reward == pytest.approx((0 + 1 + 2 + 3) / 4)
+
+
+def test_the_learner_imports_no_task_and_no_learning_library() -> None:
+    forbidden = {"flax", "optax", "brax", "torch"}
+    for path in (Path(checkpoints.__file__).parent).glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            for name in names:
+                assert name.split(".")[0] not in forbidden, path
+                assert not name.startswith("mqe_jax") or name.startswith("mqe_jax.train"), path
