@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import importlib
 import io
+import itertools
 import json
 import os
 import re
@@ -38,6 +39,7 @@ Do first:
 COMMANDS = ("tasks", "train", "eval", "render", "bench", "demo", "walk")
 
 Repeated = tyro.conf.UseAppendAction
+MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
 class Command(Protocol):
@@ -54,7 +56,7 @@ def _commands() -> Any:
 
 Impl = Annotated[
     str,
-    tyro.conf.arg(help="Physics engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
+    tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
 ]
 Set = Annotated[
     list[str],
@@ -72,7 +74,7 @@ Control = Annotated[
     tyro.conf.arg(
         metavar="MODE",
         help="Action mode: command (velocities for the walk policy), position (joint targets), torque. "
-        "Default: command, or what the run was trained with."
+        "Default: command, or what the run was trained with.",
     ),
 ]
 
@@ -95,7 +97,7 @@ def _setting_fields() -> list[tuple[str, Any, Any]]:
     body = next(n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == "TrainConfig")
     meaning = {
         at.target.id: text.value.value
-        for at, text in zip(body, body[1:], strict=False)
+        for at, text in itertools.pairwise(body)
         if isinstance(at, ast.AnnAssign)
         and isinstance(at.target, ast.Name)
         and isinstance(text, ast.Expr)
@@ -238,7 +240,9 @@ class Demo:
 class WalkTrain:
     """Train the walk policy's weights from scratch (GPU)."""
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("runs/walk/walk.safetensors")
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path(
+        "runs/walk/walk.safetensors"
+    )
     """Weights to write; the curve lands beside them."""
     num_envs: int = 4000
     """Worlds stepped together."""
@@ -330,7 +334,7 @@ def parse(arguments: Sequence[str]) -> Command:
                 prog="mqe",
                 description="Multi-agent quadruped tasks in JAX on MuJoCo MJX.",
                 args=list(arguments),
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+                config=MARKERS,
             )
     except SystemExit as stop:
         if not stop.code:
@@ -340,7 +344,10 @@ def parse(arguments: Sequence[str]) -> Command:
 
 def _one_line(box: str) -> str:
     """What tyro says in a box, as one line without the frame."""
-    lines = [re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()]
+    lines = [
+        re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip()
+        for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
+    ]
     kept = []
     for line in lines:
         if line.startswith("╭"):
@@ -374,7 +381,9 @@ def _quiet_stdout(active: bool) -> Iterator[Any]:
 def _is_ours(error: BaseException) -> bool:
     """Whether the error was raised by this package's own code, that is, by a check of input."""
     frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and Path(frames[-1].filename).resolve().is_relative_to(Path(__file__).resolve().parent)
+    return bool(frames) and Path(frames[-1].filename).resolve().is_relative_to(
+        Path(__file__).resolve().parent
+    )
 
 
 def _run(command: Command) -> None:

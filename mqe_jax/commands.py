@@ -72,12 +72,15 @@ def find_config(name: str) -> Path:
     """The settings file of this path, or of this shipped name; ValueError lists the shipped ones."""
     path = Path(name)
     shipped = {file.stem: file for file in sorted(CONFIG_FOLDER.glob("*.yaml"))}
+    allowed = f"a YAML file, or one of {', '.join(shipped)}"
     if path.suffix in (".yaml", ".yml") or path.parent != Path("."):
         if path.is_file():
             return path
-        raise ValueError(f"config: no file {name!r}; allowed: a YAML file, or one of {', '.join(shipped)}")
+        raise ValueError(f"config: no file {name!r}; allowed: {allowed}")
     if name not in shipped:
-        raise ValueError(f"config: unknown name {name!r}; allowed: a YAML file, or one of {', '.join(shipped)}")
+        raise ValueError(
+            f"config: unknown name {name!r}; allowed: a YAML file, or one of {', '.join(shipped)}"
+        )
     return shipped[name]
 
 
@@ -169,7 +172,9 @@ def _check_run(target: str) -> None:
     if not Path(target).is_dir():
         raise ValueError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
     if not (Path(target) / training.CONFIG_FILE).is_file():
-        raise ValueError(f"run: {target!r} holds no {training.CONFIG_FILE}; it is not the folder of a training")
+        raise ValueError(
+            f"run: {target!r} holds no {training.CONFIG_FILE}; it is not the folder of a training"
+        )
 
 
 # ---------------------------------------------------------------- commands
@@ -221,7 +226,9 @@ def _print_table(values: Mapping[str, Any]) -> None:
     """Prints names and numbers below each other."""
     flat = {}
     for name, value in values.items():
-        flat.update({f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value})
+        flat.update(
+            {f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value}
+        )
     for name, value in flat.items():
         print(f"{name:<28} {value:.4g}" if isinstance(value, float) else f"{name:<28} {value}")
 
@@ -296,7 +303,9 @@ def demo(arguments: cli.Demo) -> None:
     config = train_config(DEMO_TASK, arguments.config, {}, {})
     _check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
-    _say(f"mqe demo: {DEMO_TASK}, {config.num_envs} worlds, {config.total_steps / 1e6:g} M steps, into {run_dir}")
+    _say(
+        f"mqe demo: {DEMO_TASK}, {config.num_envs} worlds, {config.total_steps / 1e6:g} M steps, into {run_dir}"
+    )
 
     untrained = make_learner(vector_env, config)
     state = jax.jit(untrained.init)(training.initial_key(config))
@@ -323,7 +332,9 @@ def demo(arguments: cli.Demo) -> None:
     draw(env, Actor(DEMO_TASK, dict(config.env), after), video, seed=config.seed + 1, worlds=16)
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
-    print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
+    print(
+        f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors"
+    )
     print(f"took {(time.perf_counter() - began) / 60:.1f} minutes; measure it again with: mqe eval {run_dir}")
 
 

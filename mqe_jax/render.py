@@ -1,10 +1,12 @@
 """Clips and pictures of episodes: record a rollout as numpy, draw it, write it whole.
 
 Drawing is `mujoco.Renderer` on a GL library that works without a screen (EGL, then OSMesa). Where neither
-works, the same episode is drawn from above with matplotlib, and one line says which packages give the real one.
+works, the same episode is drawn from above with matplotlib, and one line says which packages give the real
+picture.
 """
 
 import copy
+import itertools
 import os
 import subprocess
 import sys
@@ -154,7 +156,8 @@ def _scenery(model: mujoco.MjModel) -> list[int]:
     return [
         geom
         for geom in range(model.ngeom)
-        if int(model.geom_type[geom]) not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+        if int(model.geom_type[geom])
+        not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
         and int(model.geom_group[geom]) != COLLISION_GROUP
         and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots
     ]
@@ -180,7 +183,9 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
     low, high = _extent(model, episode)
     centre = (low + high) / 2
     camera = Camera((float(centre[0]), float(centre[1]), 0.2), 1.0)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])])
+    corners = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])]
+    )
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -189,9 +194,11 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
     up = np.cross(right, forward)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     lookat, distance = np.array(camera.lookat), 1.0
-    for _ in range(60):  # put the middle of what is seen into the middle of the picture, then step back or forth
+    for _ in range(
+        60
+    ):  # put the middle of what is seen into the middle of the picture, then step back or forth
         offset = corners - lookat
-        # A corner is inside the picture when |offset . right| <= depth tan aspect and |offset . up| <= depth tan.
+        # A corner is in the picture when |offset right| <= depth tan aspect and |offset up| <= depth tan.
         need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
         distance = need.max()
         depth = distance + offset @ forward
@@ -345,7 +352,11 @@ def _draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) ->
     for geom in _scenery(model):
         moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
         patch = Polygon(
-            np.zeros((3, 2)), facecolor="#c9ced6" if moves else "#3a3d45", edgecolor="#23252b", lw=0.6, zorder=2
+            np.zeros((3, 2)),
+            facecolor="#c9ced6" if moves else "#3a3d45",
+            edgecolor="#23252b",
+            lw=0.6,
+            zorder=2,
         )
         scenery.append((geom, axes.add_patch(patch)))
     body_shape = np.array([[-0.25, -0.13], [0.2, -0.13], [0.33, 0.0], [0.2, 0.13], [-0.25, 0.13]])
@@ -383,14 +394,16 @@ def render_frames(
 ) -> Iterator[np.ndarray]:
     """Yield the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
-    `backend` is `auto` (what `gl_backend` finds), `egl`, `osmesa`, or None for the matplotlib view from above.
+    `backend` is `auto` (what `gl_backend` finds), `egl`, `osmesa`, or None for matplotlib's view from above.
     """
     model = _drawn_model(env.mj_model, episode)
     if backend == "auto":
         backend = gl_backend()
     if backend is None:
         return _draw_top(model, episode, size)
-    return _draw_gl(model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend)
+    return _draw_gl(
+        model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend
+    )
 
 
 def check_output(path: Path) -> Path:
@@ -410,8 +423,8 @@ def check_output(path: Path) -> Path:
             import_module("imageio_ffmpeg")
         except ImportError:
             raise ValueError(
-                f"output {str(path)!r}: .mp4 needs imageio and imageio-ffmpeg (pip install 'mqe-jax[render]'); "
-                "allowed without them: .gif, .png"
+                f"output {str(path)!r}: .mp4 needs imageio and imageio-ffmpeg "
+                "(pip install 'mqe-jax[render]'); allowed without them: .gif, .png"
             ) from None
     return path
 
@@ -441,7 +454,13 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """H.264, yuv420p: what browsers and players take."""
     imageio = import_module("imageio.v2")
     with imageio.get_writer(
-        path, fps=fps, codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2, ffmpeg_log_level="error"
+        path,
+        fps=fps,
+        codec="libx264",
+        pixelformat="yuv420p",
+        quality=8,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
     ) as writer:
         for frame in frames:
             writer.append_data(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
@@ -454,7 +473,9 @@ def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)][:8])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
     images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True
+    )
 
 
 def render_episode(
@@ -469,7 +490,7 @@ def render_episode(
 ) -> str:
     """Draw an episode into a file chosen by suffix; returns what drew it (`egl`, `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720, the middle frame.
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720, middle frame.
     Where GL is missing, one line on standard error names the packages that give the real picture.
     """
     check_output(path)
@@ -479,7 +500,10 @@ def render_episode(
     if backend == "auto":
         backend = gl_backend()
     if backend is None:
-        print(f"mqe: no GL library, drawn from above instead; for the 3-D picture install {GL_PACKAGES}", file=sys.stderr)
+        print(
+            f"mqe: no GL library, drawn from above instead; for the 3-D picture install {GL_PACKAGES}",
+            file=sys.stderr,
+        )
     if suffix == ".png":
         camera = camera or default_camera(_drawn_model(env.mj_model, episode), episode, size[0] / size[1])
         middle = len(episode) // 2
