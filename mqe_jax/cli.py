@@ -240,14 +240,16 @@ class Demo:
 class WalkTrain:
     """Train the walk policy's weights from scratch (GPU)."""
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path(
-        "runs/walk/walk.safetensors"
-    )
-    """Weights to write; the curve lands beside them."""
+    run_dir: Path = Path("runs/walk")
+    """Folder of the run: weights, curve, checkpoints."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the run folder."""
     num_envs: int = 4000
     """Worlds stepped together."""
-    updates: int = 1500
+    iterations: int = 1500
     """PPO updates of 24 steps."""
+    max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Stop after so long, with everything saved, s."""
     impl: Impl = "auto"
     seed: Seed = 0
 

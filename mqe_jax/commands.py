@@ -26,7 +26,7 @@ from mqe_jax.train import config as configs
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy_api
 from mqe_jax.train import train as training
-from mqe_jax.train.checkpoint import write_atomically
+from mqe_jax.train.checkpoint import latest, write_atomically
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import env_sizes, make_learner
 
@@ -303,9 +303,8 @@ def demo(arguments: cli.Demo) -> None:
     config = train_config(DEMO_TASK, arguments.config, {}, {})
     _check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
-    _say(
-        f"mqe demo: {DEMO_TASK}, {config.num_envs} worlds, {config.total_steps / 1e6:g} M steps, into {run_dir}"
-    )
+    size = f"{config.num_envs} worlds, {config.total_steps / 1e6:g} M steps"
+    _say(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
     untrained = make_learner(vector_env, config)
     state = jax.jit(untrained.init)(training.initial_key(config))
@@ -374,25 +373,44 @@ def _check_folder(folder: Path) -> None:
 # ---------------------------------------------------------------- the walk policy
 
 
-def _walk_training() -> Any:
-    return importlib.import_module("mqe_jax.train.walk")
-
-
 def walk_train(arguments: cli.WalkTrain) -> None:
-    """Trains the walk policy."""
-    _walk_training().train_walk(
-        arguments.output,
-        num_envs=arguments.num_envs,
-        updates=arguments.updates,
-        impl=arguments.impl,
-        seed=arguments.seed,
+    """Trains the walk policy into the run folder."""
+    from mqe_jax.envs.walk import WalkEnv
+    from mqe_jax.train import walk
+
+    for name in ("num_envs", "iterations"):
+        if getattr(arguments, name) < 1:
+            raise ValueError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
+    _check_folder(arguments.run_dir)
+    if latest(arguments.run_dir) is not None and not arguments.resume:
+        raise ValueError(
+            f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder"
+        )
+    env = WalkEnv(impl=arguments.impl, num_envs=arguments.num_envs)
+    config = walk.WalkConfig(
+        num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed
     )
+
+    def report(iteration: int, row: dict[str, float]) -> None:
+        shown = ("reward", "episode_length", "kl", "level")
+        numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
+        _say(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
+
+    walk.train_walk(
+        env,
+        config,
+        arguments.run_dir,
+        resume=arguments.resume,
+        max_seconds=arguments.max_seconds,
+        report=report,
+    )
+    _say(f"mqe: {arguments.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 
 def walk_eval(arguments: cli.WalkEval) -> dict[str, Any]:
     """Measures the walk policy."""
     result = dict(
-        _walk_training().evaluate_walk(
+        importlib.import_module("mqe_jax.walk_eval").evaluate_walk(
             arguments.weights,
             episodes=arguments.episodes,
             num_envs=arguments.num_envs,

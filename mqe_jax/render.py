@@ -6,7 +6,6 @@ picture.
 """
 
 import copy
-import itertools
 import os
 import subprocess
 import sys
