@@ -9,10 +9,12 @@ import ast
 import contextlib
 import dataclasses
 import difflib
+import functools
 import importlib
 import io
 import itertools
 import json
+import operator
 import os
 import re
 import sys
@@ -311,15 +313,16 @@ def _parser(wanted: Sequence[str]) -> Any:
         train = dataclasses.make_dataclass("Train", _setting_fields(), bases=(_Train,), frozen=True)
         train.__doc__ = _Train.__doc__
     subcommand = tyro.conf.subcommand
-    return (
-        Annotated[Tasks, subcommand("tasks")]
-        | Annotated[train, subcommand("train", description=_Train.__doc__)]
-        | Annotated[Eval, subcommand("eval")]
-        | Annotated[Render, subcommand("render")]
-        | Annotated[Bench, subcommand("bench")]
-        | Annotated[Demo, subcommand("demo")]
-        | Annotated[Walk, subcommand("walk")]
-    )
+    records: list[Any] = [
+        Annotated[Tasks, subcommand("tasks")],
+        Annotated[train, subcommand("train", description=_Train.__doc__)],
+        Annotated[Eval, subcommand("eval")],
+        Annotated[Render, subcommand("render")],
+        Annotated[Bench, subcommand("bench")],
+        Annotated[Demo, subcommand("demo")],
+        Annotated[Walk, subcommand("walk")],
+    ]
+    return functools.reduce(operator.or_, records)
 
 
 def parse(arguments: Sequence[str]) -> Command:

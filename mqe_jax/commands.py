@@ -386,7 +386,7 @@ def walk_train(arguments: cli.WalkTrain) -> None:
         raise ValueError(
             f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder"
         )
-    env = WalkEnv(impl=arguments.impl, num_envs=arguments.num_envs)
+    env: Any = WalkEnv(impl=arguments.impl, num_envs=arguments.num_envs)
     config = walk.WalkConfig(
         num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed
     )
