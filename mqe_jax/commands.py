@@ -17,11 +17,10 @@ import jax
 import jax.numpy as jnp
 import yaml
 
-import mqe_jax
 from mqe_jax import bench as benchmark
 from mqe_jax import plots
 from mqe_jax import render as rendering
-from mqe_jax.envs.autoreset import VectorEnv
+from mqe_jax.envs import TASKS, VectorEnv, make
 from mqe_jax.train import config as configs
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy_api
@@ -62,9 +61,11 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 
 def make_env(task: str, impl: str, overrides: Mapping[str, Any], num_envs: int) -> tuple[Any, VectorEnv]:
     """Makes a task and its batch of `num_envs` worlds."""
-    if num_envs < 1:
-        raise ValueError(f"num_envs: {num_envs} is not allowed; it must be at least 1")
-    env = mqe_jax.make(task, impl=impl, **overrides)
+    for name in ("impl", "num_envs"):
+        if name in overrides:
+            flag = name.replace("_", "-")
+            raise ValueError(f"set: {name} is no task parameter; give it as --{flag}")
+    env = make(task, impl=impl, num_envs=num_envs, **overrides)
     return env, VectorEnv(env, num_envs)
 
 
@@ -181,8 +182,29 @@ def _check_run(target: str) -> None:
 
 
 def tasks(arguments: cli.Tasks) -> dict[str, Any] | None:
-    """Lists the tasks."""
-    raise NotImplementedError
+    """Lists the tasks, each from an environment made with its own parameters."""
+    rows = []
+    for name, task in TASKS.items():
+        env = task(control="position", num_envs=1)  # the same sizes, without reading the walk policy
+        rows.append(
+            {
+                "task": name,
+                "title": task.title,
+                "agents": env.num_agents,
+                "observation": env.observation_size,
+                "privileged": env.privileged_observation_size,
+                "time_limit_s": env.params.episode_length,
+            }
+        )
+    if not arguments.json:
+        print(f"{'task':<22} {'title':<22} agents  observation  time limit")
+        for row in rows:
+            print(
+                f"{row['task']:<22} {row['title']:<22} {row['agents']:>6}  {row['observation']:>11}"
+                f"  {row['time_limit_s']:>8g} s"
+            )
+        print("\nactions per agent: command 3 (velocities for the walk policy), position 12, torque 12")
+    return {"tasks": rows}
 
 
 def train(arguments: cli._Train) -> None:
