@@ -1,1 +1,28 @@
-"""Multi-agent Quadruped Environment in JAX on MuJoCo MJX."""
+"""Multi-agent Quadruped Environment in JAX on MuJoCo MJX.
+
+    import jax, mqe_jax
+
+    env = mqe_jax.make("go1gate")
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
+    state = jax.jit(jax.vmap(env.step))(state, action)  # (64, env.num_agents, env.action_size)
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
+    from mqe_jax.train.policy_api import load_policy
+
+__version__ = "0.1.0"
+__all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks"]
+
+
+def __getattr__(name: str) -> Any:
+    # Imported when first used, so that `mqe --help` does not wait for JAX and MuJoCo.
+    if name not in __all__:
+        raise AttributeError(f"module 'mqe_jax' has no attribute {name!r}")
+    home = "mqe_jax.train.policy_api" if name == "load_policy" else "mqe_jax.envs"
+    return getattr(importlib.import_module(home), name)

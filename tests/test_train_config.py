@@ -24,6 +24,9 @@ def test_the_papers_file_is_the_default() -> None:
 def test_there_and_back() -> None:
     config = TrainConfig(hidden_sizes=(32, 16), env={"episode_length": 3})
     assert config_from_mapping(config_to_mapping(config)) == config
+    assert config_to_mapping(TrainConfig(env={"range": (0, 1)}))["env"] == {"range": [0, 1]}
+    with pytest.raises(ValueError, match=r"env\.seed: .*object"):
+        config_to_mapping(TrainConfig(env={"seed": object()}))
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ class Killed(Exception):
 
 
 def test_a_killed_training_resumes_as_if_never_stopped(
-    straight: tuple[Path, TrainState], tmp_path: Path
+    straight: tuple[Path, TrainState], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     straight_dir, expected = straight
     run_dir = tmp_path / "killed"
@@ -101,8 +101,11 @@ def test_a_killed_training_resumes_as_if_never_stopped(
     assert len(rows(run_dir)) == 3
     with (run_dir / "metrics.csv").open("a") as file:
         file.write("64,4,0.1")  # a half-written row
+    capsys.readouterr()
     state = train(PROBE, settings(), run_dir, resume=True)
     assert_same(state, expected)
+    told = capsys.readouterr()
+    assert told.out == "" and "80 of 80 steps, reward" in told.err
     timed = {"seconds", "fps"}
     for row, expected_row in zip(rows(run_dir), rows(straight_dir), strict=True):
         assert {k: v for k, v in row.items() if k not in timed} == {

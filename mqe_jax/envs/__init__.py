@@ -1,0 +1,48 @@
+"""The tasks, by their ids."""
+
+from __future__ import annotations
+
+import typing
+from typing import Any
+
+from mqe_jax.envs.autoreset import VectorEnv
+from mqe_jax.envs.base import QuadrupedEnv, Randomization, State, TaskParams
+from mqe_jax.envs.gate import Go1Gate
+from mqe_jax.envs.overrides import override
+from mqe_jax.envs.plane import Go1Plane
+from mqe_jax.terrain import nearest
+
+TASKS: dict[str, type[QuadrupedEnv]] = {task.name: task for task in (Go1Plane, Go1Gate)}
+
+
+def tasks() -> tuple[str, ...]:
+    """Returns the ids of all tasks."""
+    return tuple(TASKS)
+
+
+def make(
+    task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
+) -> QuadrupedEnv:
+    """Makes a task.
+
+    Args:
+        task: its id, such as 'go1gate'.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        control: what an action means: 'command', 'position' or 'torque'.
+        num_envs: how many worlds there will be at most (only Warp's contact buffer needs to know).
+        overrides: any parameter of the task by name; nested ones as mappings or, from a dict, dotted names:
+            `make("go1gate", gate_width=0.8, rewards={"collision": -5.0})`.
+
+    Raises:
+        ValueError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
+    """
+    if task not in TASKS:
+        raise ValueError(f"task: unknown id {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
+    cls = TASKS[task]
+    params = typing.cast(TaskParams, override(cls.Params(), overrides))
+    return cls(params, impl=impl, control=control, num_envs=num_envs)
+
+
+__all__ = [
+    "TASKS", "QuadrupedEnv", "Randomization", "State", "TaskParams", "VectorEnv", "make", "override", "tasks",
+]  # fmt: skip

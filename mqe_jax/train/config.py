@@ -231,9 +231,21 @@ def config_from_mapping(values: Mapping[str, Any]) -> TrainConfig:
 
 
 def config_to_mapping(config: TrainConfig) -> dict[str, Any]:
-    """Returns the settings as plain values that JSON and YAML can hold."""
-    values = dataclasses.asdict(config)
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+    """Returns the settings as plain values that JSON and YAML can hold.
+
+    Raises ValueError for an override in `env` that is no such value.
+    """
+    return {f.name: _plain(f.name, getattr(config, f.name)) for f in dataclasses.fields(config)}
+
+
+def _plain(name: str, value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Mapping):
+        return {str(k): _plain(f"{name}.{k}", v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(f"{name}[{i}]", v) for i, v in enumerate(value)]
+    _fail(name, value, "a number, a text, true, false, none, or lists and mappings of these")
 
 
 def load_config(path: str | Path, **overrides: Any) -> TrainConfig:

@@ -74,6 +74,8 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     """
     if env.num_envs != config.num_envs:
         raise ValueError(f"num_envs: {config.num_envs}; the environment given has {env.num_envs} worlds")
+    if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
+        raise ValueError(f"stagger_episodes: True; the environment {env.name} has no max_episode_steps")
     network = make_network(env_sizes(env), config)
     optimizer = adam(eps=config.adam_eps, max_grad_norm=config.max_grad_norm)
 
@@ -142,9 +144,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
 
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
     """Sets every world's clock to a random time, so that their first episodes end at different steps."""
-    limit = getattr(env, "max_episode_steps", None)
-    if limit is None:
-        raise ValueError(f"stagger_episodes: True; the environment {env.name} has no max_episode_steps")
+    limit: int = getattr(env, "max_episode_steps")  # noqa: B009
     step = jax.random.randint(key, env_state.step.shape, 0, limit, env_state.step.dtype)
     return dataclasses.replace(env_state, step=step)
 

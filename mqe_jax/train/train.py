@@ -47,6 +47,8 @@ def train(
     learner = make_learner(env, config)
     checkpoint = _prepare_folder(run_dir, config, resume)
     state, seconds = _first_state(env, learner, config, checkpoint)
+    text = yaml.safe_dump(config_to_mapping(config), sort_keys=False)
+    write_atomically(run_dir / CONFIG_FILE, text.encode())
     update = jax.jit(learner.update)
     env_steps = int(state.updates) * config.steps_per_update
     csv_log, tensorboard_log = CsvLog(run_dir, env_steps), TensorBoardLog(run_dir, env_steps)
@@ -55,15 +57,16 @@ def train(
 
     def save() -> None:
         nonlocal saved
-        if saved != env_steps:
+        step = int(state.updates) * config.steps_per_update
+        if saved != step:
             metadata = {
                 "task": env.name,
                 "config": config_to_mapping(config),
                 "seconds": time.perf_counter() - began,
             }
-            save_checkpoint(run_dir, state, env_steps, metadata, config.checkpoints_kept)
-            save_policy(run_dir, policy_of(state, env_sizes(env), config, task=env.name, env_steps=env_steps))
-            saved = env_steps
+            save_policy(run_dir, policy_of(state, env_sizes(env), config, task=env.name, env_steps=step))
+            save_checkpoint(run_dir, state, step, metadata, config.checkpoints_kept)
+            saved = step
 
     total_steps = config.num_updates * config.steps_per_update
     try:
@@ -116,7 +119,7 @@ def _row(
 
 
 def _prepare_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Path | None:
-    """Makes the run's folder and writes its settings; returns the checkpoint to go on from, if any."""
+    """Makes the run's folder and checks what it holds; returns the checkpoint to go on from, if any."""
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=run_dir):
@@ -130,8 +133,6 @@ def _prepare_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Path | 
         )
     if checkpoint is not None:
         _check_same(run_dir, config)
-    text = yaml.safe_dump(config_to_mapping(config), sort_keys=False)
-    write_atomically(run_dir / CONFIG_FILE, text.encode())
     return checkpoint
 
 

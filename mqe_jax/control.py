@@ -1,0 +1,238 @@
+"""Control: what an agent's action means, and the way from it to the actuators.
+
+| mode | per robot | meaning |
+|---|---|---|
+| `command` | one number per opened command (3) | velocity (and gait) commands for the walk policy |
+| `position` | 12 | joint target = default + scale x action, then PD at every physics step |
+| `torque` | 12 | joint torque = action x torque limit |
+
+Actions lie in [-1, 1]. PD control runs inside the physics engine, at every physics step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax import robot as go1
+from mqe_jax import walk_policy
+from mqe_jax.physics import Physics
+from mqe_jax.robot import RobotIndex
+from mqe_jax.terrain import nearest
+from mqe_jax.walk_policy import WalkMemory
+
+MODES = ("command", "position", "torque")
+
+# What an action of 1 adds to a command's default: (gain before clipping, greatest size), in the command's unit.
+COMMAND_RANGES = {
+    "vx": (2.0, 1.0),
+    "vy": (0.5, 0.5),
+    "yaw_rate": (0.5, 0.5),
+    "body_height": (0.12, 0.12),
+    "gait_frequency": (1.0, 1.0),
+    "footswing_height": (0.08, 0.08),
+    "pitch": (0.25, 0.25),
+    "roll": (0.1, 0.1),
+    "stance_width": (0.1, 0.1),
+    "stance_length": (0.06, 0.06),
+}
+
+
+def check_mode(mode: str) -> str:
+    """Returns the mode, or raises a ValueError that names the allowed ones."""
+    if mode not in MODES:
+        raise ValueError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
+    return mode
+
+
+def check_commands(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the opened commands, or raises a ValueError that names the allowed ones."""
+    for name in names:
+        if name not in COMMAND_RANGES:
+            allowed = ", ".join(COMMAND_RANGES)
+            raise ValueError(f"commands: unknown command {name!r}{nearest(name, COMMAND_RANGES)}; allowed: {allowed}")
+    if not names or len(set(names)) != len(names):
+        raise ValueError(f"commands: {tuple(names)} must name at least one command, none twice")
+    return tuple(names)
+
+
+def commands_from_action(action: jax.Array, names: Sequence[str], default: np.ndarray) -> jax.Array:
+    """Turns actions (A, len(names)) in [-1, 1] into walk commands (A, 15) around the defaults (15,)."""
+    gain = np.array([COMMAND_RANGES[name][0] for name in names], np.float32)
+    limit = np.array([COMMAND_RANGES[name][1] for name in names], np.float32)
+    index = np.array([walk_policy.command_index(name) for name in names])
+    change = jnp.clip(gain * action, -limit, limit)
+    return jnp.tile(jnp.asarray(default), (action.shape[0], 1)).at[:, index].add(change)
+
+
+ActuatorParams = dict[str, dict[str, jax.Array]]
+
+
+def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
+    """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6), `0.bias`, `2...`, `4...`.
+
+    Raises:
+        ValueError: if the file is missing, damaged, or holds other names or shapes.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    file = pathlib.Path(path)
+    if not file.is_file():
+        raise ValueError(f"actuator_network: no file {file}")
+    try:
+        flat = load_file(file)
+    except SafetensorError as error:
+        raise ValueError(f"actuator_network {file}: not a safetensors file ({error})") from None
+    params: ActuatorParams = {}
+    for layer, (n_in, n_out) in zip(("0", "2", "4"), ((6, 32), (32, 32), (32, 1)), strict=True):
+        for kind, shape in (("weight", (n_out, n_in)), ("bias", (n_out,))):
+            name = f"{layer}.{kind}"
+            found = tuple(flat[name].shape) if name in flat else "nothing"
+            if found != shape:
+                raise ValueError(f"actuator_network {file}: {name} has shape {found}; expected {shape}")
+            params.setdefault(layer, {})[kind] = jnp.asarray(flat[name], jnp.float32)
+    return params
+
+
+def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Computes joint torques (...), N m, by the actuator network.
+
+    Args:
+        params: of the network.
+        error: joint position minus target at this physics step and the two before (3, ...), rad.
+        velocity: joint velocity likewise (3, ...), rad/s.
+    """
+    x = jnp.moveaxis(jnp.concatenate([error, velocity]), 0, -1)
+    for layer in ("0", "2"):
+        x = jax.nn.soft_sign(jnp.matmul(x, params[layer]["weight"].T, precision="highest") + params[layer]["bias"])
+    return (jnp.matmul(x, params["4"]["weight"].T, precision="highest") + params["4"]["bias"])[..., 0]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ControlState:
+    """What control remembers of one world with R robots.
+
+    Attributes:
+        walk: the walk policies' memories, leading axis R; None where the robots do not walk by it.
+        delayed: actuator targets of the last steps, newest first (lag + 1, R, 12).
+        error: joint position errors of the last two physics steps (2, R, 12), rad; empty without an actuator network.
+        velocity: joint velocities likewise (2, R, 12), rad/s.
+    """
+
+    walk: WalkMemory | None
+    delayed: jax.Array
+    error: jax.Array
+    velocity: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Controller:
+    """Turns actions into actuator targets and steps the physics under them.
+
+    Attributes:
+        mode: one of `MODES`.
+        physics: steps the world.
+        index: the robots in it.
+        walk_params: weights of the walk policy, or None where it is not used.
+        actuator_params: weights of the actuator network, or None for PD.
+        commands: the opened commands.
+        default_commands: of the walk policy (15,).
+        lag: greatest action lag, environment steps.
+    """
+
+    mode: str
+    physics: Physics
+    index: RobotIndex
+    walk_params: walk_policy.Params | None
+    actuator_params: ActuatorParams | None
+    commands: tuple[str, ...]
+    default_commands: np.ndarray
+    lag: int = 0
+
+    @property
+    def action_size(self) -> int:
+        """Numbers per robot."""
+        return len(self.commands) if self.mode == "command" else go1.NUM_JOINTS
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """Actuator targets (R, 12) of a robot that is told nothing."""
+        rest = np.zeros(go1.NUM_JOINTS) if self.mode == "torque" else go1.DEFAULT_JOINTS
+        return np.tile(rest, (self.index.num_robots, 1)).astype(np.float32)
+
+    def reset(self) -> ControlState:
+        """Returns the control state of a fresh world."""
+        robots = self.index.num_robots
+        walk = None
+        if self.walk_params is not None:
+            walk = jax.tree.map(lambda x: jnp.broadcast_to(x, (robots, *x.shape)), walk_policy.initial_memory())
+        past = jnp.zeros((2 if self.actuator_params is not None else 0, robots, go1.NUM_JOINTS))
+        return ControlState(walk, jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1)), past, past)
+
+    def targets(
+        self, state: ControlState, action: jax.Array, gravity_b: jax.Array, joint_position: jax.Array,
+        joint_velocity: jax.Array, npc_commands: jax.Array | None = None,
+    ) -> tuple[jax.Array, ControlState]:  # fmt: skip
+        """Computes the actuator targets (R, 12) of all robots from the agents' actions.
+
+        Args:
+            state: control state.
+            action: of the A agents, the first robots (A, action_size), in [-1, 1].
+            gravity_b: unit gravity vectors (R, 3).
+            joint_position: (R, 12), rad.
+            joint_velocity: (R, 12), rad/s.
+            npc_commands: walk commands of the other robots (R - A, 15), if there are any.
+        """
+        agents = action.shape[0]
+        target = jnp.asarray(self.neutral)
+        commands = jnp.zeros((agents, 15)) + self.default_commands
+        if self.mode == "command":
+            commands = commands_from_action(action, self.commands, self.default_commands)
+        elif self.mode == "position":
+            target = target.at[:agents].set(walk_policy.joint_targets(action))
+        else:
+            target = target.at[:agents].set(action * go1.TORQUE_LIMIT)
+        if self.walk_params is None or state.walk is None:
+            return target, state
+        if npc_commands is not None:
+            commands = jnp.concatenate([commands, npc_commands])
+        walked, walk = jax.vmap(walk_policy.walk, (None, 0, 0, 0, 0, 0))(
+            self.walk_params, state.walk, commands, gravity_b, joint_position, joint_velocity
+        )
+        walks = np.arange(len(walked))[:, None] >= (0 if self.mode == "command" else agents)
+        return jnp.where(walks, walked, target), dataclasses.replace(state, walk=walk)
+
+    def apply(
+        self, state: ControlState, data: mjx.Data, target: jax.Array, lag: jax.Array,
+        fields: dict[str, jax.Array], xfrc_applied: jax.Array | None,
+    ) -> tuple[mjx.Data, ControlState]:  # fmt: skip
+        """Steps the physics by one environment step under targets (R, 12) that act `lag` () steps late."""
+        delayed = jnp.concatenate([target[None], state.delayed[:-1]])
+        target = delayed[lag] if self.lag else target
+        state = dataclasses.replace(state, delayed=delayed)
+        scatter = lambda values: jnp.zeros(self.physics.model.nu).at[self.index.actuator].set(values)  # noqa: E731
+        params = self.actuator_params
+        if params is None:
+            return self.physics.step(data, scatter(target), fields=fields, xfrc_applied=xfrc_applied), state
+
+        def substep(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
+            data, errors, velocities = carry
+            errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
+            velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
+            torque = jnp.clip(actuator_torque(params, errors, velocities), -go1.TORQUE_LIMIT, go1.TORQUE_LIMIT)
+            data = self.physics.step(data, scatter(torque), fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
+            return (data, errors[:2], velocities[:2]), None
+
+        (data, error, velocity), _ = jax.lax.scan(
+            substep, (data, state.error, state.velocity), None, self.physics.num_substeps
+        )
+        return data, dataclasses.replace(state, error=error, velocity=velocity)

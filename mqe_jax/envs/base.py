@@ -1,0 +1,542 @@
+"""The environment core: one world of robots as pure `reset` and `step` functions, batched by `jax.vmap`.
+
+A task is a subclass in a file of its own that says, in this order: its parameters, its scene, what it draws at
+reset, its observation, its reward terms and its ending. Everything that tasks share is here: spawning, control,
+physics, randomisation, falls, collisions, the time limit and the guard against diverged physics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, ClassVar
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax import robot as go1
+from mqe_jax import walk_policy
+from mqe_jax.control import Controller, ControlState, check_commands, check_mode, load_actuator_network
+from mqe_jax.envs.observation import Block, ObservationLayout
+from mqe_jax.envs.overrides import Range
+from mqe_jax.envs.reward import weigh
+from mqe_jax.physics import Physics
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene, build_model, compile_scene
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomization:
+    """Domain randomisation; every range is drawn uniformly at reset, for each robot by itself. None or 0 is off.
+
+    Attributes:
+        friction: sliding friction of the robots' shapes (lowest, highest).
+        payload: extra mass of the trunk, kg.
+        center_of_mass: shift of the trunk's centre of mass along each axis, m.
+        motor_strength: factor on all torques.
+        action_lag: greatest delay of the actuator targets, environment steps; drawn once a world.
+        push: greatest sudden change of a trunk's horizontal velocity, m/s.
+        push_period: mean time between pushes, s.
+        observation_noise: standard deviation of the noise on every observed number.
+    """
+
+    friction: Range | None = None
+    payload: Range | None = None
+    center_of_mass: Range | None = None
+    motor_strength: Range | None = None
+    action_lag: int = 0
+    push: float = 0.0
+    push_period: float = 5.0
+    observation_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("friction", "payload", "center_of_mass", "motor_strength"):
+            value = getattr(self, name)
+            if value is not None and (len(value) != 2 or value[0] > value[1]):
+                raise ValueError(f"randomization.{name}: {value} must be (lowest, highest) or none")
+        if self.action_lag < 0 or self.push < 0 or self.observation_noise < 0 or self.push_period <= 0:
+            raise ValueError("randomization: action_lag, push, observation_noise must be >= 0 and push_period > 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskParams:
+    """Parameters that all tasks have; a task adds its own.
+
+    Attributes:
+        num_agents: robots that are told what to do.
+        episode_length: time limit, s.
+        spawn_height: of the trunks, m.
+        spawn_noise: half-width of the uniform noise on the spawn position in x and y, m.
+        spawn_joint_scale: the joints start at their default angles times a factor from this range.
+        spawn_velocity: half-width of the uniform noise on all six base velocities, m/s and rad/s.
+        max_roll: an episode ends when any |roll| is greater, rad.
+        max_pitch: likewise |pitch|, rad.
+        min_height: an episode ends when any trunk is lower, m.
+        max_height: likewise higher, m.
+        end_on_collision: an episode ends when any trunk touches anything with more than `collision_force`.
+        collision_force: N.
+        gait: of the walk policy: trot, pronk, bound or pace.
+        commands: the walk commands that the action sets, in order.
+        walk_policy: weights file of the walk policy; the package's own if None.
+        actuator_network: weights file of an actuator network in place of PD; none if None.
+        friction: sliding friction of robots and ground.
+        solver_iterations: at most so many solver iterations per physics step.
+        contacts_per_env: contacts that a world may have on average, for Warp's buffer.
+        rows_per_env: constraint rows that a world may have, for Warp's buffer.
+        randomization: domain randomisation.
+    """
+
+    num_agents: int = 2
+    episode_length: float = 10.0
+    spawn_height: float = 0.42
+    spawn_noise: float = 0.1
+    spawn_joint_scale: Range = (0.7, 1.3)
+    spawn_velocity: float = 0.5
+    max_roll: float = 0.8
+    max_pitch: float = 1.6
+    min_height: float = -1.0
+    max_height: float = 100.0
+    end_on_collision: bool = False
+    collision_force: float = 1.0
+    gait: str = "trot"
+    commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
+    walk_policy: str | None = None
+    actuator_network: str | None = None
+    friction: float = 1.0
+    solver_iterations: int = 4
+    contacts_per_env: int = 24
+    rows_per_env: int = 128
+    randomization: Randomization = Randomization()
+
+    def __post_init__(self) -> None:
+        for name in ("episode_length", "collision_force", "friction", "solver_iterations"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name}: {getattr(self, name)} must be positive")
+        check_commands(self.commands)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class World:
+    """How one world differs from the model: its randomised physics (R robots).
+
+    Attributes:
+        friction: (R,).
+        payload: (R,), kg.
+        center_of_mass: (R, 3), m.
+        motor_strength: (R,).
+        action_lag: () int32, environment steps.
+    """
+
+    friction: jax.Array
+    payload: jax.Array
+    center_of_mass: jax.Array
+    motor_strength: jax.Array
+    action_lag: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """State of one world with A agents, R robots and G gates; a batch has leading axes.
+
+    Attributes:
+        data: physics state.
+        obs: what the agents see now (A, O); after an auto-reset, of the fresh world.
+        privileged_obs: everything in the simulator, for critics and distillation (P,).
+        final_obs: what the agents saw at the end of the last step (A, O): differs from `obs` after an auto-reset.
+        final_privileged_obs: likewise (P,).
+        reward: (A,).
+        terminated: () bool; an episode ended by its rules.
+        truncated: () bool; it ended by the time limit.
+        metrics: `reward/<name>`, `average_step_reward`, `success`, `diverged` and the task's own, () each.
+        step: environment steps since the reset () int32.
+        gates: centres of the gates (G, 2), m, environment frame.
+        control: what control remembers.
+        world: randomised physics.
+        task: the task's own fields.
+        key: random key of the world.
+    """
+
+    data: mjx.Data
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    step: jax.Array
+    gates: jax.Array
+    control: ControlState
+    world: World
+    task: Any
+    key: jax.Array
+
+
+class QuadrupedEnv:
+    """Base of all tasks; functions of one world, to be batched by `jax.vmap` and compiled by `jax.jit`.
+
+    Attributes:
+        params: the task's parameters.
+        impl: physics engine: 'jax', 'warp' or 'c'.
+        control: 'command', 'position' or 'torque'.
+        num_agents: A.
+        teams: agents of each team.
+        dt: environment step, s.
+    """
+
+    name: ClassVar[str] = ""
+    title: ClassVar[str] = ""
+    Params: ClassVar[type[TaskParams]] = TaskParams
+    dt = walk_policy.STEP
+
+    def __init__(
+        self, params: TaskParams | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
+    ) -> None:
+        self.params: Any = self.Params() if params is None else params
+        self.control = check_mode(control)
+        if num_envs < 1:
+            raise ValueError(f"num_envs: {num_envs} must be at least 1")
+        self.num_agents = self.params.num_agents
+        self._scene = dataclasses.replace(
+            self.scene(), friction=self.params.friction, solver_iterations=self.params.solver_iterations,
+            torque_control=control == "torque" or self.params.actuator_network is not None,
+        )  # fmt: skip
+        self.compiled = compile_scene(self._scene)
+        self.robot = self.compiled.robot
+        self.physics = Physics(
+            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self.params.contacts_per_env,
+            rows_per_env=self.params.rows_per_env,
+        )  # fmt: skip
+        self.impl = self.physics.impl
+        network = self.params.actuator_network if control != "torque" else None
+        walks = control == "command" or self._scene.num_robots > self.num_agents
+        self.controller = Controller(
+            mode=control, physics=self.physics, index=self.robot,
+            walk_params=walk_policy.load_params(self.params.walk_policy) if walks else None,
+            actuator_params=load_actuator_network(network) if network else None, commands=self.params.commands,
+            default_commands=walk_policy.default_commands(self.params.gait), lag=self.params.randomization.action_lag,
+        )  # fmt: skip
+
+    # -- what a task says ---------------------------------------------------------------------------------------
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        raise TypeError(f"{type(self).__name__}: scene() is not defined")
+
+    def spawn(self, key: jax.Array) -> jax.Array:
+        """Draws poses x, y, z, yaw (R, 4), m and rad, of all robots."""
+        params = self.params
+        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.compiled.layout.spawn], np.float32)
+        noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        return jnp.asarray(pose).at[:, :2].add(noise)
+
+    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draws where movable objects start, into qpos (nq,) and qvel (nv,)."""
+        return qpos, qvel
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, gates: jax.Array) -> Any:
+        """Returns the task's own fields of a fresh world."""
+        return None
+
+    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array | None:
+        """Returns walk commands (R - A, 15) of the robots that are no agents."""
+        return None
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        raise TypeError(f"{type(self).__name__}: observation_layout is not defined")
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (A, width)."""
+        raise TypeError(f"{type(self).__name__}: observe() is not defined")
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms, () or (A,), and the task's fields after the step.
+
+        Args:
+            state: the state before the step, with the physics after it.
+            readings: of the robots after the step.
+            collision: whether any trunk touches anything () bool.
+        """
+        raise TypeError(f"{type(self).__name__}: rewards() is not defined")
+
+    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+        """Returns whether the task's own rules end the episode () bool."""
+        return jnp.zeros((), bool)
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Returns `success` () and further `success/...` measures, which count when the episode ends.
+
+        Args:
+            state: after the step.
+            readings: of the robots.
+            failed: whether the step ended by a fall, a collision or a divergence () bool.
+        """
+        return {"success": jnp.zeros(())}
+
+    # -- what users call ----------------------------------------------------------------------------------------
+
+    @property
+    def teams(self) -> tuple[tuple[int, ...], ...]:
+        """Agents of each team; one team where all work together."""
+        return (tuple(range(self.num_agents)),)
+
+    @property
+    def action_size(self) -> int:
+        """Length of an agent's action."""
+        return self.controller.action_size
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an agent's observation."""
+        return self.observation_layout.size
+
+    @functools.cached_property
+    def privileged_observation_size(self) -> int:
+        """Length of the privileged observation."""
+        return jax.eval_shape(self.reset, jax.random.PRNGKey(0)).privileged_obs.shape[0]
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """All agents' actions (A, action_size) in [-1, 1]."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (self.num_agents, self.action_size), np.float32)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """All agents' observations (A, O)."""
+        return gymnasium.spaces.Box(-np.inf, np.inf, (self.num_agents, self.observation_size), np.float32)
+
+    @functools.cached_property
+    def mj_model(self) -> mujoco.MjModel:
+        """The model with everything to look at; its qpos and mocap bodies are those of the physics."""
+        return build_model(self._scene, visual=True)[0]
+
+    @property
+    def max_steps(self) -> int:
+        """Environment steps until the time limit."""
+        return round(self.params.episode_length / self.dt)
+
+    def with_room_for(self, num_envs: int) -> QuadrupedEnv:
+        """Returns the environment with buffers for `num_envs` worlds, which only Warp's contacts need."""
+        if self.impl != "warp" or self.physics.num_envs >= num_envs:
+            return self
+        return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
+
+    def reset(self, key: jax.Array) -> State:
+        """Returns a freshly drawn world; needs no forward pass of the physics."""
+        next_key, gate_key, spawn_key, body_key, object_key, world_key, task_key, noise_key = jax.random.split(key, 8)
+        gates = self._draw_gates(gate_key)
+        qpos, qvel = self._draw_robots(spawn_key, body_key)
+        qpos, qvel = self.reset_objects(object_key, qpos, qvel)
+        ctrl = jnp.zeros(self.compiled.model.nu).at[self.robot.actuator].set(self.controller.neutral)
+        data = self.physics.init(qpos, qvel, self._mocap(gates), ctrl)
+        readings = self.read(data)
+        no = jnp.zeros((), bool)
+        empty = jnp.zeros((0,))
+        state = State(
+            data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
+            reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
+            step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
+            world=self._draw_world(world_key), task=self.reset_task(task_key, readings, gates), key=next_key,
+        )  # fmt: skip
+        terms, _ = self.rewards(state, readings, no)
+        _, logged = weigh(terms, self.params.rewards, self.num_agents)
+        metrics = {**logged, **self.outcome(state, readings, no), "collision": 0.0, "diverged": 0.0}
+        state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in metrics})
+        return self._observed(state, readings, noise_key)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one world by one environment step.
+
+        Args:
+            state: of the world; one that has ended goes on unless it is reset (see `VectorEnv`).
+            action: (A, action_size), floating point, in [-1, 1] (clipped to it).
+
+        Raises:
+            ValueError: if the action has another shape or dtype, or is not finite (where that can be seen: in
+                compiled code a world with such an action ends as diverged).
+        """
+        action = self._checked(action)
+        bad_action = ~jnp.all(jnp.isfinite(action))
+        action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
+        key, push_key, noise_key = jax.random.split(state.key, 3)
+
+        before = self.read(state.data)
+        target, control = self.controller.targets(
+            state.control, action, before.projected_gravity, before.joint_position, before.joint_velocity,
+            self.npc_commands(state, before),
+        )  # fmt: skip
+        data = self._pushed(state.data, push_key)
+        data, control = self.controller.apply(
+            control, data, target, state.world.action_lag, self._fields(state.world), self.external_forces(state)
+        )
+        readings = self.read(data)
+        state = dataclasses.replace(state, data=data, control=control, step=state.step + 1, key=key)
+
+        diverged = bad_action | self._diverged(data)
+        collision = jnp.any(readings.trunk_force[: self.num_agents] > self.params.collision_force)
+        terms, task = self.rewards(state, readings, collision)
+        reward, logged = weigh(terms, self.params.rewards, self.num_agents)
+        state = dataclasses.replace(state, task=task)
+        fallen = self.fallen(readings)
+        failed = fallen | diverged | (collision & self.params.end_on_collision)
+        terminated = failed | self.ending(state, readings)
+        metrics = {**logged, **self.outcome(state, readings, failed), "collision": collision}
+        clean = lambda x: jnp.where(diverged, 0.0, jnp.asarray(x, jnp.float32))  # noqa: E731
+        metrics = {name: clean(value) for name, value in metrics.items()}
+        metrics["diverged"] = diverged.astype(jnp.float32)
+        state = dataclasses.replace(
+            state, reward=clean(reward), terminated=terminated, metrics=metrics,
+            truncated=~terminated & (state.step >= self.max_steps),
+        )  # fmt: skip
+        return self._observed(state, readings, noise_key)
+
+    def read(self, data: mjx.Data) -> RobotReadings:
+        """Reads all robots of one world."""
+        return go1.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
+
+    def fallen(self, readings: RobotReadings) -> jax.Array:
+        """Returns whether any robot lies on its side or back, or is too low or too high () bool."""
+        params = self.params
+        roll, pitch, height = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1]), readings.position_w[:, 2]
+        out = (roll > params.max_roll) | (pitch > params.max_pitch)
+        return jnp.any(out | (height < params.min_height) | (height > params.max_height))
+
+    def external_forces(self, state: State) -> jax.Array | None:
+        """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
+        return None
+
+    def privileged_layout(self) -> ObservationLayout:
+        """The blocks of the privileged observation, in order; raw units."""
+        robots, model = self.robot.num_robots, self.compiled.model
+        base = (
+            Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),
+            Block("angular_velocity", 3, "rad/s, body"), Block("joint_position", 12, "rad, minus default"),
+            Block("joint_velocity", 12, "rad/s"),
+        )  # fmt: skip
+        blocks = [Block(f"robot{i}/{block.name}", block.width, block.meaning) for i in range(robots) for block in base]
+        blocks.append(Block("objects/qpos", model.nq - 19 * robots, "positions of everything that is no robot"))
+        blocks.append(Block("objects/qvel", model.nv - 18 * robots, "velocities of everything that is no robot"))
+        blocks.append(Block("gates", 2 * len(self.compiled.layout.anchors), "centres, m"))
+        return ObservationLayout(tuple(block for block in blocks if block.width))
+
+    # -- the common parts of reset and step ---------------------------------------------------------------------
+
+    def _draw_gates(self, key: jax.Array) -> jax.Array:
+        mean, spread = self.compiled.anchor_mean, self.compiled.anchor_spread
+        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
+
+    def _mocap(self, gates: jax.Array) -> jax.Array:
+        model = self.compiled.model
+        if not model.nmocap:
+            return jnp.zeros((0, 3))
+        return self.compiled.wall_positions(gates)
+
+    def _draw_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        params, model, index = self.params, self.compiled.model, self.robot
+        pose = self.spawn(spawn_key)
+        joint_key, velocity_key = jax.random.split(body_key)
+        low, high = params.spawn_joint_scale
+        joints = go1.DEFAULT_JOINTS * jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
+        joints = jnp.clip(joints, go1.JOINT_LOWER, go1.JOINT_UPPER)
+        speed = params.spawn_velocity
+        velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
+        level = jnp.zeros(len(pose))
+        turn = go1.euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
+        qpos = jnp.asarray(model.qpos0, jnp.float32).at[index.joint_qpos].set(joints)
+        qpos = qpos.at[index.base_qpos].set(jnp.concatenate([pose[:, :3], turn], axis=-1))
+        return qpos, jnp.zeros(model.nv).at[index.base_qvel].set(velocity)
+
+    def _draw_world(self, key: jax.Array) -> World:
+        random, robots = self.params.randomization, self.robot.num_robots
+        keys = jax.random.split(key, 5)
+
+        def draw(key: jax.Array, span: Range | None, shape: tuple[int, ...], usual: float) -> jax.Array:
+            if span is None:
+                return jnp.full(shape, usual)
+            return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
+
+        return World(
+            friction=draw(keys[0], random.friction, (robots,), self.params.friction),
+            payload=draw(keys[1], random.payload, (robots,), 0.0),
+            center_of_mass=draw(keys[2], random.center_of_mass, (robots, 3), 0.0),
+            motor_strength=draw(keys[3], random.motor_strength, (robots,), 1.0),
+            action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
+        )
+
+    def _fields(self, world: World) -> dict[str, jax.Array]:
+        """Returns the model fields that this world has otherwise than the model."""
+        random, model, index = self.params.randomization, self.compiled.model, self.robot
+        fields = {}
+        as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+        if random.friction is not None:
+            fields["geom_friction"] = as_float(model.geom_friction).at[index.geoms, 0].set(world.friction[:, None])
+        if random.payload is not None:
+            fields["body_mass"] = as_float(model.body_mass).at[index.trunk_body].add(world.payload)
+        if random.center_of_mass is not None:
+            fields["body_ipos"] = as_float(model.body_ipos).at[index.trunk_body].add(world.center_of_mass)
+        if random.motor_strength is not None:
+            strength = jnp.ones(model.nu).at[index.actuator].set(world.motor_strength[:, None])[:, None]
+            fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
+            fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
+        return fields
+
+    def _pushed(self, data: mjx.Data, key: jax.Array) -> mjx.Data:
+        random, index = self.params.randomization, self.robot
+        if not random.push:
+            return data
+        when_key, size_key = jax.random.split(key)
+        now = jax.random.bernoulli(when_key, self.dt / random.push_period, (index.num_robots, 1))
+        change = jax.random.uniform(size_key, (index.num_robots, 2), minval=-random.push, maxval=random.push)
+        return data.replace(qvel=data.qvel.at[index.base_qvel[:, :2]].add(jnp.where(now, change, 0.0)))
+
+    def _checked(self, action: jax.Array) -> jax.Array:
+        action = jnp.asarray(action)
+        shape = (self.num_agents, self.action_size)
+        if action.shape != shape:
+            raise ValueError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
+        if not jnp.issubdtype(action.dtype, jnp.floating):
+            raise ValueError(f"action: dtype {action.dtype}; expected a floating-point type")
+        if not isinstance(action, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(action))):
+            raise ValueError("action: holds NaN or infinite numbers; expected numbers in [-1, 1]")
+        return action
+
+    def _diverged(self, data: mjx.Data) -> jax.Array:
+        finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+        position = data.qpos[self.robot.base_qpos[:, :3]]
+        return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
+
+    def _observed(self, state: State, readings: RobotReadings, key: jax.Array) -> State:
+        obs = self.observation_layout.pack(self.observe(state, readings))
+        noise = self.params.randomization.observation_noise
+        if noise:
+            obs = obs + noise * jax.random.normal(key, obs.shape)
+        robots = readings.joint_position.shape[0]
+        per_robot = jnp.concatenate(
+            [
+                readings.position_w, readings.quaternion, readings.linear_velocity_w, readings.angular_velocity_b,
+                readings.joint_position - go1.DEFAULT_JOINTS, readings.joint_velocity,
+            ],
+            axis=-1,
+        )  # fmt: skip
+        assert robots == self.robot.num_robots
+        index, model = self.robot, self.compiled.model
+        used_qpos = np.concatenate([index.base_qpos.ravel(), index.joint_qpos.ravel()])
+        used_qvel = np.concatenate([index.base_qvel.ravel(), index.joint_qvel.ravel()])
+        rest_qpos = np.setdiff1d(np.arange(model.nq), used_qpos)
+        rest_qvel = np.setdiff1d(np.arange(model.nv), used_qvel)
+        privileged = jnp.concatenate(
+            [per_robot.ravel(), state.data.qpos[rest_qpos], state.data.qvel[rest_qvel], state.gates.ravel()]
+        )
+        obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
+        return dataclasses.replace(
+            state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged
+        )

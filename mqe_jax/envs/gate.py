@@ -1,0 +1,144 @@
+"""go1gate, the paper's Narrow Gate: two robots must pass, one after the other, a gap for one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs import reward
+from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+
+
+@dataclasses.dataclass(frozen=True)
+class GateRewards:
+    """Weights of the reward terms.
+
+    Attributes:
+        success: per robot past the gate.
+        approach: per m by which a robot came closer to its target.
+        crowding: per robot and 1 / d^2 while the robots are closer than 0.5 m.
+        collision: when any trunk touches anything.
+    """
+
+    success: float = 5.0
+    approach: float = 1.0
+    crowding: float = -0.025
+    collision: float = -2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class GateParams(TaskParams):
+    """Parameters of Narrow Gate.
+
+    Attributes:
+        track_width: m.
+        gate_width: of the gap, m.
+        gate_depth: of the wall along x, m.
+        gate_random: half-widths of the range of the gap's centre in x and y, m.
+        past_gate: a robot is through when it is so far behind the gate's centre, m.
+        target_x: x of the robots' targets, m.
+        target_y: y of the targets, m; the robots cross: the first goes to the left.
+        rewards: weights.
+    """
+
+    episode_length: float = 10.0
+    spawn_noise: float = 0.0
+    min_height: float = 0.08
+    max_height: float = 1.5
+    end_on_collision: bool = True
+    track_width: float = 3.0
+    gate_width: float = 0.6
+    gate_depth: float = 0.1
+    gate_random: tuple[float, float] = (0.5, 0.5)
+    past_gate: float = 0.25
+    target_x: float = 5.5
+    target_y: float = 0.75
+    rewards: GateRewards = GateRewards()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class GateState:
+    """`distance`: of each robot to its target after the last step (2,), m."""
+
+    distance: jax.Array
+
+
+class Go1Gate(QuadrupedEnv):
+    """Narrow Gate.
+
+    - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is drawn at reset.
+    - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2.
+    - Reward: see `GateRewards`; shared.
+    - End: a fall, a collision, or 10 s. Success: both are through without a collision.
+
+    Source: paper, section III and table of rewards.
+    """
+
+    name = "go1gate"
+    title = "Narrow Gate"
+    Params: ClassVar[type[TaskParams]] = GateParams
+
+    def __init__(self, params: TaskParams | None = None, **engine: Any) -> None:
+        if params is not None and params.num_agents != 2:
+            raise ValueError(f"num_agents: {params.num_agents}; go1gate is for 2 robots")
+        super().__init__(params, **engine)
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
+        track = Track(blocks=(Init(2.0), gate, Plane(1.0), Closing()), width=params.track_width)
+        contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk", "foot"), object=())
+        return Scene(track, num_robots=2, contacts=contacts)
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, gates: jax.Array) -> GateState:
+        """Returns the task's own fields of a fresh world."""
+        return GateState(self.target_distance(readings))
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout(
+            (
+                Block("one_hot", 2, ONE_HOT),
+                Block("base", 6, BASE_INFO),
+                Block("mate", 6, BASE_INFO),
+                Block("gate", 2, "centre of the gap, m"),
+            )
+        )
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width)."""
+        info = readings.base_info
+        return {"one_hot": jnp.eye(2), "base": info, "mate": others(info), "gate": for_all(state.gates, 2)}
+
+    def target_distance(self, readings: RobotReadings) -> jax.Array:
+        """Returns each robot's horizontal distance to its target (2,), m."""
+        params = self.params
+        target = np.array([[params.target_x, params.target_y], [params.target_x, -params.target_y]], np.float32)
+        return jnp.linalg.norm(readings.position_w[:, :2] - target, axis=-1)
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        distance = self.target_distance(readings)
+        terms = {
+            "success": reward.past(readings.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
+            "approach": reward.decrease(state.task.distance, distance),
+            "crowding": reward.crowding(readings.position_w[:, :2]),
+            "collision": collision.astype(jnp.float32),
+        }
+        return terms, GateState(distance)
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: both robots are through; `success/one`: at least one is, however the episode ended."""
+        through = readings.position_w[:, 0] > state.gates[0, 0] + self.params.past_gate
+        return {"success": jnp.all(through) & ~failed, "success/one": jnp.any(through)}

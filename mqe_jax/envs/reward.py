@@ -1,0 +1,52 @@
+"""Rewards: named terms times weights of the same names, summed and logged in one place."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def weigh(terms: Mapping[str, jax.Array], weights: Any, num_agents: int) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Sums weighted terms into the agents' rewards (A,), and names them for logging.
+
+    A term is () if all agents share it, or (A,) if each has its own; of the latter the first agent's is logged.
+
+    Args:
+        terms: unweighted terms by name.
+        weights: a dataclass whose fields have the same names.
+        num_agents: A.
+
+    Returns:
+        reward (A,), and `reward/<name>` () of every term with their sum `average_step_reward`.
+    """
+    names = [field.name for field in dataclasses.fields(weights)]
+    if set(terms) != set(names):
+        raise ValueError(f"reward: terms {sorted(terms)} do not match the weights {sorted(names)}")
+    weighted = {name: getattr(weights, name) * jnp.asarray(terms[name], jnp.float32) for name in names}
+    total = sum((jnp.broadcast_to(value, (num_agents,)) for value in weighted.values()), jnp.zeros(num_agents))
+    logged = {f"reward/{name}": value if value.ndim == 0 else value[0] for name, value in weighted.items()}
+    logged["average_step_reward"] = total[0]
+    return total, logged
+
+
+def past(position_x: jax.Array, line_x: jax.Array | float, margin: float = 0.0) -> jax.Array:
+    """Counts who is past a line across the track by a margin, m: (N,) -> ()."""
+    return jnp.sum(position_x > line_x + margin).astype(jnp.float32)
+
+
+def decrease(before: jax.Array, after: jax.Array) -> jax.Array:
+    """Sums the decrease of distances over a step: (N,), (N,) -> (), m."""
+    return jnp.sum(before - after)
+
+
+def crowding(position: jax.Array, within: float = 0.5) -> jax.Array:
+    """Sums 1 / d^2 over robots, for each other robot at a distance d below `within` m: (A, D) -> ()."""
+    count = position.shape[0]
+    apart = position[:, None] - position[None]
+    square = jnp.sum(jnp.square(apart), axis=-1) + jnp.eye(count)
+    near = (square < within**2) & ~jnp.eye(count, dtype=bool)
+    return jnp.sum(jnp.where(near, 1.0 / jnp.maximum(square, 1e-2), 0.0))
