@@ -292,7 +292,15 @@ def _draw_gl(
     vis.headlight.ambient[:] = 0.38
     vis.headlight.diffuse[:] = 0.22
     vis.headlight.specular[:] = 0.0
+    # Shadows reach as far as the scene: MuJoCo casts them around the sun's place, up to `shadowclip` extents.
+    low, high = _extent(model, episode)
+    model.stat.extent = float(np.linalg.norm(high - low) / 2)
+    model.vis.map.shadowclip = 1.0
+    model.vis.map.znear, model.vis.map.zfar = 0.1, 10.0  # extents; a wider range blurs depth into stripes
     if model.nlight:
+        # Leaning along one axis only: otherwise the software renderer draws stripes on the floor.
+        model.light_dir[0] = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
+        model.light_pos[0] = (low + high) / 2 - 2 * model.stat.extent * model.light_dir[0]
         model.light_diffuse[:] = 0.45
         model.light_specular[:] = 0.05
     option = mujoco.MjvOption()
