@@ -1,0 +1,179 @@
+"""Measures a walk policy: tracking, falls, kicks, slopes, forces, standing still and gait frequency."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax import robot as go1
+from mqe_jax import walk_policy
+from mqe_jax.envs.walk import Condition, WalkEnv, WalkTask
+from mqe_jax.terrain import nearest
+
+WARM_UP = 1.0  # s at the start of an episode that no error counts
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """What one measurement asks.
+
+    Attributes:
+        duration: of an episode, s.
+        velocity: commanded vx, vy, yaw rate, m/s and rad/s; None draws them uniformly from +-1, +-0.6, +-1.
+        gait: name of the gait.
+        frequency: commanded gait frequency, Hz.
+        slope: rise of the ground along x, rad.
+        force: sustained force along and to the left of the heading, N.
+        kick: sudden change of velocity every 5 s, m/s.
+        meaning: a line of explanation.
+    """
+
+    duration: float = 20.0
+    velocity: tuple[float, float, float] | None = None
+    gait: str = "trot"
+    frequency: float = 3.0
+    slope: float = 0.0
+    force: tuple[float, float] = (0.0, 0.0)
+    kick: float = 0.0
+    meaning: str = ""
+
+
+SCENARIOS = {
+    "flat": Scenario(meaning="random commands on flat ground"),
+    "kicks": Scenario(kick=0.5, meaning="the same with kicks of 0.5 m/s every 5 s"),
+    "slope_up": Scenario(velocity=(1.0, 0.0, 0.0), slope=0.25, meaning="vx 1.0 up a slope of 0.25 rad"),
+    "slope_down": Scenario(velocity=(1.0, 0.0, 0.0), slope=-0.25, meaning="vx 1.0 down a slope of 0.25 rad"),
+    "stand": Scenario(duration=11.0, velocity=(0.0, 0.0, 0.0), meaning="zero command"),
+    "force_against": Scenario(velocity=(0.5, 0.0, 0.0), force=(-30.0, 0.0), meaning="vx 0.5 against 30 N"),
+    "force_across": Scenario(velocity=(0.5, 0.0, 0.0), force=(0.0, 30.0), meaning="vx 0.5 across 30 N"),
+    "trot": Scenario(velocity=(0.5, 0.0, 0.0), meaning="vx 0.5, trot at 3 Hz"),
+    "pace": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", meaning="vx 0.5, pace at 3 Hz"),
+    "trot_slow": Scenario(velocity=(0.5, 0.0, 0.0), frequency=2.0, meaning="vx 0.5, trot at 2 Hz"),
+    "pace_fast": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", frequency=4.0, meaning="vx 0.5, pace at 4 Hz"),
+}
+
+
+def make_env(impl: str, episodes: int) -> WalkEnv:
+    """Makes the walking environment as it is for measuring: nothing randomised, commands kept."""
+    task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
+    return WalkEnv(task, impl=impl, num_envs=episodes)
+
+
+def conditions(scenario: Scenario, key: jax.Array, episodes: int) -> Condition:
+    """Draws what every episode asks; leading axis `episodes`."""
+    span = jnp.array([1.0, 0.6, 1.0])
+    velocity = jax.random.uniform(key, (episodes, 3), minval=-span, maxval=span)
+    if scenario.velocity is not None:
+        velocity = jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
+    rest = walk_policy.default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
+    full = lambda values: jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))  # noqa: E731
+    return Condition(
+        commands=jnp.concatenate([velocity, full(rest)], axis=1),
+        slope=full((scenario.slope, 0.0)), force=full(scenario.force), kick=full(scenario.kick),
+    )  # fmt: skip
+
+
+def measure(env: WalkEnv, params: walk_policy.Params, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, float]:
+    """Runs one scenario and returns its figures.
+
+    Returns:
+        rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors after the first second, until a fall;
+        fall_rate: share of episodes with a fall; speed: mean velocity along the heading, m/s; drift and drift_p95:
+        mean and 95th percentile of the distance covered in the 10 s after the first, m; step_frequency: median
+        over episodes and feet of the strongest frequency of the foot's height, Hz.
+    """
+    steps, warm = round(scenario.duration / walk_policy.STEP), round(WARM_UP / walk_policy.STEP)
+    reset_key, condition_key = jax.random.split(jax.random.PRNGKey(seed))
+
+    def advance(carry: Any, _: None) -> Any:
+        state, memory = carry
+
+        def one(state: Any, memory: Any) -> Any:
+            readings = env.read(state.data)
+            gravity = state.obs[:3]
+            commands = state.condition.commands
+            target, memory = walk_policy.walk(
+                params, memory, commands, gravity, readings.joint_position[0], readings.joint_velocity[0]
+            )
+            state = env.step(state, memory.action)
+            readings = env.read(state.data)
+            quaternion = readings.quaternion[0]
+            feet = go1.foot_positions(readings.joint_position[0])
+            height = go1.rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
+            squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
+            speed = go1.rotate_inverse(quaternion, readings.linear_velocity_w[0])[0]
+            return state, memory, (squares, speed, readings.position_w[0, :2], height, state.terminated)
+
+        state, memory, record = jax.vmap(one)(state, memory)
+        return (state, memory), record
+
+    @jax.jit
+    def run(keys: jax.Array, condition: Condition) -> Any:
+        state = jax.vmap(env.reset)(keys, condition)
+        memory = jax.vmap(lambda _: walk_policy.initial_memory())(keys)
+        return jax.lax.scan(advance, (state, memory), None, steps)[1]
+
+    asked = conditions(scenario, condition_key, episodes)
+    squares, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), asked))
+    alive = ~np.logical_or.accumulate(fallen, axis=0)
+    counted = alive.copy()
+    counted[:warm] = False
+    rms = np.sqrt((squares * counted[..., None]).sum((0, 1)) / max(counted.sum(), 1))
+    upright = alive[-1]
+    figures = {
+        "rms_vx": float(rms[0]), "rms_vy": float(rms[1]), "rms_yaw": float(rms[2]),
+        "fall_rate": float(1.0 - upright.mean()),
+        "speed": float((speed * counted).sum() / max(counted.sum(), 1)),
+    }  # fmt: skip
+    if upright.any():
+        travelled = np.linalg.norm(position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1)[upright]
+        figures |= {"drift": float(travelled.mean()), "drift_p95": float(np.percentile(travelled, 95))}
+        figures["step_frequency"] = _frequency(height[warm:][:, upright])
+    return figures
+
+
+def _frequency(height: np.ndarray) -> float:
+    """Returns the median strongest frequency, Hz, of heights (T, N, 4) sampled at 50 Hz."""
+    steps = len(height)
+    signal = (height - height.mean(0)) * np.hanning(steps)[:, None, None]
+    spectrum = np.abs(np.fft.rfft(signal, 8 * steps, axis=0))
+    frequency = np.fft.rfftfreq(8 * steps, walk_policy.STEP)
+    usable = frequency > 0.8
+    return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
+
+
+def evaluate_walk(
+    params: walk_policy.Params, *, impl: str = "auto", episodes: int = 1000, seed: int = 0,
+    scenarios: Sequence[str] | None = None, report: Callable[[str, dict[str, float]], None] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Measures a walk policy in the named scenarios (all of `SCENARIOS` if None).
+
+    Returns:
+        the figures of `flat` at the top level (rms_vx, rms_vy, rms_yaw, fall_rate) and all under `scenarios`.
+
+    Raises:
+        ValueError: for an unknown scenario, or episodes below 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes: {episodes} must be at least 1")
+    names = list(SCENARIOS) if scenarios is None else list(scenarios)
+    for name in names:
+        if name not in SCENARIOS:
+            raise ValueError(f"scenario: unknown name {name!r}{nearest(name, SCENARIOS)}; allowed: {', '.join(SCENARIOS)}")
+    env = make_env(impl, episodes)
+    results = {}
+    for name in names:
+        results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
+        if report is not None:
+            report(name, results[name])
+    top = results.get("flat", {})
+    keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
+    return {
+        "impl": env.physics.impl, "episodes": episodes, **{key: top[key] for key in keys if key in top},
+        "scenarios": results,
+    }  # fmt: skip
