@@ -267,9 +267,9 @@ class WalkEval:
     """Weights to measure. Default: those that ship."""
     json: Json = False
     episodes: int = 1000
-    """Episodes of 20 s."""
-    num_envs: int = 256
-    """Worlds stepped together."""
+    """Episodes of each scenario, all side by side."""
+    scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
+    """Scenario to measure, such as flat, kicks or slope_up; may be repeated. Default: all."""
     impl: Impl = "auto"
     seed: Seed = 0
 

@@ -430,18 +430,23 @@ def walk_train(arguments: cli.WalkTrain) -> None:
 
 
 def walk_eval(arguments: cli.WalkEval) -> dict[str, Any]:
-    """Measures the walk policy."""
-    result = dict(
-        importlib.import_module("mqe_jax.walk_eval").evaluate_walk(
-            arguments.weights,
-            episodes=arguments.episodes,
-            num_envs=arguments.num_envs,
-            impl=arguments.impl,
-            seed=arguments.seed,
-        )
+    """Measures the walk policy and prints a table, or gives the object for `--json`."""
+    from mqe_jax import walk_policy
+    from mqe_jax.envs.walk_eval import evaluate_walk
+
+    def report(name: str, figures: Mapping[str, float]) -> None:
+        _say(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
+
+    result = evaluate_walk(
+        walk_policy.load_params(arguments.weights),
+        impl=arguments.impl,
+        episodes=arguments.episodes,
+        seed=arguments.seed,
+        scenarios=arguments.scenario or None,
+        report=report,
     )
     if not arguments.json:
-        _print_table(result)
+        _print_table({name: value for name, value in result.items() if name != "scenarios"})
     return result
 
 

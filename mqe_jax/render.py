@@ -6,9 +6,11 @@ picture.
 """
 
 import copy
+import itertools
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -422,15 +424,18 @@ def check_output(path: Path) -> Path:
     parent = path.resolve().parent
     while not parent.exists():
         parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise ValueError(f"output {str(path)!r}: the folder {str(parent)!r} cannot be written")
+    try:
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"output {str(path)!r}: {str(parent)!r} cannot be written ({reason})") from None
     if path.suffix.lower() == ".mp4":
         try:
-            import_module("imageio")
             import_module("imageio_ffmpeg")
         except ImportError:
             raise ValueError(
-                f"output {str(path)!r}: .mp4 needs imageio and imageio-ffmpeg "
+                f"output {str(path)!r}: .mp4 needs imageio-ffmpeg "
                 "(pip install 'mqe-jax[render]'); allowed without them: .gif, .png"
             ) from None
     return path
@@ -459,18 +464,27 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """H.264, yuv420p: what browsers and players take."""
-    imageio = import_module("imageio.v2")
-    with imageio.get_writer(
-        path,
-        fps=fps,
-        codec="libx264",
-        pixelformat="yuv420p",
-        quality=8,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-    ) as writer:
-        for frame in frames:
-            writer.append_data(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
+    # ffmpeg is started without a fork of this process, in which JAX's threads might hold locks.
+    program = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    first = next(frames)
+    height, width = (n // 2 * 2 for n in first.shape[:2])
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        try:
+            for frame in itertools.chain([first], frames):
+                process.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
+        except BrokenPipeError:
+            pass  # ffmpeg says below what was wrong
+        except BaseException:
+            process.kill()
+            raise
+        process.stdin.close()
+        said = process.stderr.read().decode(errors="replace")
+    if process.returncode:
+        raise ValueError(f"output: ffmpeg could not write the clip ({' '.join(said.split())})")
 
 
 def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
