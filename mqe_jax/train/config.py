@@ -86,6 +86,8 @@ class TrainConfig:
     """Whether the mean action is free or kept within -1 and 1."""
     log_std_init: float = 0.0
     """Logarithm of the actions' deviation at the start."""
+    log_std_max: float | None = None
+    """Upper bound of that logarithm, against which an entropy bonus can push; none sets no bound."""
     normalize_observations: bool = False
     """Whether observations are brought to mean 0 and deviation 1 by running statistics."""
     normalize_values: bool = True
@@ -152,6 +154,8 @@ def _validate(config: TrainConfig) -> None:
         _fail("value_norm_decay", config.value_norm_decay, "at least 0 and less than 1")
     if config.dual_clip is not None and not config.dual_clip > 1.0:
         _fail("dual_clip", config.dual_clip, "greater than 1, or none")
+    if config.log_std_max is not None and config.log_std_init > config.log_std_max:
+        _fail("log_std_init", config.log_std_init, f"at most log_std_max ({config.log_std_max})")
     if not all(size > 0 for size in config.hidden_sizes) or not config.hidden_sizes:
         _fail("hidden_sizes", config.hidden_sizes, "one or more widths greater than 0")
     if config.rollout_steps % config.chunk:

@@ -171,7 +171,10 @@ def make_network(sizes: Sizes, config: TrainConfig) -> Network:
         mean, memory = run(params["actor"], config.share_policy, memory, start, obs)
         if config.action_mean == "tanh":
             mean = jnp.tanh(mean)
-        return mean, jnp.broadcast_to(params["log_std"], mean.shape), memory
+        log_std = params["log_std"]
+        if config.log_std_max is not None:
+            log_std = jnp.minimum(log_std, config.log_std_max)
+        return mean, jnp.broadcast_to(log_std, mean.shape), memory
 
     def act(
         params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
