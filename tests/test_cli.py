@@ -83,6 +83,7 @@ def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]
 
 def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     table = tmp_path / "speed.csv"
+    result: dict[str, Any] = {}
     for _ in range(2):
         arguments = ["bench", "fake", "--json", "--num-envs", "2", "--steps", "3", "--csv", str(table)]
         assert cli.main(arguments) == 0
