@@ -349,7 +349,7 @@ def demo(arguments: cli.Demo) -> None:
     except ValueError:
         video = run_dir / "video.gif"
     _say("mqe demo: drawing an episode")
-    draw(env, Actor(DEMO_TASK, dict(config.env), after), video, seed=config.seed + 1, worlds=16)
+    draw(env, Actor(DEMO_TASK, dict(config.env), after), video, seed=config.seed + 1, worlds=16, size=(640, 360))
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(
@@ -372,11 +372,8 @@ def _measure(env: VectorEnv, policy: policy_api.Policy, episodes: int, config: T
 def _summary(result: Mapping[str, Any]) -> str:
     """One line of the figures that a person looks for."""
     parts = [f"both robots through {result['success_rate']:.0%}"]
-    parts += [
-        f"{name.removeprefix('success/').replace('_', ' ')} {value:.0%}"
-        for name, value in result.items()
-        if name.startswith("success/")
-    ]
+    if "success/one" in result:
+        parts.append(f"at least one {result['success/one']:.0%}")
     parts.append(f"average step reward {result['average_step_reward']:.3f}")
     return f"{', '.join(parts)} ({result['episodes']} episodes)"
 
