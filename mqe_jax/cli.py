@@ -53,7 +53,8 @@ class Command(Protocol):
 
 
 def _commands() -> Any:
-    return importlib.import_module("mqe_jax.commands")
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that warp-lang is missing
+        return importlib.import_module("mqe_jax.commands")
 
 
 Impl = Annotated[
