@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import mujoco
 import numpy as np
@@ -94,12 +94,13 @@ class Layout:
 
 
 BLOCKS: dict[str, type[Block]] = {}
+B = TypeVar("B", bound="Block")
 
 
-def register_block(name: str) -> Callable[[type[Block]], type[Block]]:
+def register_block(name: str) -> Callable[[type[B]], type[B]]:
     """Registers a block class under `name`, for `block(name, ...)` and configuration files."""
 
-    def register(cls: type[Block]) -> type[Block]:
+    def register(cls: type[B]) -> type[B]:
         cls.name = name
         BLOCKS[name] = cls
         return cls

@@ -196,7 +196,7 @@ def walk(
 
 def joint_targets(action: jax.Array) -> jax.Array:
     """Turns actions (..., 12) into joint targets (..., 12), rad."""
-    return DEFAULT_JOINTS + ACTION_SCALE * action
+    return jnp.asarray(DEFAULT_JOINTS) + ACTION_SCALE * action
 
 
 def init_params(key: jax.Array) -> Params:

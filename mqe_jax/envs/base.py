@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.core import Tracer
 from mujoco import mjx
 
 from mqe_jax import robot as go1
@@ -505,7 +506,7 @@ class QuadrupedEnv:
             raise ValueError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
         if not jnp.issubdtype(action.dtype, jnp.floating):
             raise ValueError(f"action: dtype {action.dtype}; expected a floating-point type")
-        if not isinstance(action, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(action))):
+        if not isinstance(action, Tracer) and not bool(jnp.all(jnp.isfinite(action))):
             raise ValueError("action: holds NaN or infinite numbers; expected numbers in [-1, 1]")
         return action
 

@@ -1,0 +1,51 @@
+# Needs Python >= 3.11, pip and make: every target makes .venv and installs what it needs.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# An NVIDIA machine: make EXTRAS=render,log,dev,warp,cuda
+EXTRAS ?= render,log,dev
+# The first Python that is new enough; override with `make PYTHON=/path/to/python3`.
+PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 python,\
+  $(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
+SOURCES := $(wildcard mqe_jax tests examples)
+
+.PHONY: help install demo test check fmt clean system
+
+help: ## Say what the targets do
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+install: $(STAMP) ## Make .venv and install the package with its tools
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "make: no Python >= 3.11 found; name one with make PYTHON=/path/to/python3" >&2; exit 2; }
+	@# Debian keeps ensurepip in python3-venv; without it the outer pip fills the environment.
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) 2>/dev/null || $(PYTHON) -m venv --clear --without-pip $(VENV)
+	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then pip="$(BIN)/python -m pip"; \
+	else pip="$(PYTHON) -m pip --python $(BIN)/python"; fi; \
+	echo "$$pip install -c constraints.txt -e .[$(EXTRAS)]"; \
+	$$pip install --disable-pip-version-check -q -c constraints.txt -e ".[$(EXTRAS)]"
+	@touch $@
+
+system: ## Install the GL libraries for pictures, where that is possible
+	@bash tools/install_gl.sh
+
+demo: $(STAMP) system ## Train Narrow Gate on the CPU, print before and after, leave runs/demo
+	JAX_PLATFORMS=cpu $(BIN)/mqe demo
+
+test: $(STAMP) ## Run the tests
+	$(BIN)/python -m pytest
+
+check: $(STAMP) ## Lint, formatting, types
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+fmt: $(STAMP) ## Format and fix what can be fixed
+	$(BIN)/ruff format $(SOURCES)
+	$(BIN)/ruff check --fix $(SOURCES)
+
+clean: ## Remove .venv, caches and build leftovers (runs/ stays)
+	rm -rf $(VENV) .cache .pytest_cache .ruff_cache build dist *.egg-info
+	find mqe_jax tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,92 @@
+"""Pictures of learning curves, beside what the paper reports."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+# Average step reward after 40 M steps, read off the figures of arXiv 2403.16015, with the walk policy.
+PAPER = {
+    "go1gate": {"MAPPO": 2.75, "JRPO": 3.1, "MAT": 2.1},
+    "go1seesaw": {"MAPPO": 0.73, "JRPO": 0.73, "MAT": 0.62},
+    "go1sheep-easy": {"MAPPO": 0.28, "JRPO": 0.40, "MAT": 0.58},
+    "go1sheep-hard": {"MAPPO": 1.75, "JRPO": 1.75, "MAT": 3.3},
+    "go1pushbox": {"MAPPO": 0.0009, "JRPO": 0.001, "MAT": 0.0012},
+    "go1football-defender": {"MAPPO": 0.55, "JRPO": 0.33, "MAT": 0.30},
+}
+_INK, _OURS, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
+
+
+def read_metrics(path: Path) -> dict[str, list[float]]:
+    """Columns of a metrics.csv; ValueError in one line where it is missing or no such table."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file)
+            columns: dict[str, list[float]] = {name: [] for name in reader.fieldnames or []}
+            for row in reader:
+                for name in columns:
+                    columns[name].append(float(row[name]))
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; a run folder has one after its first update") from None
+    except (TypeError, ValueError, UnicodeDecodeError):
+        raise ValueError(f"{path}: is no table of numbers as a training writes it") from None
+    if "env_steps" not in columns:
+        raise ValueError(f"{path}: has no column env_steps")
+    return columns
+
+
+def smooth(values: Sequence[float], share: float = 0.02) -> list[float]:
+    """Running mean over the last `share` of the rows, numbers that are not finite left out."""
+    width = max(1, round(len(values) * share))
+    means = []
+    for end in range(1, len(values) + 1):
+        window = [v for v in values[max(0, end - width) : end] if math.isfinite(v)]
+        means.append(sum(window) / len(window) if window else math.nan)
+    return means
+
+
+def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = None) -> None:
+    """Draw average step reward (and success) of runs against environment steps into an image, written whole.
+
+    The paper's values after 40 M steps are dashed lines, where it has the task.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    tables = [read_metrics(run / "metrics.csv") for run in runs]
+    figure = Figure((7.2, 4.2), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for table in tables:
+        steps = [s / 1e6 for s in table["env_steps"]]
+        reward = table.get("average_step_reward", [math.nan] * len(steps))
+        axes.plot(steps, reward, color=_OURS, lw=0.6, alpha=0.3)
+        axes.plot(steps, smooth(reward), color=_OURS, lw=1.8, label="ours" if table is tables[0] else None)
+    last = max((t["env_steps"][-1] for t in tables if t["env_steps"]), default=0.0) / 1e6
+    for (name, value), style in zip(PAPER.get(task, {}).items(), ("--", "-.", ":"), strict=False):
+        axes.axhline(
+            value, color=_PALE, lw=1.0, ls=style, label=f"paper, {name}, after 40 M steps: {value:g}"
+        )
+    axes.set(xlabel="environment steps (millions)", ylabel="average step reward", xlim=(0, max(last, 1e-6)))
+    axes.set_title(title or task, color=_INK, loc="left")
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    if any(math.isfinite(v) for t in tables for v in t.get("success", [])):
+        right = axes.twinx()
+        for table in tables:
+            rate = [100 * v for v in smooth(table["success"])]
+            right.plot([s / 1e6 for s in table["env_steps"]], rate, color=_SECOND, lw=1.4, alpha=0.9)
+        right.set(ylim=(0, 100))
+        right.set_ylabel("episodes that succeed (%)", color=_SECOND)
+        right.spines[["top", "left"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, loc="best")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        figure.savefig(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,146 @@
+"""A task without physics, for what stands around the environments: command line, drawing, benchmark.
+
+Its `mj_model` is two jointed boxes that a drawing takes for robots, between a fixed wall and two moving ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+LEG = "".join(f'<body pos="0 0 -.01"><joint name="{{robot}}j{i}"/><geom size=".02"/>' for i in range(12))
+ROBOT = (
+    '<body name="{robot}" pos="1 {y} .3"><freejoint/><geom type="box" size=".2 .1 .06" rgba="{rgba}"/>'
+    + LEG
+    + "</body>" * 12
+    + "</body>"
+)
+XML = f"""<mujoco><worldbody>
+<geom type="plane" size="0 0 1"/>
+<geom type="plane" size="0 0 1" pos="0 0 0" zaxis="1 0 0" group="3"/>
+<geom type="box" pos="0 0 .25" size=".02 1.5 .25"/>
+<geom type="box" pos="4 0 .25" size=".02 1.5 .25"/>
+<body name="left" mocap="true" pos="2 1.4 .25"><geom type="box" size=".05 1 .25"/></body>
+<body name="right" mocap="true" pos="2 -1.4 .25"><geom type="box" size=".05 1 .25"/></body>
+{ROBOT.format(robot="a", y=-0.5, rgba="0 0 1 1")}{ROBOT.format(robot="b", y=0.5, rgba="0 1 0 1")}
+</worldbody></mujoco>"""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class FakeData:
+    """The three arrays of an `mjx.Data` that drawing reads, and ctrl."""
+
+    qpos: jax.Array
+    mocap_pos: jax.Array
+    mocap_quat: jax.Array
+    ctrl: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class FakeState:
+    """As the environments' State, for one world or (in FakeVectorEnv) many."""
+
+    data: FakeData
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    key: jax.Array
+    step: jax.Array
+
+
+class FakeEnv:
+    """Two robots that glide along x by a tenth of a metre times their first action; ends after ten steps."""
+
+    name = "fake"
+    num_agents, observation_size, privileged_observation_size, action_size = 2, 1, 2, 3
+    dt = 0.02
+
+    def __init__(self) -> None:
+        self.mj_model = mujoco.MjModel.from_xml_string(XML)
+        self.physics = SimpleNamespace(impl="none", step=lambda data, ctrl: data)
+        self.robot_x = np.array([0, 19])
+
+    def reset(self, key: jax.Array) -> FakeState:
+        model, false = self.mj_model, jnp.zeros((), bool)
+        mocap = np.flatnonzero(model.body_mocapid >= 0)
+        data = FakeData(
+            jnp.asarray(model.qpos0, jnp.float32),
+            jnp.asarray(model.body_pos[mocap], jnp.float32),
+            jnp.asarray(model.body_quat[mocap], jnp.float32),
+            jnp.zeros(model.nu),
+        )
+        zero = jnp.zeros(())
+        metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
+        obs = data.qpos[self.robot_x][:, None]
+        return FakeState(
+            data, obs, obs[:, 0], obs, obs[:, 0], jnp.zeros(2), false, false, metrics, key, jnp.int32(0)
+        )
+
+    def step(self, state: FakeState, action: jax.Array) -> FakeState:
+        move = 0.1 * jnp.clip(action[:, 0], -1.0, 1.0)
+        qpos = state.data.qpos.at[self.robot_x].add(move)
+        data = FakeData(qpos, state.data.mocap_pos, state.data.mocap_quat, state.data.ctrl)
+        obs = qpos[self.robot_x][:, None]
+        total = move.sum()
+        metrics = {
+            "reward/progress": total,
+            "average_step_reward": total,
+            "success": jnp.all(obs > 1.2).astype(jnp.float32),
+            "diverged": jnp.zeros(()),
+        }
+        end = state.step >= 9
+        reward = jnp.full(2, total)
+        return FakeState(
+            data, obs, obs[:, 0], obs, obs[:, 0], reward, ~end & end, end, metrics, state.key, state.step + 1
+        )
+
+
+class FakeVectorEnv:
+    """`FakeEnv` in `num_envs` worlds that start anew when they end."""
+
+    def __init__(self, env: Any, num_envs: int) -> None:
+        self.env, self.num_envs = env, num_envs
+        self.name = env.name
+        self.num_agents, self.action_size = env.num_agents, env.action_size
+        self.observation_size = env.observation_size
+        self.privileged_observation_size = env.privileged_observation_size
+
+    def reset(self, key: jax.Array) -> FakeState:
+        return jax.vmap(self.env.reset)(jax.random.split(key, self.num_envs))
+
+    def step(self, state: FakeState, action: jax.Array) -> FakeState:
+        def one(state: FakeState, action: jax.Array) -> FakeState:
+            state = self.env.step(state, action)
+            fresh = self.env.reset(state.key)
+            done = state.truncated
+            data = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh.data, state.data)
+            obs = jnp.where(done, fresh.obs, state.obs)
+            step = jnp.where(done, 0, state.step)
+            return FakeState(
+                data,
+                obs,
+                obs[:, 0],
+                state.final_obs,
+                state.final_privileged_obs,
+                state.reward,
+                state.terminated,
+                state.truncated,
+                state.metrics,
+                state.key,
+                step,
+            )
+
+        return jax.vmap(one)(state, action)

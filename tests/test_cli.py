@@ -1,0 +1,173 @@
+"""The command line: what it prints, where, and how it refuses bad input."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_env import FakeEnv, FakeVectorEnv
+
+from mqe_jax import cli, commands
+
+SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--minibatches", "1"]
+
+
+@pytest.fixture(autouse=True)
+def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The task `fake` beside the real ones, and an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    real = commands.make_env
+
+    def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int) -> Any:
+        if task != "fake":
+            return real(task, impl, overrides, num_envs)
+        env = FakeEnv()
+        return env, FakeVectorEnv(env, num_envs)
+
+    monkeypatch.setattr(commands, "make_env", make_env)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a tiny training."""
+    folder = tmp_path_factory.mktemp("run") / "fake"
+    patch = pytest.MonkeyPatch()
+    env = FakeEnv()
+    patch.setattr(commands, "make_env", lambda task, impl, overrides, n: (env, FakeVectorEnv(env, n)))
+    assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
+    patch.undo()
+    return folder
+
+
+def test_alone_it_says_what_to_do_first(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 0
+    out = capfd.readouterr().out
+    assert "mqe train go1gate" in out and "mqe render" in out
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in cli.COMMANDS), ["walk", "eval"]])
+def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*command, "--help"])
+    assert not stop.value.code
+    assert "usage: mqe" in capfd.readouterr().out
+
+
+def test_every_training_setting_has_a_flag_with_its_meaning(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    out = " ".join(capfd.readouterr().out.replace("│", " ").split())
+    assert "--gae-lambda" in out and "Decay of the advantage estimate's trace." in out
+
+
+def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
+    names = {path.name for path in run_folder.iterdir()}
+    assert {"config.yaml", "metrics.csv", "curve.png", "policy.safetensors", "checkpoints"} <= names
+
+
+def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", str(run_folder), "--json", "--episodes", "6", "--num-envs", "4"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert len(lines) == 1
+    result = json.loads(lines[0])
+    assert result["task"] == "fake" and result["episodes"] == 6
+    assert {"success_rate", "average_step_reward", "terms"} <= set(result)
+
+
+def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", "fake", "--json", "--policy", "forward", "--episodes", "2"]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["success_rate"] == 1.0
+    assert result["average_step_reward"] == pytest.approx(0.05)
+
+
+def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "speed.csv"
+    result: dict[str, Any] = {}
+    for _ in range(2):
+        arguments = ["bench", "fake", "--json", "--num-envs", "2", "--steps", "3", "--csv", str(table)]
+        assert cli.main(arguments) == 0
+        result = json.loads(capfd.readouterr().out)
+    figures = ["task", "impl", "num_envs", "env_steps_per_s", "bare_env_steps_per_s", "ratio", "compile_s"]
+    assert list(result)[:7] == figures
+    assert len(table.read_text().splitlines()) == 3
+
+
+def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mqe_jax.render.gl_backend", lambda: None)
+    assert (
+        cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
+    )
+    assert (tmp_path / "new" / "clip.png").stat().st_size > 500
+
+
+BAD = {
+    "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
+    "flag": (["bench", "--nope", "3"], ["--nope"]),
+    "number": (["eval", "fake", "--episodes", "many"], ["episodes", "many"]),
+    "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
+    "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
+    "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
+    "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
+    "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
+    "parameter's value": (
+        ["bench", "go1gate", "--set", "gate_width=wide"],
+        ["gate_width", "'wide'", "number"],
+    ),
+    "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
+    "worlds": (["bench", "go1gate", "--num-envs", "0"], ["num_envs", "0"]),
+    "episodes": (["eval", "fake", "--episodes", "0"], ["episodes", "0", "at least 1"]),
+    "policy": (["eval", "fake", "--policy", "randm"], ["'randm'", "random"]),
+    "run": (["eval", "runs/none"], ["runs/none"]),
+    "no run": (["eval", "."], ["config.yaml"]),
+    "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
+    "config file": (["train", "fake", "--config", "none.yaml"], ["none.yaml"]),
+    "setting": (["train", "fake", "--gamma", "2"], ["gamma", "2", "between 0 and 1"]),
+    "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .gif, .png"]),
+    "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
+    "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
+    "weights": (["walk", "eval", "--weights", "none.safetensors"], ["none.safetensors"]),
+    "checkpoint": (["walk", "convert", "a.jit", "b.jit", "-o", "w.safetensors"], ["a.jit"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_exit_code_2(
+    case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    arguments, said = BAD[case]
+    assert cli.main(arguments) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith("mqe: ") and err.count("\n") == 1, err
+    assert all(word in err for word in said), err
+    assert list(tmp_path.iterdir()) == []  # nothing half-written
+
+
+def test_a_damaged_policy_is_refused(
+    run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "config.yaml").write_bytes((run_folder / "config.yaml").read_bytes())
+    (broken / "policy.safetensors").write_bytes((run_folder / "policy.safetensors").read_bytes()[:200])
+    assert cli.main(["eval", str(broken)]) == 2
+    assert "policy.safetensors" in capfd.readouterr().err
+
+
+def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+    def stop(arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "tasks", stop)
+    assert cli.main(["tasks"]) == 130
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_our_own_mistakes_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(arguments: Any) -> None:
+        json.loads("{")  # a ValueError from somebody else's code
+
+    monkeypatch.setattr(commands, "tasks", wrong)
+    with pytest.raises(ValueError):
+        cli.main(["tasks"])

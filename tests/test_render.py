@@ -1,0 +1,126 @@
+"""Drawing: what is in the frame, what lands on disk, what is refused."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from fake_env import FakeEnv
+
+from mqe_jax import render
+from mqe_jax.commands import simple_policy
+
+
+@pytest.fixture(scope="module")
+def env() -> FakeEnv:
+    return FakeEnv()
+
+
+@pytest.fixture(scope="module")
+def episode(env: FakeEnv) -> render.Episode:
+    act = simple_policy("forward", env)
+    return render.record(env, act, (), jax.random.PRNGKey(0), worlds=2, seconds=1.0)[1]
+
+
+def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(
+    env: FakeEnv, episode: render.Episode
+) -> None:
+    assert len(episode) == 11  # the reset and ten steps
+    np.testing.assert_allclose(episode.qpos[:, 0], 1.0 + 0.025 * np.arange(11), rtol=1e-5)
+    assert episode.success == 1.0
+    assert episode.reward == pytest.approx(0.05)
+
+
+def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(
+    env: FakeEnv, episode: render.Episode
+) -> None:
+    assert [env.mj_model.body(body).name for body in render.robot_bases(env.mj_model)] == ["a", "b"]
+    drawn = render._drawn_model(env.mj_model, episode)
+    low, high = render._extent(drawn, episode)
+    assert high[1] == pytest.approx(1.5) and low[1] == pytest.approx(-1.5)
+    own = render._extent(env.mj_model, episode)[1][1]
+    assert own == pytest.approx(2.4)  # the environment's own model is as it was
+
+
+@pytest.mark.parametrize("aspect", [1.0, 16 / 9])
+def test_the_default_camera_holds_the_whole_track(
+    env: FakeEnv, episode: render.Episode, aspect: float
+) -> None:
+    model = render._drawn_model(env.mj_model, episode)
+    camera = render.default_camera(model, episode, aspect)
+    a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([np.sin(a), -np.cos(a), 0.0])
+    low, high = render._extent(model, episode)
+    tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
+    reach = []
+    for corner in np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T:
+        offset = corner - camera.lookat
+        depth = camera.distance + offset @ forward
+        x, y = offset @ right / depth / tangent / aspect, offset @ np.cross(right, forward) / depth / tangent
+        reach.append(max(abs(x), abs(y)))
+    assert max(reach) <= 1.0
+    assert max(reach) > 0.85  # and no farther away than it must be
+
+
+@pytest.mark.parametrize("suffix", [".png", ".gif", ".mp4"])
+def test_clips_land_whole_without_gl(
+    env: FakeEnv, episode: render.Episode, tmp_path: Path, capsys: Any, suffix: str
+) -> None:
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    file = tmp_path / f"clip{suffix}"
+    assert render.render_episode(env, episode, file, size=(160, 90), backend=None) == "matplotlib"
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+    start = file.read_bytes()[:12]
+    assert {".png": b"PNG", ".gif": b"GIF89", ".mp4": b"ftyp"}[suffix] in start
+    errors = capsys.readouterr().err
+    assert errors.count("\n") == 1 and "libegl1" in errors
+
+
+def test_gl_draws_robots_walls_and_floor(env: FakeEnv, episode: render.Episode) -> None:
+    if render.gl_backend() is None:
+        pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
+    frames = list(render.render_frames(env, episode.every(10), size=(160, 90)))
+    assert len(frames) == 2 and frames[0].shape == (90, 160, 3)
+    red, green, blue = np.moveaxis(frames[-1].astype(int), -1, 0)
+    assert np.count_nonzero((blue > red + 60) & (blue > green + 60)) > 5
+    assert np.count_nonzero((green > red + 60) & (green > blue + 60)) > 5
+    assert np.any(frames[0] != frames[1])
+
+
+def test_a_broken_drawing_leaves_nothing_behind(tmp_path: Path) -> None:
+    def frames() -> Any:
+        yield np.zeros((8, 8, 3), np.uint8)
+        raise RuntimeError("out of frames")
+
+    with pytest.raises(RuntimeError):
+        render.write_clip(tmp_path / "clip.gif", frames(), 10.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("clip.avi", r"clip\.avi.*\.mp4, \.gif, \.png"),
+        (".", "suffix"),
+        ("/proc/nowhere/clip.png", "cannot be written"),
+    ],
+)
+def test_bad_outputs_are_refused(tmp_path: Path, name: str, said: str) -> None:
+    if name.startswith("/proc") and not os.path.isdir("/proc"):
+        pytest.skip("no folder here that nobody may write")
+    with pytest.raises(ValueError, match=said):
+        render.check_output(tmp_path / name)
+
+
+def test_the_models_own_settings_are_left_alone(env: FakeEnv, episode: render.Episode) -> None:
+    if render.gl_backend() is None:
+        pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
+    before = env.mj_model.vis.global_.offwidth
+    list(render.render_frames(env, episode.every(10), size=(1000, 80)))
+    assert env.mj_model.vis.global_.offwidth == before
+    assert isinstance(env.mj_model, mujoco.MjModel)
