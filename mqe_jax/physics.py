@@ -92,7 +92,7 @@ class Physics:
             self._engine = _CEngine(model, num_substeps)
             self._template = mjx.make_data(model, impl="cpp")
         elif self.impl == "warp":
-            self._mjx_model = mjx.put_model(model, impl="warp")
+            self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
             self._template = mjx.make_data(
                 model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env
             )
@@ -152,7 +152,16 @@ class Physics:
         """Returns whether Warp dropped contacts or constraint rows in the last step, () bool; else false."""
         if self.impl != "warp":
             return jnp.zeros((), bool)
-        return jnp.any(data._impl.overflow != 0)
+        return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+
+
+# Warp's flags for a solver that used all its iterations, which is how it is set here, and no overflow.
+_ITERATIONS = 1 << 9 | 1 << 10
+
+
+def _quiet(model: mjx.Model) -> mjx.Model:
+    """Switches off Warp's printed warnings; `Physics.overflow` tells of what matters."""
+    return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
 
 
 class _CEngine:
