@@ -29,8 +29,8 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
             column = column - jnp.matmul(q, jnp.matmul(column, q, precision=PRECISION), precision=PRECISION)
         return q.at[:, j].set(column / jnp.linalg.norm(column))
 
-    # Gram-Schmidt by hand: on a CPU with few cores, LAPACK's decompositions of one program (jnp.linalg.qr) run
-    # side by side in XLA's threads, each waits for a free thread, and the program stands still.
+    # Gram-Schmidt by hand: on a CPU with few cores, LAPACK's decompositions in one program (jnp.linalg.qr)
+    # run side by side in XLA's threads, each waits for a free thread, and the program stands still.
     q = jax.lax.fori_loop(0, min(shape), add_column, jnp.zeros_like(normal))
     return scale * (q if rows >= columns else q.T)
 
