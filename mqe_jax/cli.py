@@ -402,6 +402,7 @@ def _run(command: Command) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `mqe`; returns the exit code: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C."""
+    as_program = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments:
         print(FIRST_STEPS)
@@ -409,7 +410,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _run(parse(arguments))
     except KeyboardInterrupt:
-        print("mqe: interrupted", file=sys.stderr)
+        print("mqe: interrupted", file=sys.stderr, flush=True)
+        if as_program:
+            sys.stdout.flush()
+            os._exit(130)  # an ordinary exit would wait for steps that JAX is still computing
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -419,10 +423,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _refuse(error)
     except OSError as error:
-        return _refuse(error)
-    except RuntimeError as error:
-        if "nable to initialize backend" not in str(error):
-            raise
         return _refuse(error)
     return 0
 

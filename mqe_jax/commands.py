@@ -64,8 +64,21 @@ def make_env(task: str, impl: str, overrides: Mapping[str, Any], num_envs: int) 
         if name in overrides:
             flag = name.replace("_", "-")
             raise ValueError(f"set: {name} is no task parameter; give it as --{flag}")
+    platform = _platform()
+    if impl == "warp" and platform != "gpu":
+        raise ValueError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {platform}; allowed: c, jax")
     env = make(task, impl=impl, num_envs=num_envs, **overrides)
     return env, VectorEnv(env, num_envs)
+
+
+def _platform() -> str:
+    """What JAX runs on; ValueError where JAX_PLATFORMS asks for what is not there."""
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        said = str(error) or "no such device"
+        raise ValueError(f"JAX_PLATFORMS: {asked!r} cannot be used here ({said}); try cpu") from None
 
 
 def find_config(name: str) -> Path:
@@ -349,7 +362,14 @@ def demo(arguments: cli.Demo) -> None:
     except ValueError:
         video = run_dir / "video.gif"
     _say("mqe demo: drawing an episode")
-    draw(env, Actor(DEMO_TASK, dict(config.env), after), video, seed=config.seed + 1, worlds=16, size=(640, 360))
+    draw(
+        env,
+        Actor(DEMO_TASK, dict(config.env), after),
+        video,
+        seed=config.seed + 1,
+        worlds=16,
+        size=(640, 360),
+    )
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(

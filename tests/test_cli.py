@@ -108,6 +108,7 @@ BAD = {
     "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
+    "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
     "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
     "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
     "parameter's value": (

@@ -22,8 +22,16 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
     """
     rows, columns = shape
     normal = jax.random.normal(key, (max(shape), min(shape)), jnp.float32)
-    q, r = jnp.linalg.qr(normal)
-    q = q * jnp.where(jnp.diagonal(r) < 0, -1.0, 1.0)
+
+    def add_column(j: jax.Array, q: jax.Array) -> jax.Array:
+        column = normal[:, j]
+        for _ in range(2):  # once more takes off what rounding left
+            column = column - jnp.matmul(q, jnp.matmul(column, q, precision=PRECISION), precision=PRECISION)
+        return q.at[:, j].set(column / jnp.linalg.norm(column))
+
+    # Gram-Schmidt by hand: on a CPU with few cores, LAPACK's decompositions in one program (jnp.linalg.qr)
+    # run side by side in XLA's threads, each waits for a free thread, and the program stands still.
+    q = jax.lax.fori_loop(0, min(shape), add_column, jnp.zeros_like(normal))
     return scale * (q if rows >= columns else q.T)
 
 
