@@ -26,7 +26,7 @@ from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.overrides import Range
 from mqe_jax.envs.reward import weigh
 from mqe_jax.physics import Physics
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.robot import RobotReadings
 from mqe_jax.scene import Scene, build_model, compile_scene
 
 
@@ -205,7 +205,12 @@ class QuadrupedEnv:
     dt = walk_policy.STEP
 
     def __init__(
-        self, params: TaskParams | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
+        self,
+        params: TaskParams | None = None,
+        *,
+        impl: str = "auto",
+        control: str = "command",
+        num_envs: int = 4096,
     ) -> None:
         self.params: Any = self.Params() if params is None else params
         self.control = check_mode(control)
@@ -393,7 +398,12 @@ class QuadrupedEnv:
         )  # fmt: skip
         data = self._pushed(state.data, push_key)
         data, control = self.controller.apply(
-            control, data, target, state.world.action_lag, self._fields(state.world), self.external_forces(state)
+            control,
+            data,
+            target,
+            state.world.action_lag,
+            self._fields(state.world),
+            self.external_forces(state),
         )
         readings = self.read(data)
         state = dataclasses.replace(state, data=data, control=control, step=state.step + 1, key=key)
@@ -423,7 +433,11 @@ class QuadrupedEnv:
     def fallen(self, readings: RobotReadings) -> jax.Array:
         """Returns whether any robot lies on its side or back, or is too low or too high () bool."""
         params = self.params
-        roll, pitch, height = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1]), readings.position_w[:, 2]
+        roll, pitch, height = (
+            jnp.abs(readings.euler[:, 0]),
+            jnp.abs(readings.euler[:, 1]),
+            readings.position_w[:, 2],
+        )
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
         return jnp.any(out | (height < params.min_height) | (height > params.max_height))
 

@@ -257,9 +257,7 @@ def _loss(
     surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], config.clip, config.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
-    critic_loss = jnp.mean(
-        value_loss(now.value, batch.old_value, target, config.value_clip, config.huber_delta)
-    )
+    critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, config.value_clip, config.huber_delta))
     mean_entropy = jnp.mean(now.entropy)
     per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
     metrics = {
@@ -274,9 +272,7 @@ def _loss(
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
     """Returns a smaller step size where the policy moved too far, a larger one where it hardly moved."""
-    factor = jnp.where(
-        kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0)
-    )
+    factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
 
 
