@@ -1,0 +1,250 @@
+"""The tasks' contract, and Narrow Gate's scene, observation, rewards and endings on states made by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mqe_jax
+from mqe_jax import robot as go1
+from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
+from mqe_jax.robot import RobotReadings
+
+Array = jax.Array
+
+
+@pytest.fixture(scope="module")
+def gate() -> QuadrupedEnv:
+    return make("go1gate", impl="c", control="position")
+
+
+@pytest.fixture(scope="module")
+def gate_step(gate: QuadrupedEnv) -> Any:
+    return jax.jit(gate.step)
+
+
+def readings(position: Any, yaw: Any = (0.0, 0.0), roll: Any = (0.0, 0.0), force: Any = (0.0, 0.0)) -> RobotReadings:
+    """Two robots, standing still with the default joints."""
+    zeros = jnp.zeros(2)
+    turn = go1.euler_to_quaternion(jnp.stack([jnp.asarray(roll), zeros, jnp.asarray(yaw)], axis=-1))
+    joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
+    return RobotReadings(
+        jnp.asarray(position), turn, jnp.zeros((2, 3)), jnp.zeros((2, 3)), joints, jnp.zeros((2, 12)),
+        jnp.asarray(force), jnp.zeros((2, 2), bool),
+    )  # fmt: skip
+
+
+def moved(env: QuadrupedEnv, state: State, position: Any, quaternion: Any = None) -> State:
+    """The state with both robots somewhere else, standing still."""
+    index = env.robot
+    qpos = state.data.qpos.at[index.base_qpos[:, :3]].set(jnp.asarray(position))
+    turn = jnp.tile(jnp.array([1.0, 0, 0, 0]), (2, 1)) if quaternion is None else quaternion
+    qpos = qpos.at[index.base_qpos[:, 3:]].set(turn)
+    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
+    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_contract(task: str) -> None:
+    """Shapes, finite numbers, same key same result, one trace, auto-reset that keeps the final observation."""
+    env = make(task, impl="c", control="position", episode_length=0.4)
+    worlds = VectorEnv(env, 4)
+    traces = []
+
+    @jax.jit
+    def step(state: State, action: Array) -> State:
+        traces.append(1)
+        return worlds.step(state, action)
+
+    def play(seed: int) -> list[State]:
+        state = jax.jit(worlds.reset)(jax.random.PRNGKey(seed))
+        states = [state]
+        for i in range(22):
+            action = jax.random.uniform(jax.random.PRNGKey(i), (4, env.num_agents, env.action_size), minval=-1.0)
+            states.append(step(states[-1], action))
+        return states
+
+    states, again = play(0), play(0)
+    for state in states:
+        assert state.obs.shape == (4, env.num_agents, env.observation_size)
+        assert state.privileged_obs.shape == (4, env.privileged_observation_size)
+        assert env.observation_space.shape == state.obs.shape[1:]
+        assert env.action_space.shape == (env.num_agents, env.action_size)
+        assert state.reward.shape == (4, env.num_agents)
+        assert env.privileged_layout().size == env.privileged_observation_size
+        for leaf in (state.obs, state.privileged_obs, state.reward, *state.metrics.values()):
+            assert np.isfinite(leaf).all()
+    jax.tree.map(np.testing.assert_array_equal, states[-1], again[-1])
+    # Twice only: the first state's leaves may be weakly typed.
+    assert len(traces) == 1
+    last = states[20]
+    ended = np.asarray(last.terminated | last.truncated)
+    assert ended.any()
+    fresh = np.asarray(last.step) == 0
+    np.testing.assert_array_equal(fresh, ended)
+    assert np.all(np.abs(np.asarray(last.obs - last.final_obs)).max((1, 2))[ended] > 0)
+    np.testing.assert_array_equal(np.asarray(last.obs)[~ended], np.asarray(last.final_obs)[~ended])
+    spawned = np.asarray(last.data.qpos)[ended][:, env.robot.base_qpos[:, 2]]
+    np.testing.assert_allclose(spawned, env.params.spawn_height, atol=1e-6)
+
+
+def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv) -> None:
+    state = gate.reset(jax.random.PRNGKey(0))
+    both = readings([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
+    state = dataclasses.replace(state, gates=jnp.array([[3.4, 0.2]]))
+    obs = gate.observation_layout.pack(gate.observe(state, both))
+    first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
+    second = [0, 1, 4, 5, 0.6, 0, 0, 0.2, 1, 2, 0.3, 0, 0, 0.1, 3.4, 0.2]
+    np.testing.assert_allclose(obs, [first, second], atol=1e-6)
+
+
+def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
+    from mqe_jax.envs.reward import weigh
+
+    state = gate.reset(jax.random.PRNGKey(0))
+    before = readings([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
+    # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
+    state = dataclasses.replace(
+        state, gates=jnp.array([[3.5, 0.0]]), task=gate.reset_task(jax.random.PRNGKey(0), before, state.gates)
+    )
+    after = readings([[3.8, 0.75, 0.3], [3.5, 0.35, 0.3]])
+    terms, _ = gate.rewards(state, after, jnp.array(True))
+    assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
+    assert float(terms["approach"]) == pytest.approx(0.3, abs=1e-5)
+    # 0.3 m and 0.4 m apart are 0.5 m, which is not closer than 0.5 m
+    assert float(terms["crowding"]) == 0
+    reward, logged = weigh(terms, gate.params.rewards, 2)
+    np.testing.assert_allclose(reward, [5 + 0.3 - 2] * 2, atol=1e-4)
+    near, _ = gate.rewards(state, readings([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
+    assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
+    assert float(near["collision"]) == 0
+    assert float(logged["average_step_reward"]) == pytest.approx(3.3, abs=1e-4)
+
+
+def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv) -> None:
+    state = dataclasses.replace(gate.reset(jax.random.PRNGKey(0)), gates=jnp.array([[3.5, 0.0]]))
+    both, one = readings([[3.8, 0, 0.3], [4.5, 0, 0.3]]), readings([[3.8, 0, 0.3], [3.7, 0, 0.3]])
+    fine = jnp.array(False)
+    assert float(gate.outcome(state, both, fine)["success"]) == 1
+    assert float(gate.outcome(state, both, ~fine)["success"]) == 0
+    assert float(gate.outcome(state, one, fine)["success"]) == 0
+    assert float(gate.outcome(state, one, fine)["success/one"]) == 1
+
+
+def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
+    """A fall, a trunk too low or too high, a collision and the time limit end an episode; standing does not."""
+    state = gate.reset(jax.random.PRNGKey(1))
+    still = jnp.zeros((2, 12))
+    stand = moved(gate, state, [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]])
+    after = gate_step(stand, still)
+    assert not after.terminated and not after.truncated
+    late = gate_step(dataclasses.replace(stand, step=jnp.int32(gate.max_steps - 1)), still)
+    assert late.truncated and not late.terminated
+    rolled = go1.euler_to_quaternion(jnp.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], rolled), still).terminated
+    pitched = go1.euler_to_quaternion(jnp.array([[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]))
+    assert not gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched), still).terminated
+    assert gate_step(moved(gate, state, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]]), still).terminated
+    fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
+    assert bool(fallen)
+    bumped = gate_step(moved(gate, state, [[1.0, -1.46, 0.31], [1.0, 0.75, 0.31]]), still)
+    assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
+
+
+def test_diverged_world_ends_with_finite_numbers_and_is_counted(gate: QuadrupedEnv, gate_step: Any) -> None:
+    state = gate.reset(jax.random.PRNGKey(0))
+    broken = dataclasses.replace(state, data=state.data.replace(qvel=state.data.qvel.at[0].set(jnp.nan)))
+    after = gate_step(broken, jnp.zeros((2, 12)))
+    assert after.terminated and float(after.metrics["diverged"]) == 1
+    assert np.all(np.asarray(after.reward) == 0) and np.isfinite(after.obs).all()
+    bad = gate_step(state, jnp.full((2, 12), jnp.nan))
+    assert bad.terminated and float(bad.metrics["diverged"]) == 1
+    assert np.isfinite(np.asarray(bad.data.qpos)).all()
+
+
+def test_aid_holds_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:
+    plain = jax.vmap(gate.reset)(jax.random.split(jax.random.PRNGKey(0), 32))
+    assert not np.asarray(plain.hold).any()
+    aided = jax.vmap(lambda key: gate.reset(key, 1.0))(jax.random.split(jax.random.PRNGKey(0), 32))
+    hold = np.asarray(aided.hold)
+    assert np.all((hold > 0).sum(1) <= 1) and (hold[:, 0] > 0).any() and (hold[:, 1] > 0).any()
+    assert hold.max() <= gate.params.hold_time / gate.dt
+
+
+def test_randomisation_reaches_the_physics() -> None:
+    """Each world's friction, payload, motors, pushes and lag differ, and a heavier trunk sags more."""
+    env = make(
+        "go1plane", impl="c", control="position", spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0), spawn_height=0.31,
+        randomization={
+            "friction": (0.5, 1.25), "payload": (0.0, 6.0), "center_of_mass": (-0.02, 0.02),
+            "motor_strength": (0.9, 1.1), "action_lag": 2, "push": 0.3, "observation_noise": 0.01,
+        },
+    )  # fmt: skip
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
+    world = states.world
+    assert np.ptp(np.asarray(world.friction)) > 0.3 and set(np.asarray(world.action_lag).tolist()) == {0, 1, 2}
+    step = jax.jit(jax.vmap(env.step))
+    for _ in range(60):
+        states = step(states, jnp.zeros((16, 2, 12)))
+    height = np.asarray(jax.vmap(env.read)(states.data).position_w)[..., 2].ravel()
+    payload = np.asarray(world.payload).ravel()
+    assert np.corrcoef(height, payload)[0, 1] < -0.5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: make("go1gat"), r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate"),
+        (lambda: make("go1gate", impl="mjx"), r"impl: unknown engine 'mjx'.*allowed: auto, jax, warp, c"),
+        (lambda: make("go1gate", control="comand"), r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
+        (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown parameter \(did you mean 'gate_width'\?\)"),
+        (lambda: make("go1gate", rewards={"colision": 1.0}), r"rewards.colision.*did you mean 'collision'"),
+        (lambda: make("go1gate", gate_width="wide"), r"gate_width: 'wide' is not a number"),
+        (lambda: make("go1gate", gate_width=4.0), r"gate: width 4.0 must be between 0 and"),
+        (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate is for 2"),
+        (lambda: make("go1gate", num_envs=0), r"num_envs: 0 must be at least 1"),
+        (lambda: make("go1plane", gait="gallop"), r"gait: unknown name 'gallop'"),
+        (lambda: make("go1plane", commands=("vx", "vz")), r"commands: unknown command 'vz'"),
+        (lambda: make("go1plane", walk_policy="/nowhere"), r"walk policy: no file /nowhere"),
+    ],
+)
+def test_bad_parameters_are_named(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_bad_actions_are_named(gate: QuadrupedEnv) -> None:
+    state = gate.reset(jax.random.PRNGKey(0))
+    with pytest.raises(ValueError, match=r"action: shape \(2, 3\); expected \(2, 12\)"):
+        gate.step(state, jnp.zeros((2, 3)))
+    with pytest.raises(ValueError, match=r"action: dtype int32"):
+        gate.step(state, jnp.zeros((2, 12), jnp.int32))
+    with pytest.raises(ValueError, match=r"action: holds NaN"):
+        gate.step(state, jnp.full((2, 12), jnp.nan))
+    with pytest.raises(ValueError, match="num_envs: 0"):
+        VectorEnv(gate, 0)
+
+
+def test_overrides_reach_every_level() -> None:
+    env = make("go1gate", impl="c", control="torque", gate_width=0.8, **{"rewards.collision": -5})
+    assert env.params.gate_width == 0.8 and env.params.rewards.collision == -5.0
+    assert env.action_size == 12 and float(env.compiled.model.actuator_gainprm[0, 0]) == 1.0
+
+
+def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
+    code = (
+        "import sys, jax, mqe_jax, mqe_jax.train.train, mqe_jax.train.walk\n"
+        "env = mqe_jax.make('go1plane', impl='c', control='position')\n"
+        "env.reset(jax.random.PRNGKey(0))\n"
+        "print([m for m in ('flax', 'optax', 'brax', 'torch') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip().splitlines()[-1] == "[]"
+    assert mqe_jax.tasks() == ("go1plane", "go1gate")
