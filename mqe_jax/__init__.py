@@ -1,10 +1,10 @@
 """Multi-agent Quadruped Environment in JAX on MuJoCo MJX.
 
-    import jax, mqe_jax
+import jax, mqe_jax
 
-    env = mqe_jax.make("go1gate")
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
-    state = jax.jit(jax.vmap(env.step))(state, action)  # (64, env.num_agents, env.action_size)
+env = mqe_jax.make("go1gate")
+state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
+state = jax.jit(jax.vmap(env.step))(state, action)  # (64, env.num_agents, env.action_size)
 """
 
 from __future__ import annotations

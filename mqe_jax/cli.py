@@ -350,10 +350,7 @@ def parse(arguments: Sequence[str]) -> Command:
 
 def _one_line(box: str) -> str:
     """What tyro says in a box, as one line without the frame."""
-    lines = [
-        re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip()
-        for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
-    ]
+    lines = [re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()]
     kept = []
     for line in lines:
         if line.startswith("╭"):
@@ -387,9 +384,7 @@ def _quiet_stdout(active: bool) -> Iterator[Any]:
 def _is_ours(error: BaseException) -> bool:
     """Whether the error was raised by this package's own code, that is, by a check of input."""
     frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and Path(frames[-1].filename).resolve().is_relative_to(
-        Path(__file__).resolve().parent
-    )
+    return bool(frames) and Path(frames[-1].filename).resolve().is_relative_to(Path(__file__).resolve().parent)
 
 
 def _run(command: Command) -> None:

@@ -91,15 +91,11 @@ def find_config(name: str) -> Path:
             return path
         raise ValueError(f"config: no file {name!r}; allowed: {allowed}")
     if name not in shipped:
-        raise ValueError(
-            f"config: unknown name {name!r}; allowed: a YAML file, or one of {', '.join(shipped)}"
-        )
+        raise ValueError(f"config: unknown name {name!r}; allowed: a YAML file, or one of {', '.join(shipped)}")
     return shipped[name]
 
 
-def train_config(
-    task: str, name: str | None, settings: Mapping[str, str], overrides: Mapping[str, Any]
-) -> TrainConfig:
+def train_config(task: str, name: str | None, settings: Mapping[str, str], overrides: Mapping[str, Any]) -> TrainConfig:
     """Settings of a training: shipped or given file, then flags (as text), then task parameters."""
     values = {key: yaml.safe_load(text) for key, text in settings.items()}
     if name is None and (CONFIG_FOLDER / f"{task}.yaml").is_file():
@@ -185,9 +181,7 @@ def _check_run(target: str) -> None:
     if not Path(target).is_dir():
         raise ValueError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
     if not (Path(target) / training.CONFIG_FILE).is_file():
-        raise ValueError(
-            f"run: {target!r} holds no {training.CONFIG_FILE}; it is not the folder of a training"
-        )
+        raise ValueError(f"run: {target!r} holds no {training.CONFIG_FILE}; it is not the folder of a training")
 
 
 # ---------------------------------------------------------------- commands
@@ -260,9 +254,7 @@ def _print_table(values: Mapping[str, Any]) -> None:
     """Prints names and numbers below each other."""
     flat = {}
     for name, value in values.items():
-        flat.update(
-            {f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value}
-        )
+        flat.update({f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value})
     for name, value in flat.items():
         print(f"{name:<28} {value:.4g}" if isinstance(value, float) else f"{name:<28} {value}")
 
@@ -372,9 +364,7 @@ def demo(arguments: cli.Demo) -> None:
     )
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
-    print(
-        f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors"
-    )
+    print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
     print(f"took {(time.perf_counter() - began) / 60:.1f} minutes; measure it again with: mqe eval {run_dir}")
 
 
@@ -421,13 +411,9 @@ def walk_train(arguments: cli.WalkTrain) -> None:
             raise ValueError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
     _check_folder(arguments.run_dir)
     if latest(arguments.run_dir) is not None and not arguments.resume:
-        raise ValueError(
-            f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder"
-        )
+        raise ValueError(f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder")
     env: Any = WalkEnv(impl=arguments.impl, num_envs=arguments.num_envs)
-    config = walk.WalkConfig(
-        num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed
-    )
+    config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
 
     def report(iteration: int, row: dict[str, float]) -> None:
         shown = ("reward", "episode_length", "kl", "level")

@@ -224,7 +224,9 @@ class Controller:
         if params is None:
             return self.physics.step(data, scatter(target), fields=fields, xfrc_applied=xfrc_applied), state
 
-        def substep(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
+        def substep(
+            carry: tuple[mjx.Data, jax.Array, jax.Array], _: None
+        ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
             data, errors, velocities = carry
             errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
             velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])

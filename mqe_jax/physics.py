@@ -27,7 +27,17 @@ from mqe_jax.terrain import nearest
 IMPLS = ("auto", "jax", "warp", "c")
 
 # What a step carries from one physics step to the next; everything else in `mjx.Data` is derived from it.
-STATE_FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied", "time", "sensordata")
+STATE_FIELDS = (
+    "qpos",
+    "qvel",
+    "qacc_warmstart",
+    "ctrl",
+    "mocap_pos",
+    "mocap_quat",
+    "xfrc_applied",
+    "time",
+    "sensordata",
+)
 
 
 def resolve_impl(impl: str = "auto") -> str:
@@ -44,9 +54,13 @@ def resolve_impl(impl: str = "auto") -> str:
             return "warp"
         return "c" if platform == "cpu" else "jax"
     if impl == "warp" and not _has_warp():
-        raise ValueError("impl 'warp' needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'")
+        raise ValueError(
+            "impl 'warp' needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'"
+        )
     if impl == "c" and platform != "cpu":
-        raise ValueError(f"impl 'c' runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'")
+        raise ValueError(
+            f"impl 'c' runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
+        )
     return impl
 
 
@@ -57,7 +71,9 @@ def _has_warp() -> bool:
 
 
 def _has_cuda() -> bool:
-    return any("cuda" in device.device_kind.lower() or "nvidia" in device.device_kind.lower() for device in jax.devices())
+    return any(
+        "cuda" in device.device_kind.lower() or "nvidia" in device.device_kind.lower() for device in jax.devices()
+    )
 
 
 class Physics:
@@ -92,10 +108,8 @@ class Physics:
             self._engine = _CEngine(model, num_substeps)
             self._template = mjx.make_data(model, impl="cpp")
         elif self.impl == "warp":
-            self._mjx_model = mjx.put_model(model, impl="warp")
-            self._template = mjx.make_data(
-                model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env
-            )
+            self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
+            self._template = mjx.make_data(model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env)
         else:
             self._mjx_model = mjx.put_model(model, impl="jax")
             self._template = mjx.make_data(model, impl="jax")
@@ -152,7 +166,16 @@ class Physics:
         """Returns whether Warp dropped contacts or constraint rows in the last step, () bool; else false."""
         if self.impl != "warp":
             return jnp.zeros((), bool)
-        return jnp.any(data._impl.overflow != 0)
+        return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+
+
+# Warp's flags for a solver that used all its iterations, which is how it is set here, and no overflow.
+_ITERATIONS = 1 << 9 | 1 << 10
+
+
+def _quiet(model: mjx.Model) -> mjx.Model:
+    """Switches off Warp's printed warnings; `Physics.overflow` tells of what matters."""
+    return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
 
 
 class _CEngine:

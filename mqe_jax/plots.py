@@ -67,9 +67,7 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
         axes.plot(steps, smooth(reward), color=_OURS, lw=1.8, label="ours" if table is tables[0] else None)
     last = max((t["env_steps"][-1] for t in tables if t["env_steps"]), default=0.0) / 1e6
     for (name, value), style in zip(PAPER.get(task, {}).items(), ("--", "-.", ":"), strict=False):
-        axes.axhline(
-            value, color=_PALE, lw=1.0, ls=style, label=f"paper, {name}, after 40 M steps: {value:g}"
-        )
+        axes.axhline(value, color=_PALE, lw=1.0, ls=style, label=f"paper, {name}, after 40 M steps: {value:g}")
     axes.set(xlabel="environment steps (millions)", ylabel="average step reward", xlim=(0, max(last, 1e-6)))
     axes.set_title(title or task, color=_INK, loc="left")
     axes.grid(alpha=0.25)

@@ -69,9 +69,7 @@ class Camera:
     elevation: float = -46.0  # -90 looks straight down
 
 
-def record(
-    env: Any, act: Act, memory: Any, key: jax.Array, *, worlds: int = 1, seconds: float = 20.0
-) -> list[Episode]:
+def record(env: Any, act: Act, memory: Any, key: jax.Array, *, worlds: int = 1, seconds: float = 20.0) -> list[Episode]:
     """Play one episode in each of `worlds` fresh worlds, without auto-reset.
 
     `act` and `memory` are batched over `worlds` as in `Act`. Every episode ends with the frame on which the
@@ -157,8 +155,7 @@ def _scenery(model: mujoco.MjModel) -> list[int]:
     return [
         geom
         for geom in range(model.ngeom)
-        if int(model.geom_type[geom])
-        not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+        if int(model.geom_type[geom]) not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
         and int(model.geom_group[geom]) != COLLISION_GROUP
         and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots
     ]
@@ -184,20 +181,14 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
     low, high = _extent(model, episode)
     centre = (low + high) / 2
     camera = Camera((float(centre[0]), float(centre[1]), 0.2), 1.0)
-    corners = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])]
-    )
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])])
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
-    forward = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     up = np.cross(right, forward)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     lookat, distance = np.array(camera.lookat), 1.0
-    for _ in range(
-        60
-    ):  # put the middle of what is seen into the middle of the picture, then step back or forth
+    for _ in range(60):  # put the middle of what is seen into the middle of the picture, then step back or forth
         offset = corners - lookat
         # A corner is in the picture when |offset right| <= depth tan aspect and |offset up| <= depth tan.
         need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
@@ -410,9 +401,7 @@ def render_frames(
         backend = gl_backend()
     if backend is None:
         return _draw_top(model, episode, size)
-    return _draw_gl(
-        model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend
-    )
+    return _draw_gl(model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend)
 
 
 def check_output(path: Path) -> Path:
@@ -494,9 +483,7 @@ def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)][:8])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
     images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
-    images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True
-    )
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)
 
 
 def render_episode(

@@ -155,7 +155,13 @@ def _add_inertial(body: Any, link: Link) -> None:
 
 
 def build_robot(
-    robot: int, num_robots: int, contacts: Contacts, *, visual: bool = True, friction: float = 1.0, torque_control: bool = False
+    robot: int,
+    num_robots: int,
+    contacts: Contacts,
+    *,
+    visual: bool = True,
+    friction: float = 1.0,
+    torque_control: bool = False,
 ) -> mujoco.MjSpec:
     """Builds one Go1 with a free base as an `MjSpec`, to be attached to a scene under a prefix.
 
@@ -197,17 +203,35 @@ def build_robot(
         _add_inertial(thigh, THIGH.mirrored(1, left))
         calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -THIGH_LENGTH))
         _add_inertial(calf, CALF.mirrored(1, left).welded(FOOT, (0.0, 0.0, -CALF_LENGTH)))
-        for body, name, axis in ((hip, "hip", (1, 0, 0)), (thigh, "thigh", (0, 1, 0)), (calf, "calf", (0, 1, 0))):
+        for body, name, axis in (
+            (hip, "hip", (1, 0, 0)),
+            (thigh, "thigh", (0, 1, 0)),
+            (calf, "calf", (0, 1, 0)),
+        ):
             index = JOINT_NAMES.index(f"{leg}_{name}")
             body.add_joint(
                 name=f"{leg}_{name}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, limited=True,
                 range=(JOINT_LOWER[index], JOINT_UPPER[index]),
             )  # fmt: skip
         capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-        collide(thigh, "thigh", f"{leg}_thigh", type=capsule, size=(0.017, 0, 0), fromto=(0, 0, -0.02, 0, 0, -0.19))
+        collide(
+            thigh,
+            "thigh",
+            f"{leg}_thigh",
+            type=capsule,
+            size=(0.017, 0, 0),
+            fromto=(0, 0, -0.02, 0, 0, -0.19),
+        )
         collide(calf, "calf", f"{leg}_calf", type=capsule, size=(0.01, 0, 0), fromto=(0, 0, -0.03, 0, 0, -0.18))
         foot_size = (FOOT_RADIUS, 0, 0)
-        collide(calf, "foot", f"{leg}_foot", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=foot_size, pos=(0, 0, -CALF_LENGTH))
+        collide(
+            calf,
+            "foot",
+            f"{leg}_foot",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=foot_size,
+            pos=(0, 0, -CALF_LENGTH),
+        )
         if visual:
             _add_leg_look(hip, thigh, calf, front, left, COLORS[robot % len(COLORS)])
     if visual:
@@ -245,7 +269,13 @@ def _add_trunk_look(trunk: Any, color: tuple[float, ...]) -> None:
     _look(trunk, box, _DARK, size=(0.006, 0.04, 0.024), pos=(0.304, 0, 0.034))
     for side in (-1, 1):
         _look(trunk, sphere, (0.9, 0.95, 1.0, 1.0), size=(0.009, 0, 0), pos=(0.309, side * 0.022, 0.04))
-        _look(trunk, capsule, _DARK, size=(0.008, 0, 0), fromto=(-0.13, side * 0.035, 0.068, 0.13, side * 0.035, 0.068))
+        _look(
+            trunk,
+            capsule,
+            _DARK,
+            size=(0.008, 0, 0),
+            fromto=(-0.13, side * 0.035, 0.068, 0.13, side * 0.035, 0.068),
+        )
 
 
 def _add_leg_look(hip: Any, thigh: Any, calf: Any, front: int, left: int, color: tuple[float, ...]) -> None:
@@ -311,7 +341,9 @@ def add_sensors(spec: mujoco.MjSpec, num_robots: int, contacts: Contacts, *, fee
     geom = mujoco.mjtObj.mjOBJ_GEOM
     force_bits, found_bits, strongest = 1 << 1, 1 << 0, 2
     if "trunk" not in contacts.parts():
-        raise ValueError("Contacts: the trunk must collide with something; add 'trunk' to ground, wall, robot or object")
+        raise ValueError(
+            "Contacts: the trunk must collide with something; add 'trunk' to ground, wall, robot or object"
+        )
     shapes = ["trunk"] + [f"{leg}_foot" for leg in LEGS if feet]
     for robot in range(num_robots):
         for shape in shapes:

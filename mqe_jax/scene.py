@@ -38,7 +38,7 @@ class Scene:
 
     track: Track
     num_robots: int = 2
-    contacts: Contacts = Contacts()
+    contacts: Contacts = dataclasses.field(default_factory=Contacts)
     objects: tuple[AddBodies, ...] = ()
     friction: float = 1.0
     torque_control: bool = False

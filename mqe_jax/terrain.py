@@ -119,7 +119,9 @@ def block(name: str, **parameters: Any) -> Block:
     fields = [field.name for field in dataclasses.fields(BLOCKS[name])]
     for key in parameters:
         if key not in fields:
-            raise ValueError(f"terrain block {name}: unknown parameter {key!r}{nearest(key, fields)}; allowed: {', '.join(fields)}")
+            raise ValueError(
+                f"terrain block {name}: unknown parameter {key!r}{nearest(key, fields)}; allowed: {', '.join(fields)}"
+            )
     return BLOCKS[name](**parameters)
 
 
@@ -233,7 +235,12 @@ class Gate(Block):
         # Long enough to reach the side wall wherever the gap is drawn; what stands out beyond it is not drawn.
         reach = (track.width - gap) / 2 + abs(self.offset[1]) + self.random[1]
         walls = tuple(
-            Wall(f"gate{number}_{side}", (0.0, sign * (gap + reach) / 2, height / 2), (depth, reach, height), anchor=0)
+            Wall(
+                f"gate{number}_{side}",
+                (0.0, sign * (gap + reach) / 2, height / 2),
+                (depth, reach, height),
+                anchor=0,
+            )
             for side, sign in (("right", -1.0), ("left", 1.0))
         )
         return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))
@@ -367,7 +374,11 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             pos=(*barrier.point, 0.0), zaxis=normal, contype=WALL_BIT, conaffinity=0, group=3,
         )  # fmt: skip
         if visual:
-            half = (track.wall_thickness / 2, barrier.length / 2 + track.wall_thickness, track.wall_height / 2)
+            half = (
+                track.wall_thickness / 2,
+                barrier.length / 2 + track.wall_thickness,
+                track.wall_height / 2,
+            )
             center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
             yaw = np.arctan2(normal[1], normal[0])
             world.add_geom(
@@ -380,7 +391,7 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             body, position = world, wall.center
         else:
             anchor = layout.anchors[wall.anchor]
-            start = np.array(wall.center) + (*anchor.position, 0.0)
+            start = np.add(wall.center, [*anchor.position, 0.0])
             body, position = world.add_body(name=f"wall/{wall.name}", mocap=True, pos=start), (0, 0, 0)
         body.add_geom(
             name=f"wall/{wall.name}", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=position, rgba=WALL_COLOR,

@@ -19,6 +19,7 @@ the joint target is default + `ACTION_SCALE` * action. ELU between layers. Matri
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import pathlib
@@ -134,7 +135,11 @@ def advance_gait(gait: jax.Array, commands: jax.Array) -> jax.Array:
 
 
 def observe(
-    memory: WalkMemory, commands: jax.Array, gravity_b: jax.Array, joint_position: jax.Array, joint_velocity: jax.Array
+    memory: WalkMemory,
+    commands: jax.Array,
+    gravity_b: jax.Array,
+    joint_position: jax.Array,
+    joint_velocity: jax.Array,
 ) -> jax.Array:
     """Builds one observation (70,).
 
@@ -204,7 +209,7 @@ def init_params(key: jax.Array) -> Params:
     params: Params = {}
     for part, sizes in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES)):
         layers = {}
-        for index, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for index, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
             key, w_key, b_key = jax.random.split(key, 3)
             bound = n_in**-0.5
             last = part == "body" and index == len(sizes) - 2
@@ -218,7 +223,7 @@ def init_params(key: jax.Array) -> Params:
 def _expected_shapes() -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {}
     for part, sizes in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES)):
-        for index, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for index, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
             shapes[f"{part}.{2 * index}.weight"] = (n_out, n_in)
             shapes[f"{part}.{2 * index}.bias"] = (n_out,)
     return shapes

@@ -85,9 +85,7 @@ class FakeEnv:
         zero = jnp.zeros(())
         metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
         obs = data.qpos[self.robot_x][:, None]
-        return FakeState(
-            data, obs, obs[:, 0], obs, obs[:, 0], jnp.zeros(2), false, false, metrics, key, jnp.int32(0)
-        )
+        return FakeState(data, obs, obs[:, 0], obs, obs[:, 0], jnp.zeros(2), false, false, metrics, key, jnp.int32(0))
 
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
         move = 0.1 * jnp.clip(action[:, 0], -1.0, 1.0)

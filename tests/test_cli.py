@@ -95,9 +95,7 @@ def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest
 
 def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mqe_jax.render.gl_backend", lambda: None)
-    assert (
-        cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
-    )
+    assert cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
     assert (tmp_path / "new" / "clip.png").stat().st_size > 500
 
 
@@ -133,9 +131,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_exit_code_2(
-    case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     arguments, said = BAD[case]
     assert cli.main(arguments) == 2
     out, err = capfd.readouterr()
@@ -145,9 +141,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
-def test_a_damaged_policy_is_refused(
-    run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "config.yaml").write_bytes((run_folder / "config.yaml").read_bytes())

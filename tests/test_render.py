@@ -25,18 +25,14 @@ def episode(env: FakeEnv) -> render.Episode:
     return render.record(env, act, (), jax.random.PRNGKey(0), worlds=2, seconds=1.0)[1]
 
 
-def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(
-    env: FakeEnv, episode: render.Episode
-) -> None:
+def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, episode: render.Episode) -> None:
     assert len(episode) == 11  # the reset and ten steps
     np.testing.assert_allclose(episode.qpos[:, 0], 1.0 + 0.025 * np.arange(11), rtol=1e-5)
     assert episode.success == 1.0
     assert episode.reward == pytest.approx(0.05)
 
 
-def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(
-    env: FakeEnv, episode: render.Episode
-) -> None:
+def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: render.Episode) -> None:
     assert [env.mj_model.body(body).name for body in render.robot_bases(env.mj_model)] == ["a", "b"]
     drawn = render._drawn_model(env.mj_model, episode)
     low, high = render._extent(drawn, episode)
@@ -46,9 +42,7 @@ def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(
 
 
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9])
-def test_the_default_camera_holds_the_whole_track(
-    env: FakeEnv, episode: render.Episode, aspect: float
-) -> None:
+def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: render.Episode, aspect: float) -> None:
     model = render._drawn_model(env.mj_model, episode)
     camera = render.default_camera(model, episode, aspect)
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)

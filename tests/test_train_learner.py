@@ -116,9 +116,7 @@ class OnePass(NamedTuple):
 @pytest.fixture(scope="module")
 def one_pass() -> OnePass:
     """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
-    env = CountingProbe(
-        probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4
-    )
+    env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
     learner = make_learner(env, small(num_envs=4, recurrent=True, chunk_length=4, epochs=1, minibatches=1))
     update = jax.jit(learner.update)
     states, all_metrics, traces = [jax.jit(learner.init)(jax.random.PRNGKey(0))], [], []

@@ -70,9 +70,7 @@ def test_gaussian_density_entropy_and_divergence() -> None:
     std = math.exp(-0.3)
     expected = -0.5 * (0.4 / std) ** 2 - math.log(std * math.sqrt(2 * math.pi))
     np.testing.assert_allclose(loss.log_prob(action, mean, log_std), [expected], rtol=1e-5)
-    np.testing.assert_allclose(
-        loss.entropy(log_std), 0.5 * math.log(2 * math.pi * math.e * std**2), rtol=1e-5
-    )
+    np.testing.assert_allclose(loss.entropy(log_std), 0.5 * math.log(2 * math.pi * math.e * std**2), rtol=1e-5)
     divergence = loss.kl_divergence(mean, log_std, action, log_std)
     np.testing.assert_allclose(divergence, 0.5 * (0.4 / std) ** 2, rtol=1e-5)
 

@@ -158,9 +158,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     assert result.episodes == 8 and result.mean_length == 4.0
 
 
-def test_a_policy_that_is_missing_or_of_another_kind(
-    straight: tuple[Path, TrainState], tmp_path: Path
-) -> None:
+def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"policy.safetensors: no such file"):
         load_policy(tmp_path)
     newest = latest(straight[0])
@@ -278,6 +276,6 @@ def test_the_learner_imports_no_task_and_no_learning_library() -> None:
                 names = [node.module or ""]
             for name in names:
                 assert name.split(".")[0] not in forbidden, path
-                assert not name.startswith(
-                    ("mqe_jax.envs", "mqe_jax.adapters", "mqe_jax.cli", "mqe_jax.commands")
-                ), path
+                assert not name.startswith(("mqe_jax.envs", "mqe_jax.adapters", "mqe_jax.cli", "mqe_jax.commands")), (
+                    path
+                )

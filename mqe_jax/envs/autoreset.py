@@ -10,18 +10,18 @@ import jax.numpy as jnp
 from mqe_jax.envs.base import QuadrupedEnv, State
 
 # Fields that tell how a step went: an auto-reset keeps them.
-_KEPT = ("reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
+_KEPT = ("aid", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
 
 
 def autoreset(env: QuadrupedEnv, state: State) -> State:
     """Replaces one finished world by a freshly drawn one.
 
     Whole state, no forward pass. `reward`, `terminated`, `truncated`, `metrics` and `final_obs` still tell of the
-    step that ended the episode; `obs` is the fresh world's.
+    step that ended the episode; `obs` is the fresh world's. The aid stays.
     """
     done = state.terminated | state.truncated
     key, reset_key = jax.random.split(state.key)
-    fresh = env.reset(reset_key)
+    fresh = env.reset(reset_key, state.aid)
     merged = {
         field.name: jax.tree.map(
             lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)

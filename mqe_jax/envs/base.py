@@ -26,7 +26,7 @@ from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.overrides import Range
 from mqe_jax.envs.reward import weigh
 from mqe_jax.physics import Physics
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.robot import RobotReadings
 from mqe_jax.scene import Scene, build_model, compile_scene
 
 
@@ -89,6 +89,8 @@ class TaskParams:
         contacts_per_env: contacts that a world may have on average, for Warp's buffer.
         rows_per_env: constraint rows that a world may have, for Warp's buffer.
         randomization: domain randomisation.
+        hold_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
+            for up to hold_time x aid, s, so that agents first learn one at a time what they must do in turn.
     """
 
     num_agents: int = 2
@@ -112,6 +114,7 @@ class TaskParams:
     contacts_per_env: int = 24
     rows_per_env: int = 128
     randomization: Randomization = Randomization()
+    hold_time: float = 4.0
 
     def __post_init__(self) -> None:
         for name in ("episode_length", "collision_force", "friction", "solver_iterations"):
@@ -160,6 +163,8 @@ class State:
         control: what control remembers.
         world: randomised physics.
         task: the task's own fields.
+        aid: how much the world helps learning () in [0, 1]; 0 is the task itself, trainers may start higher.
+        hold: environment steps for which each agent's action counts as zero (A,); zeros without aid.
         key: random key of the world.
     """
 
@@ -177,6 +182,8 @@ class State:
     control: ControlState
     world: World
     task: Any
+    aid: jax.Array
+    hold: jax.Array
     key: jax.Array
 
 
@@ -198,7 +205,12 @@ class QuadrupedEnv:
     dt = walk_policy.STEP
 
     def __init__(
-        self, params: TaskParams | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
+        self,
+        params: TaskParams | None = None,
+        *,
+        impl: str = "auto",
+        control: str = "command",
+        num_envs: int = 4096,
     ) -> None:
         self.params: Any = self.Params() if params is None else params
         self.control = check_mode(control)
@@ -331,9 +343,16 @@ class QuadrupedEnv:
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
-    def reset(self, key: jax.Array) -> State:
-        """Returns a freshly drawn world; needs no forward pass of the physics."""
-        next_key, gate_key, spawn_key, body_key, object_key, world_key, task_key, noise_key = jax.random.split(key, 8)
+    def reset(self, key: jax.Array, aid: jax.Array | float = 0.0) -> State:
+        """Returns a freshly drawn world; needs no forward pass of the physics.
+
+        Args:
+            key: random key.
+            aid: how much the world helps learning, in [0, 1]; 0 is the task itself.
+        """
+        keys = jax.random.split(key, 9)
+        next_key, gate_key, spawn_key, body_key, object_key, world_key, task_key, noise_key, aid_key = keys
+        aid = jnp.asarray(aid, jnp.float32)
         gates = self._draw_gates(gate_key)
         qpos, qvel = self._draw_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel)
@@ -346,7 +365,8 @@ class QuadrupedEnv:
             data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
             reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
             step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
-            world=self._draw_world(world_key), task=self.reset_task(task_key, readings, gates), key=next_key,
+            world=self._draw_world(world_key), task=self.reset_task(task_key, readings, gates), aid=aid,
+            hold=self._draw_hold(aid_key, aid), key=next_key,
         )  # fmt: skip
         terms, _ = self.rewards(state, readings, no)
         _, logged = weigh(terms, self.params.rewards, self.num_agents)
@@ -368,6 +388,7 @@ class QuadrupedEnv:
         action = self._checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
+        action = jnp.where((state.step < state.hold)[:, None], 0.0, action)
         key, push_key, noise_key = jax.random.split(state.key, 3)
 
         before = self.read(state.data)
@@ -377,7 +398,12 @@ class QuadrupedEnv:
         )  # fmt: skip
         data = self._pushed(state.data, push_key)
         data, control = self.controller.apply(
-            control, data, target, state.world.action_lag, self._fields(state.world), self.external_forces(state)
+            control,
+            data,
+            target,
+            state.world.action_lag,
+            self._fields(state.world),
+            self.external_forces(state),
         )
         readings = self.read(data)
         state = dataclasses.replace(state, data=data, control=control, step=state.step + 1, key=key)
@@ -407,7 +433,11 @@ class QuadrupedEnv:
     def fallen(self, readings: RobotReadings) -> jax.Array:
         """Returns whether any robot lies on its side or back, or is too low or too high () bool."""
         params = self.params
-        roll, pitch, height = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1]), readings.position_w[:, 2]
+        roll, pitch, height = (
+            jnp.abs(readings.euler[:, 0]),
+            jnp.abs(readings.euler[:, 1]),
+            readings.position_w[:, 2],
+        )
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
         return jnp.any(out | (height < params.min_height) | (height > params.max_height))
 
@@ -455,6 +485,12 @@ class QuadrupedEnv:
         qpos = jnp.asarray(model.qpos0, jnp.float32).at[index.joint_qpos].set(joints)
         qpos = qpos.at[index.base_qpos].set(jnp.concatenate([pose[:, :3], turn], axis=-1))
         return qpos, jnp.zeros(model.nv).at[index.base_qvel].set(velocity)
+
+    def _draw_hold(self, key: jax.Array, aid: jax.Array) -> jax.Array:
+        who_key, time_key = jax.random.split(key)
+        steps = aid * self.params.hold_time / self.dt * jax.random.uniform(time_key, ())
+        who = jax.random.randint(who_key, (), 0, self.num_agents)
+        return jnp.where(jnp.arange(self.num_agents) == who, steps, 0.0).astype(jnp.int32)
 
     def _draw_world(self, key: jax.Array) -> World:
         random, robots = self.params.randomization, self.robot.num_robots

@@ -55,7 +55,9 @@ class ObservationLayout:
         for block in self.blocks:
             part = values[block.name]
             if part.shape[-1] != block.width:
-                raise ValueError(f"observation block {block.name}: width {part.shape[-1]}; the layout has {block.width}")
+                raise ValueError(
+                    f"observation block {block.name}: width {part.shape[-1]}; the layout has {block.width}"
+                )
             parts.append(part)
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 

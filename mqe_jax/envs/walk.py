@@ -183,9 +183,7 @@ class WalkEnv:
             solver_iterations=self.task.solver_iterations,
         )  # fmt: skip
         self.compiled = compile_scene(scene)
-        self.physics = Physics(
-            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, rows_per_env=44
-        )
+        self.physics = Physics(self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, rows_per_env=44)
         self.index = self.compiled.robot
         self._mass = np.asarray(self.compiled.model.body_mass)
 
@@ -203,7 +201,11 @@ class WalkEnv:
         uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
         chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
         velocity = jnp.stack(
-            [uniform(-task.max_vx, task.max_vx), uniform(-task.max_vy, task.max_vy), uniform(-task.max_yaw, task.max_yaw)]
+            [
+                uniform(-task.max_vx, task.max_vx),
+                uniform(-task.max_vy, task.max_vy),
+                uniform(-task.max_yaw, task.max_yaw),
+            ]
         )
         velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
         velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
@@ -245,7 +247,11 @@ class WalkEnv:
     # -- reset and step -----------------------------------------------------------------------------------------
 
     def reset(
-        self, key: jax.Array, condition: Condition | None = None, level: jax.Array | float = 1.0, step: jax.Array | int = 0
+        self,
+        key: jax.Array,
+        condition: Condition | None = None,
+        level: jax.Array | float = 1.0,
+        step: jax.Array | int = 0,
     ) -> WalkState:
         """Returns a fresh state; without a condition one is drawn."""
         next_key, condition_key, body_key, pose_key, noise_key = jax.random.split(key, 5)
@@ -303,7 +309,10 @@ class WalkEnv:
 
         ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.body.motor_offset)
         data = self.physics.step(
-            data, ctrl, fields=self._fields(state.body), xfrc_applied=self._forces(data, state.body, slope, force)
+            data,
+            ctrl,
+            fields=self._fields(state.body),
+            xfrc_applied=self._forces(data, state.body, slope, force),
         )
         readings = self.read(data)
         commands = state.condition.commands
@@ -484,7 +493,8 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
 
     # Where the gait wants the feet: the stance corners, shifted by half a stance's travel over the cycle.
     stance = jnp.stack(
-        [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]], -1
+        [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]],
+        -1,
     )
     shift = jnp.abs(1.0 - 2.0 * phases) - 0.5
     speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)

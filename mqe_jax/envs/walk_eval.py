@@ -78,7 +78,9 @@ def conditions(scenario: Scenario, key: jax.Array, episodes: int) -> Condition:
     )  # fmt: skip
 
 
-def measure(env: WalkEnv, params: walk_policy.Params, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, float]:
+def measure(
+    env: WalkEnv, params: walk_policy.Params, scenario: Scenario, episodes: int, seed: int = 0
+) -> dict[str, float]:
     """Runs one scenario and returns its figures.
 
     Returns:
@@ -97,7 +99,7 @@ def measure(env: WalkEnv, params: walk_policy.Params, scenario: Scenario, episod
             readings = env.read(state.data)
             gravity = state.obs[:3]
             commands = state.condition.commands
-            target, memory = walk_policy.walk(
+            _, memory = walk_policy.walk(
                 params, memory, commands, gravity, readings.joint_position[0], readings.joint_velocity[0]
             )
             state = env.step(state, memory.action)
@@ -164,7 +166,9 @@ def evaluate_walk(
     names = list(SCENARIOS) if scenarios is None else list(scenarios)
     for name in names:
         if name not in SCENARIOS:
-            raise ValueError(f"scenario: unknown name {name!r}{nearest(name, SCENARIOS)}; allowed: {', '.join(SCENARIOS)}")
+            raise ValueError(
+                f"scenario: unknown name {name!r}{nearest(name, SCENARIOS)}; allowed: {', '.join(SCENARIOS)}"
+            )
     env = make_env(impl, episodes)
     results = {}
     for name in names:

@@ -21,7 +21,8 @@ def gae(
     Shapes: time-major (T, ...); `terminated` and `done` (bool) may lack trailing axes of `reward`.
     `next_value[t]` is the value of the state in which step t arrived, before any reset, so a truncated
     episode bootstraps from its own last state. `terminated` removes the bootstrap; `done`
-    (terminated or truncated) cuts the trace. A `terminated` between 0 and 1 removes that part of the bootstrap. Source: Schulman et al., arXiv 1506.02438.
+    (terminated or truncated) cuts the trace. A `terminated` between 0 and 1
+    removes that part of the bootstrap. Source: Schulman et al., arXiv 1506.02438.
     """
 
     def as_reward(flag: jax.Array) -> jax.Array:
@@ -36,7 +37,5 @@ def gae(
         trace = delta_t + carry_over_t * trace
         return trace, trace
 
-    _, advantage = jax.lax.scan(
-        backwards, jnp.zeros_like(delta[0]), (delta, carry_over), reverse=True, unroll=8
-    )
+    _, advantage = jax.lax.scan(backwards, jnp.zeros_like(delta[0]), (delta, carry_over), reverse=True, unroll=8)
     return advantage, advantage + value

@@ -143,9 +143,7 @@ def latest(run_dir: str | Path) -> Path | None:
     return next(reversed(list_checkpoints(run_dir)), None)
 
 
-def save_checkpoint(
-    run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int
-) -> Path:
+def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:
     """Writes a checkpoint of environment step `step`, then removes all but the newest `keep`.
 
     Files that a killed writer left half-written are removed too.

@@ -48,6 +48,10 @@ class TrainConfig:
     """Discount per step."""
     gae_lambda: float = 0.95
     """Decay of the advantage estimate's trace."""
+    aid: float = 0.0
+    """How much the task helps at the start, in [0, 1], falling linearly to 0 (`State.aid` of the environment)."""
+    aid_until: float = 0.5
+    """Part of the training after which it helps no more."""
     failure_bootstrap: float = 0.0
     """Share of the value that a terminated episode still gets, falling linearly to 0: an early failure then costs
     its penalty alone, so that agents dare to try what often fails at first."""
@@ -132,10 +136,11 @@ class TrainConfig:
 
 _POSITIVE = (
     "num_envs total_steps rollout_steps epochs minibatches learning_rate target_kl adam_eps max_grad_norm "
-    "failure_bootstrap_until advantage_clip clip value_clip huber_delta gru_size chunk_length action_gain checkpoint_every checkpoints_kept"
+    "aid_until failure_bootstrap_until advantage_clip clip value_clip huber_delta gru_size chunk_length "
+    "action_gain checkpoint_every checkpoints_kept "
 ).split()
 _NOT_NEGATIVE = "seed value_coef entropy_coef entropy_coef_final".split()
-_SHARE = "gamma gae_lambda failure_bootstrap".split()
+_SHARE = "gamma gae_lambda failure_bootstrap aid".split()
 
 
 def _fail(name: str, value: object, allowed: str) -> typing.NoReturn:

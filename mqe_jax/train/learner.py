@@ -74,6 +74,8 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     """
     if env.num_envs != config.num_envs:
         raise ValueError(f"num_envs: {config.num_envs}; the environment given has {env.num_envs} worlds")
+    if config.aid and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "aid"):
+        raise ValueError(f"aid: {config.aid}; the environment {env.name} has no aid in its state")
     if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
         raise ValueError(f"stagger_episodes: True; the environment {env.name} has no max_episode_steps")
     network = make_network(env_sizes(env), config)
@@ -107,12 +109,14 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
 
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
+        progress = state.updates.astype(jnp.float32) / config.num_updates
+        aid = config.aid * jnp.maximum(1.0 - progress / config.aid_until, 0.0)
         cursor, transitions, metrics = rollout(
             env,
             network,
             state.params,
             state.obs_normalizer,
-            state.cursor,
+            _aided(state.cursor, aid) if config.aid else state.cursor,
             rollout_key,
             config.rollout_steps,
             config.normalize_observations,
@@ -137,9 +141,16 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
             key=key,
             updates=state.updates + 1,
         )
+        metrics["aid"] = aid
         return _strongly_typed(new_state), {**metrics, **batch_metrics, **loss_metrics}
 
     return Learner(init, update, network)
+
+
+def _aided(cursor: Cursor, aid: jax.Array) -> Cursor:
+    """Sets how much every world helps from its next episode on."""
+    env_state = dataclasses.replace(cursor.env_state, aid=jnp.full_like(cursor.env_state.aid, aid))
+    return cursor._replace(env_state=env_state)
 
 
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
@@ -246,9 +257,7 @@ def _loss(
     surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], config.clip, config.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
-    critic_loss = jnp.mean(
-        value_loss(now.value, batch.old_value, target, config.value_clip, config.huber_delta)
-    )
+    critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, config.value_clip, config.huber_delta))
     mean_entropy = jnp.mean(now.entropy)
     per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
     metrics = {
@@ -263,9 +272,7 @@ def _loss(
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
     """Returns a smaller step size where the policy moved too far, a larger one where it hardly moved."""
-    factor = jnp.where(
-        kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0)
-    )
+    factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
 
 

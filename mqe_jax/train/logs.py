@@ -46,9 +46,7 @@ class CsvLog:
             self._rewrite([])
         if self._file is None:
             self._file = self._path.open("a", encoding="utf-8", newline="")
-        csv.writer(self._file, lineterminator="\n").writerow(
-            [_text(row.get(name, math.nan)) for name in self._columns]
-        )
+        csv.writer(self._file, lineterminator="\n").writerow([_text(row.get(name, math.nan)) for name in self._columns])
         self._file.flush()
 
     def close(self) -> None:

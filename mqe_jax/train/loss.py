@@ -22,9 +22,7 @@ def entropy(log_std: jax.Array) -> jax.Array:
     return jnp.sum(log_std + 0.5 + _LOG_SQRT_2PI, axis=-1)
 
 
-def kl_divergence(
-    old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, log_std: jax.Array
-) -> jax.Array:
+def kl_divergence(old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
     """Returns KL(old || new) of diagonal Gaussians summed over the last axis: (..., D) -> (...), nats."""
     variance_ratio = jnp.exp(2.0 * (old_log_std - log_std))
     shift = jnp.square((old_mean - mean) * jnp.exp(-log_std))

@@ -36,11 +36,7 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
     share = batch_samples / samples
     shift = batch_mean - statistics.mean
     mean = statistics.mean + shift * share
-    variance = (
-        statistics.variance * (1.0 - share)
-        + batch_variance * share
-        + jnp.square(shift) * share * (1.0 - share)
-    )
+    variance = statistics.variance * (1.0 - share) + batch_variance * share + jnp.square(shift) * share * (1.0 - share)
     return RunningStatistics(mean, variance, samples)
 
 

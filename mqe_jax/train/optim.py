@@ -31,9 +31,7 @@ def global_norm(tree: PyTree) -> jax.Array:
     return jnp.sqrt(sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.float32(0.0)))
 
 
-def adam(
-    eps: float = 1e-5, b1: float = 0.9, b2: float = 0.999, max_grad_norm: float | None = None
-) -> Optimizer:
+def adam(eps: float = 1e-5, b1: float = 0.9, b2: float = 0.999, max_grad_norm: float | None = None) -> Optimizer:
     """Makes Adam; gradients whose global norm exceeds `max_grad_norm` are first scaled down to it.
 
     `grad_norm` is the norm before the scaling. Source: Kingma and Ba, arXiv 1412.6980.

@@ -47,9 +47,7 @@ class Policy:
         obs = jnp.asarray(obs, jnp.float32)
         agents, size = self.sizes.agents, self.sizes.observation
         if obs.ndim < 2 or obs.shape[-2:] != (agents, size):
-            raise ValueError(
-                f"obs: shape {obs.shape} is not allowed; it must end in {agents} agents, {size} numbers"
-            )
+            raise ValueError(f"obs: shape {obs.shape} is not allowed; it must end in {agents} agents, {size} numbers")
         act = _acting(self.sizes, self.config)
         return act(self.params, self.normalizer, obs, memory, None if deterministic else key)
 

@@ -128,9 +128,7 @@ def _prepare_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Path | 
         raise ValueError(f"run_dir: {run_dir} cannot be written ({error.strerror or error})") from None
     checkpoint = latest(run_dir)
     if checkpoint is not None and not resume:
-        raise ValueError(
-            f"run_dir: {run_dir} already holds a run; resume it (--resume) or name another folder"
-        )
+        raise ValueError(f"run_dir: {run_dir} already holds a run; resume it (--resume) or name another folder")
     if checkpoint is not None:
         _check_same(run_dir, config)
     return checkpoint

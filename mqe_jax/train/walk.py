@@ -126,7 +126,9 @@ def init_learner(key: jax.Array, config: WalkConfig, privileged_size: int) -> Wa
     return WalkLearner(params, optimizer, jnp.float32(config.learning_rate), jnp.int32(0), key)
 
 
-def make_iteration(env: WalkWorld, config: WalkConfig) -> Callable[..., tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]]:
+def make_iteration(
+    env: WalkWorld, config: WalkConfig
+) -> Callable[..., tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]]:
     """Makes `iterate(learner, state, history) -> (learner, state, history, metrics)`, one rollout and update.
 
     `state` is the batched environment state, `history` each world's last observations (N, 30, 70), the newest
@@ -162,9 +164,7 @@ def make_iteration(env: WalkWorld, config: WalkConfig) -> Callable[..., tuple[Wa
             history = jnp.concatenate([jnp.where(fresh, 0.0, history[:, 1:]), next_state.obs[:, None]], axis=1)
             return (next_state, history), record
 
-        (state, history), records = jax.lax.scan(
-            body, (state, history), jax.random.split(key, config.rollout_length)
-        )
+        (state, history), records = jax.lax.scan(body, (state, history), jax.random.split(key, config.rollout_length))
         return state, history, records
 
     def iterate(
@@ -180,7 +180,13 @@ def make_iteration(env: WalkWorld, config: WalkConfig) -> Callable[..., tuple[Wa
         next_value = critic(learner.params, records["next_privileged"])
         done = records["terminated"] | records["truncated"]
         advantage, target = gae(
-            records["reward"], value, next_value, records["terminated"], done, gamma=config.gamma, lam=config.lam
+            records["reward"],
+            value,
+            next_value,
+            records["terminated"],
+            done,
+            gamma=config.gamma,
+            lam=config.lam,
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
         old_log_std = learner.params["log_std"]

@@ -1,0 +1,12 @@
+"""Planners written by hand, one per task, over the same observations and actions that a policy has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+
+from mqe_jax.planners.gate import plan_gate
+
+# Task id -> function from one world's observations (A, O) to its actions (A, action_size).
+PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {"go1gate": plan_gate}

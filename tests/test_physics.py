@@ -1,0 +1,153 @@
+"""Physics on three engines: the compiled robot's figures, agreement with MuJoCo, worlds that stay whole."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mqe_jax import make, physics
+from mqe_jax import robot as go1
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
+from mqe_jax.physics import Physics
+from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax.terrain import Plane, Track
+
+NEEDS_GPU = pytest.mark.gpu
+IMPLS = ["c", "jax", pytest.param("warp", marks=NEEDS_GPU)]
+# The acceptance run is MQE_SOAK=64x2000; by default a short one.
+SOAK = tuple(int(n) for n in os.environ.get("MQE_SOAK", "8x60").split("x"))
+
+
+@pytest.fixture(scope="module")
+def plane() -> CompiledScene:
+    return compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1))
+
+
+def standing(scene: CompiledScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A robot that has settled on its feet on MuJoCo itself: qpos, qvel, ctrl."""
+    model = scene.model
+    data = mujoco.MjData(model)
+    data.qpos[scene.robot.base_qpos[0]] = [0, 0, 0.33, 1, 0, 0, 0]
+    data.qpos[scene.robot.joint_qpos[0]] = go1.DEFAULT_JOINTS
+    data.ctrl[scene.robot.actuator[0]] = go1.DEFAULT_JOINTS
+    mujoco.mj_step(model, data, 300)
+    return data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()
+
+
+def test_robot_has_the_masses_and_inertias_of_a_go1(plane: CompiledScene) -> None:
+    model = plane.model
+    assert model.body_mass.sum() == pytest.approx(11.31, abs=0.05)
+    trunk = model.body("robot0/trunk")
+    assert trunk.mass[0] == pytest.approx(4.8)
+    tensor = np.diag(trunk.inertia)
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, trunk.iquat)
+    turn = turn.reshape(3, 3)
+    np.testing.assert_allclose(turn @ tensor @ turn.T, go1.TRUNK.matrix(), atol=1e-6)
+    left, right = model.body("robot0/FL_thigh"), model.body("robot0/FR_thigh")
+    np.testing.assert_allclose(left.ipos, [-0.0035, -0.0189, -0.0327])
+    np.testing.assert_allclose(right.ipos, [-0.0035, 0.0189, -0.0327])
+    calf = model.body("robot0/RL_calf")
+    assert calf.mass[0] == pytest.approx(0.158 + 0.06)
+    assert calf.ipos[2] == pytest.approx((0.158 * -0.1223 + 0.06 * -0.213) / 0.218)
+
+
+def test_closed_form_feet_are_where_mujoco_puts_them(plane: CompiledScene) -> None:
+    model, index = plane.model, plane.robot
+    data = mujoco.MjData(model)
+    joints = np.random.default_rng(0).uniform(go1.JOINT_LOWER, go1.JOINT_UPPER)
+    data.qpos[index.base_qpos[0]] = [1.0, 2.0, 3.0, 1, 0, 0, 0]
+    data.qpos[index.joint_qpos[0]] = joints
+    mujoco.mj_kinematics(model, data)
+    expected = data.geom_xpos[index.foot_geom[0]] - [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(go1.foot_positions(jnp.asarray(joints)), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("impl", IMPLS)
+def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> None:
+    qpos, qvel, ctrl = standing(plane)
+    reference = mujoco.MjData(plane.model)
+    reference.qpos[:], reference.qvel[:], reference.ctrl[:] = qpos, qvel, ctrl
+    engine = Physics(plane.model, impl=impl, num_envs=1, num_substeps=1)
+    data = engine.init(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros((0, 3)), jnp.asarray(ctrl))
+    step = jax.jit(jax.vmap(lambda state: engine.step(state, jnp.asarray(ctrl))))
+    data = jax.vmap(lambda _: data)(jnp.zeros(1))
+    data = step(data)
+    mujoco.mj_step(plane.model, reference)
+    assert np.abs(np.asarray(data.qpos[0]) - reference.qpos).max() < 1e-4
+    for _ in range(49):
+        data = step(data)
+    mujoco.mj_step(plane.model, reference, 49)
+    assert np.abs(np.asarray(data.qpos[0]) - reference.qpos).max() < 5e-3
+
+
+def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
+    """Trunk x, y, z of all robots (N, A, 3) and gate centres (N, 1, 2)."""
+    position = np.asarray(state.data.qpos)[:, env.robot.base_qpos[:, :3]]
+    return position, np.asarray(state.gates)
+
+
+@pytest.mark.parametrize("impl", IMPLS)
+def test_random_actions_break_nothing(impl: str) -> None:
+    """No NaN, and no robot passes through a wall or the floor, under full-range joint targets."""
+    worlds, steps = SOAK if impl != "jax" or "MQE_SOAK" in os.environ else (2, 20)
+    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=worlds)
+    vector = VectorEnv(env, worlds)
+
+    def advance(state: Any, key: jax.Array) -> tuple[Any, Any]:
+        action = jax.random.uniform(key, (worlds, 2, 12), minval=-1.0, maxval=1.0)
+        state = vector.step(state, action)
+        position = state.data.qpos[:, env.robot.base_qpos[:, :3]]
+        overflow = jnp.any(jax.vmap(vector.env.physics.overflow)(state.data))
+        return state, (position, state.metrics["diverged"], jnp.all(jnp.isfinite(state.obs)), overflow)
+
+    run = jax.jit(lambda state, keys: jax.lax.scan(advance, state, keys))
+    state = jax.jit(vector.reset)(jax.random.PRNGKey(0))
+    state, (position, diverged, finite, overflow) = run(state, jax.random.split(jax.random.PRNGKey(1), steps))
+    assert bool(jnp.all(finite)) and float(jnp.sum(diverged)) == 0
+    assert not bool(jnp.any(overflow))
+    x, y, z = np.moveaxis(np.asarray(position), -1, 0)
+    assert np.all((x > 0.0) & (x < 6.0)) and np.all(np.abs(y) < 1.5) and np.all(z > 0.02)
+
+
+@pytest.mark.parametrize("impl", IMPLS)
+def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
+    """Two robots that overlap touch each other; a robot lying on its belly feels the ground."""
+    env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
+    state = env.reset(jax.random.PRNGKey(0))
+    index = env.robot
+    near = state.data.qpos.at[index.base_qpos[0, :3]].set(jnp.array([1.0, 0.0, 0.30]))
+    near = near.at[index.base_qpos[1, :3]].set(jnp.array([1.0, 0.10, 0.30]))
+    low = state.data.qpos.at[index.base_qpos[0, 2]].set(0.05)
+    both = jax.vmap(lambda qpos: env.reset(jax.random.PRNGKey(0)).data.replace(qpos=qpos))(jnp.stack([near, low]))
+    ctrl = jnp.asarray(state.data.ctrl)
+    after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)))(both)
+    readings = jax.vmap(env.read)(after)
+    assert bool(readings.touching[0, 0, 1]) and bool(readings.touching[0, 1, 0])
+    assert float(readings.trunk_force[0].min()) > 1.0
+    assert not bool(readings.touching[1].any())
+    assert float(readings.trunk_force[1, 0]) > 1.0 and float(readings.trunk_force[1, 1]) == 0.0
+
+
+def test_gate_moves_with_the_world() -> None:
+    """Walls stand where each world's gate was drawn, and stop a robot there."""
+    env = make("go1gate", impl="c", control="position")
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    gap = states.gates[:, 0]
+    assert len(np.unique(np.asarray(gap[:, 0]))) == 3
+    assert np.all(np.abs(np.asarray(gap) - [3.5, 0.0]) <= 0.5)
+    right, left = states.data.mocap_pos[:, 0], states.data.mocap_pos[:, 1]
+    half = np.asarray(env.compiled.model.geom("wall/gate1_left").size)[1]
+    np.testing.assert_allclose(left[:, 1] - half - gap[:, 1], 0.3, atol=1e-5)
+    np.testing.assert_allclose(gap[:, 1] - right[:, 1] - half, 0.3, atol=1e-5)
+
+
+def test_engine_names_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"impl.*'wrap'.*did you mean 'warp'"):
+        physics.resolve_impl("wrap")
