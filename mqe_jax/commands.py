@@ -347,7 +347,7 @@ def demo(arguments: cli.Demo) -> None:
     after = policy_api.load_policy(run_dir)
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
-    plots.draw_curve([run_dir], run_dir / "curve.png", DEMO_TASK, "Narrow Gate on the CPU, from scratch")
+    plots.draw_curve([run_dir], run_dir / "curve.png", DEMO_TASK, "Narrow Gate, trained on the CPU")
     video = run_dir / "video.mp4"
     try:
         rendering.check_output(video)
