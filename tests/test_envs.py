@@ -114,18 +114,18 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     state = dataclasses.replace(
         state, gates=jnp.array([[3.5, 0.0]]), task=gate.reset_task(jax.random.PRNGKey(0), before, state.gates)
     )
-    after = readings([[3.8, 0.75, 0.3], [3.5, 0.35, 0.3]])
+    after = readings([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
     terms, _ = gate.rewards(state, after, jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
-    assert float(terms["approach"]) == pytest.approx(0.3, abs=1e-5)
-    # 0.3 m and 0.4 m apart are 0.5 m, which is not closer than 0.5 m
+    assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
+    # hypot(0.3, 0.43) = 0.524 m apart, which is not closer than 0.5 m
     assert float(terms["crowding"]) == 0
     reward, logged = weigh(terms, gate.params.rewards, 2)
-    np.testing.assert_allclose(reward, [5 + 0.3 - 2] * 2, atol=1e-4)
+    np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
     near, _ = gate.rewards(state, readings([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
     assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
     assert float(near["collision"]) == 0
-    assert float(logged["average_step_reward"]) == pytest.approx(3.3, abs=1e-4)
+    assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
 
 
 def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv) -> None:
@@ -154,7 +154,7 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     assert gate_step(moved(gate, state, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]]), still).terminated
     fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
     assert bool(fallen)
-    bumped = gate_step(moved(gate, state, [[1.0, -1.46, 0.31], [1.0, 0.75, 0.31]]), still)
+    bumped = gate_step(moved(gate, state, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]]), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
 
 
