@@ -171,11 +171,13 @@ class Init(Block):
     Attributes:
         spawn_x: x of the spawn poses from the block's start, m; half its length if None.
         room_width: width of one room, m; the track's width shared out if None.
+        back_wall: whether there is a wall behind the rooms.
     """
 
     length: Ranged = 2.0
     spawn_x: float | None = None
     room_width: float | None = None
+    back_wall: bool = True
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         """Lays the block out from x = `start`."""
@@ -183,7 +185,8 @@ class Init(Block):
         room = track.width / track.num_robots if self.room_width is None else self.room_width
         middle = (track.num_robots - 1) / 2
         spawn = tuple((x, (robot - middle) * room, 0.0) for robot in range(track.num_robots))
-        return Layout(barriers=(Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),), spawn=spawn)
+        back = (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),) if self.back_wall else ()
+        return Layout(barriers=back, spawn=spawn)
 
 
 @register_block("plane")
