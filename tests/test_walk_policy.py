@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 import pickle
 import zipfile
@@ -26,7 +27,7 @@ def elu(x: np.ndarray) -> np.ndarray:
 def random_layers(sizes: tuple[int, ...], seed: int) -> dict[str, np.ndarray]:
     random = np.random.default_rng(seed)
     layers = {}
-    for i, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
         layers[f"{2 * i}.weight"] = random.normal(0, n_in**-0.5, (n_out, n_in)).astype(np.float32)
         layers[f"{2 * i}.bias"] = random.normal(0, 0.1, n_out).astype(np.float32)
     return layers
@@ -134,7 +135,7 @@ def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:
     nets = {}
     for name, sizes in (("a", ADAPTATION_SIZES), ("b", BODY_SIZES)):
         layers: list[Any] = []
-        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for n_in, n_out in itertools.pairwise(sizes):
             layers += [torch.nn.Linear(n_in, n_out), torch.nn.ELU()]
         nets[name] = torch.nn.Sequential(*layers[:-1])
         torch.jit.script(nets[name]).save(str(tmp_path / f"{name}.jit"))
@@ -248,8 +249,11 @@ def test_shipped_policy_walks() -> None:
 
 def test_actuator_network_computes_softsign_layers() -> None:
     random = np.random.default_rng(0)
-    flat = {k: random.normal(size=s) for k, s in
-            (("0.weight", (32, 6)), ("0.bias", (32,)), ("2.weight", (32, 32)), ("2.bias", (32,)), ("4.weight", (1, 32)), ("4.bias", (1,)))}  # fmt: skip
+    shapes: dict[str, tuple[int, ...]] = {
+        "0.weight": (32, 6), "0.bias": (32,), "2.weight": (32, 32), "2.bias": (32,),
+        "4.weight": (1, 32), "4.bias": (1,),
+    }  # fmt: skip
+    flat = {name: random.normal(size=shape) for name, shape in shapes.items()}
     params: Any = {}
     for name, value in flat.items():
         layer, kind = name.split(".")

@@ -134,7 +134,8 @@ class Go1Gate(QuadrupedEnv):
         distance = self.target_distance(readings)
         terms = {
             "success": reward.past(readings.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
-            "approach": reward.decrease(state.task.distance, distance) * (1.0 + (self.params.aid_approach - 1.0) * state.aid),
+            "approach": reward.decrease(state.task.distance, distance)
+            * (1.0 + (self.params.aid_approach - 1.0) * state.aid),
             "crowding": reward.crowding(readings.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
         }

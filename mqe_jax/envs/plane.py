@@ -59,9 +59,11 @@ class Go1Plane(QuadrupedEnv):
     def scene(self) -> Scene:
         """Says what is in the world."""
         track = Track(
-            blocks=(Init(2.0, back_wall=False), Plane(2.0)), width=self.params.width, num_robots=self.num_agents, walled=False,
-            wall_height=0.02,
-        )  # fmt: skip
+            blocks=(Init(2.0, back_wall=False), Plane(2.0)),
+            width=self.params.width,
+            num_robots=self.num_agents,
+            walled=False,
+        )
         return Scene(track, num_robots=self.num_agents)
 
     def reset_task(self, key: jax.Array, readings: RobotReadings, gates: jax.Array) -> PlaneState:
