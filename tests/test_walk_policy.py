@@ -48,7 +48,10 @@ class _Global:
         self.module, self.name = module, name
 
 
-class _Pickler(pickle._Pickler):  # type: ignore[misc]
+_PurePickler: Any = vars(pickle)["_Pickler"]  # the one in Python, whose opcodes can be written by hand
+
+
+class _Pickler(_PurePickler):
     """Writes the opcodes of a TorchScript archive: module objects and tensors kept in other files."""
 
     def save(self, obj: Any, save_persistent_id: bool = True) -> None:
@@ -162,7 +165,9 @@ def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     memory = walk_policy.WalkMemory(jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(()))
     commands = default_commands("trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
     joints = go1.DEFAULT_JOINTS + np.arange(12)
-    obs = walk_policy.observe(memory, jnp.asarray(commands), jnp.array([0.0, 0.0, -1.0]), joints, jnp.full(12, 2.0))
+    obs = walk_policy.observe(
+        memory, jnp.asarray(commands), jnp.array([0.0, 0.0, -1.0]), jnp.asarray(joints), jnp.full(12, 2.0)
+    )
     scaled = [2.0, -1.0, 0.1, 0, 3.0, 0.5, 0, 0, 0.5, 0.012, 0, 0, 0.25, 0.428, 0]
     np.testing.assert_allclose(obs[:18], [0, 0, -1, *scaled], atol=1e-6)
     np.testing.assert_allclose(obs[18:30], np.arange(12), atol=1e-6)
