@@ -108,7 +108,7 @@ def _setting_fields() -> list[tuple[str, Any, Any]]:
     }
     fields = []
     for f in dataclasses.fields(config.TrainConfig):
-        if f.name in ("task", "env"):
+        if f.name in ("task", "env", "train_env"):
             continue
         default = "none" if f.default is None else f.default
         help_text = f"{meaning.get(f.name, '')} Paper: {default}."

@@ -220,7 +220,7 @@ def train(arguments: cli._Train) -> None:
         overrides["control"] = arguments.control
     config = train_config(arguments.task, arguments.config, arguments.settings(), overrides)
     run_dir = arguments.run_dir or Path("runs") / arguments.task
-    _, vector_env = make_env(arguments.task, arguments.impl, config.env, config.num_envs)
+    _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
     try:
         training.train(vector_env, config, run_dir, resume=arguments.resume)
     except KeyboardInterrupt:
@@ -329,6 +329,7 @@ def demo(arguments: cli.Demo) -> None:
     config = train_config(DEMO_TASK, arguments.config, {}, {})
     _check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
+    _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)
     size = f"{config.num_envs} worlds, {config.total_steps / 1e6:g} M steps"
     _say(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
@@ -340,7 +341,7 @@ def demo(arguments: cli.Demo) -> None:
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
     try:
-        training.train(vector_env, config, run_dir, resume=True)
+        training.train(training_env, config, run_dir, resume=True)
     except KeyboardInterrupt:
         _say("mqe: stopped; the same command goes on from here")
         raise

@@ -12,6 +12,7 @@ state (friction, masses, motor strength) is passed to `Physics.step` as arrays n
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -106,7 +107,7 @@ class Physics:
         self.rows_per_env = rows_per_env
         if self.impl == "c":
             self._engine = _CEngine(model, num_substeps)
-            self._template = mjx.make_data(model, impl="cpp")
+            self._template = _without_pointers(mjx.make_data(model, impl="cpp"))
         elif self.impl == "warp":
             self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
             self._template = mjx.make_data(model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env)
@@ -176,6 +177,12 @@ _ITERATIONS = 1 << 9 | 1 << 10
 def _quiet(model: mjx.Model) -> mjx.Model:
     """Switches off Warp's printed warnings; `Physics.overflow` tells of what matters."""
     return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
+
+
+def _without_pointers(data: mjx.Data) -> mjx.Data:
+    """Clears the addresses in memory that MJX keeps in this kind of data: they mean nothing in another process."""
+    zeros = {name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")}
+    return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
 
 
 class _CEngine:

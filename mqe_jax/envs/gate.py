@@ -45,7 +45,6 @@ class GateParams(TaskParams):
         gate_random: half-widths of the range of the gap's centre in x and y, m.
         past_gate: a robot is through when it is so far behind the gate's centre, m.
         target_x: x of the robots' targets, m.
-        aid_approach: factor on the approach reward under full aid (see `State.aid`).
         target_y: y of the targets, m; the robots cross: the first goes to the left.
         rewards: weights.
     """
@@ -62,7 +61,6 @@ class GateParams(TaskParams):
     past_gate: float = 0.25
     target_x: float = 5.5
     target_y: float = 0.75
-    aid_approach: float = 10.0
     rewards: GateRewards = GateRewards()
 
 
@@ -134,8 +132,7 @@ class Go1Gate(QuadrupedEnv):
         distance = self.target_distance(readings)
         terms = {
             "success": reward.past(readings.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
-            "approach": reward.decrease(state.task.distance, distance)
-            * (1.0 + (self.params.aid_approach - 1.0) * state.aid),
+            "approach": reward.decrease(state.task.distance, distance),
             "crowding": reward.crowding(readings.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
         }

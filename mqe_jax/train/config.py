@@ -22,6 +22,8 @@ class TrainConfig:
     """Id of the task that the settings are meant for."""
     env: Mapping[str, Any] = field(default_factory=dict)
     """Overrides of the task's parameters, handed to the environment as they are."""
+    train_env: Mapping[str, Any] = field(default_factory=dict)
+    """Further overrides that hold while training only; evaluations are on the task without them."""
     seed: int = 0
     """Seed of everything random."""
     num_envs: int = 500
@@ -97,6 +99,8 @@ class TrainConfig:
     """Logarithm of the actions' deviation at the start."""
     log_std_max: float | None = None
     """Upper bound of that logarithm, against which an entropy bonus can push; none sets no bound."""
+    log_std_min: float | None = None
+    """Lower bound of that logarithm, which keeps actions varied to the end; none sets no bound."""
     normalize_observations: bool = False
     """Whether observations are brought to mean 0 and deviation 1 by running statistics."""
     normalize_values: bool = True
@@ -108,6 +112,8 @@ class TrainConfig:
     advantage_clip: float | None = None
     """Bounds advantages to so many times their median size, by which they are then divided, so that rare great
     losses do not drown everyday gains; none leaves them."""
+    advantage_clip_until: float = 1.0
+    """Part of the training after which advantages are not bounded any more."""
     stagger_episodes: bool = False
     """Whether the first episodes begin at random times, so that worlds do not reset all at once."""
     checkpoint_every: int = 20
@@ -117,6 +123,11 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         _validate(self)
+
+    @property
+    def training_env(self) -> dict[str, Any]:
+        """Overrides of the task's parameters while training."""
+        return {**self.env, **self.train_env}
 
     @property
     def chunk(self) -> int:
@@ -136,7 +147,7 @@ class TrainConfig:
 
 _POSITIVE = (
     "num_envs total_steps rollout_steps epochs minibatches learning_rate target_kl adam_eps max_grad_norm "
-    "aid_until failure_bootstrap_until advantage_clip clip value_clip huber_delta gru_size chunk_length "
+    "aid_until failure_bootstrap_until advantage_clip advantage_clip_until clip value_clip huber_delta gru_size chunk_length "
     "action_gain checkpoint_every checkpoints_kept "
 ).split()
 _NOT_NEGATIVE = "seed value_coef entropy_coef entropy_coef_final".split()
@@ -169,6 +180,8 @@ def _validate(config: TrainConfig) -> None:
         _fail("dual_clip", config.dual_clip, "greater than 1, or none")
     if config.log_std_max is not None and config.log_std_init > config.log_std_max:
         _fail("log_std_init", config.log_std_init, f"at most log_std_max ({config.log_std_max})")
+    if config.log_std_min is not None and config.log_std_init < config.log_std_min:
+        _fail("log_std_init", config.log_std_init, f"at least log_std_min ({config.log_std_min})")
     if not all(size > 0 for size in config.hidden_sizes) or not config.hidden_sizes:
         _fail("hidden_sizes", config.hidden_sizes, "one or more widths greater than 0")
     if config.rollout_steps % config.chunk:
@@ -279,8 +292,9 @@ def load_config(path: str | Path, **overrides: Any) -> TrainConfig:
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise ValueError(f"{path}: holds {type(values).__name__}; it must be a mapping of settings to values")
-    if isinstance(values.get("env"), Mapping) and isinstance(overrides.get("env"), Mapping):
-        overrides = {**overrides, "env": {**values["env"], **overrides["env"]}}
+    for name in ("env", "train_env"):
+        if isinstance(values.get(name), Mapping) and isinstance(overrides.get(name), Mapping):
+            overrides = {**overrides, name: {**values[name], **overrides[name]}}
     try:
         return config_from_mapping({**values, **overrides})
     except ValueError as error:

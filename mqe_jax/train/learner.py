@@ -211,7 +211,8 @@ def _prepare(
     metrics = {"value_mean": jnp.mean(value), "explained_variance": 1.0 - error_share}
     if config.advantage_clip is not None:
         scale = jnp.median(jnp.abs(advantage)) + 1e-8
-        advantage = jnp.clip(advantage / scale, -config.advantage_clip, config.advantage_clip)
+        bound = jnp.where(progress < config.advantage_clip_until, config.advantage_clip, jnp.inf)
+        advantage = jnp.clip(advantage / scale, -bound, bound)
     if config.normalize_advantages:
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 

@@ -174,6 +174,8 @@ def make_network(sizes: Sizes, config: TrainConfig) -> Network:
         log_std = params["log_std"]
         if config.log_std_max is not None:
             log_std = jnp.minimum(log_std, config.log_std_max)
+        if config.log_std_min is not None:
+            log_std = jnp.maximum(log_std, config.log_std_min)
         return mean, jnp.broadcast_to(log_std, mean.shape), memory
 
     def act(

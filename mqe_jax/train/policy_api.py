@@ -77,7 +77,7 @@ def _acting(sizes: Sizes, config: TrainConfig) -> Any:
     """Returns the compiled act of a network; only the settings that shape it tell networks apart."""
     names = (
         "critic_input share_policy hidden_sizes activation recurrent gru_size action_mean "
-        "normalize_observations value ratio log_std_init log_std_max"
+        "normalize_observations value ratio log_std_init log_std_max log_std_min"
     ).split()
     return _acting_cached(sizes, tuple((name, getattr(config, name)) for name in names))
 

@@ -73,11 +73,12 @@ def train(
         with ProgressLog(config.task or env.name, env_steps, total_steps) as progress_log:
             while env_steps < total_steps:
                 update_began = time.perf_counter()
-                state, metrics = update(state)
-                row = _row(state, jax.device_get(metrics), config, began, update_began)
-                env_steps = int(row["env_steps"])
+                after, metrics = update(state)
+                row = _row(after, jax.device_get(metrics), config, began, update_began)
                 for log in (csv_log, tensorboard_log, progress_log):
                     log.write(row)
+                # Only now, so that an interrupted training is saved with no more updates than its logs show.
+                state, env_steps = after, int(row["env_steps"])
                 if on_update is not None:
                     on_update(state, row)
                 if int(row["updates"]) % config.checkpoint_every == 0:
