@@ -146,10 +146,10 @@ class _Train:
 
 @dataclass(frozen=True)
 class Eval:
-    """Measure a trained run, or a simple policy on a task, over whole episodes from fresh resets."""
+    """Measure a trained run, or a planner on a task, over whole episodes from fresh resets."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN|TASK")]
-    """Folder of a run, or id of a task (then with --policy)."""
+    """Folder of a run, or id of a task (then with --planner or --policy)."""
     json: Json = False
     episodes: int = 512
     """Episodes to count; every world counts its first ones, however long they are."""
@@ -160,9 +160,11 @@ class Eval:
     seed: Seed = 0
     deterministic: bool = False
     """Act with the policy's mean instead of drawing from it."""
-    policy: Annotated[str | None, tyro.conf.arg(metavar="POLICY|RUN")] = None
-    """Who acts: random, zero, forward (straight on at half speed), or the folder of a run. Default: the run
-    given, or random for a task."""
+    planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Who acts in place of a trained policy: scripted (written by hand for the task), random, idle (zero
+    commands), forward (straight on at half speed). Default for a task: random."""
+    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Folder of the run whose policy acts. Default: the run given."""
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
@@ -177,9 +179,11 @@ class Render:
     """Id of a task, or folder of a run."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write; its suffix chooses the kind: .mp4, .gif or .png."""
-    policy: Annotated[str | None, tyro.conf.arg(metavar="POLICY|RUN")] = None
-    """Who acts: random, zero, forward (straight on at half speed), or the folder of a run. Default: the run
-    given, or forward for a task."""
+    planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Who acts in place of a trained policy: scripted (written by hand for the task), random, idle (zero
+    commands), forward (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Folder of the run whose policy acts. Default: the run given."""
     best_of: int = 1
     """Play this many episodes and draw the best one (success first, then reward)."""
     seconds: float = 20.0

@@ -20,6 +20,8 @@ from mqe_jax import bench as benchmark
 from mqe_jax import plots
 from mqe_jax import render as rendering
 from mqe_jax.envs import TASKS, VectorEnv, make
+from mqe_jax.planners import PLANNERS
+from mqe_jax.terrain import nearest
 from mqe_jax.train import config as configs
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy_api
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from mqe_jax import cli
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
-SIMPLE_POLICIES = ("random", "zero", "forward")
+PLANNER_NAMES = ("scripted", "random", "idle", "forward")
 
 Act = Callable[[jax.Array, Any, jax.Array], tuple[jax.Array, Any]]
 
@@ -111,11 +113,14 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
-def simple_policy(name: str, env: Any) -> Act:
-    """A policy that needs no training; `act` as in `evaluate`."""
+def planner(name: str, env: Any) -> Act:
+    """What acts without training; `act` as in `evaluate`. ValueError where the task has no scripted planner."""
     shape = (env.num_agents, env.action_size)
+    plan = _scripted(env) if name == "scripted" else None
 
     def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        if plan is not None:
+            return plan(obs), memory
         if name == "random":
             return jax.random.uniform(key, (len(obs), *shape), minval=-1.0, maxval=1.0), memory
         action = jnp.zeros((len(obs), *shape))
@@ -124,18 +129,27 @@ def simple_policy(name: str, env: Any) -> Act:
     return act
 
 
+def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
+    """The task's planner for a batch of worlds: observations (N, A, O) to actions (N, A, 3)."""
+    if env.name not in PLANNERS:
+        raise ValueError(f"planner: {env.name} has none that is scripted; allowed for: {', '.join(PLANNERS)}")
+    if env.control != "command":
+        raise ValueError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
+    return jax.vmap(PLANNERS[env.name])
+
+
 @dataclasses.dataclass(frozen=True)
 class Actor:
-    """Who acts on what: a task with its parameters, and a policy, simple or trained."""
+    """Who acts on what: a task with its parameters, and a trained policy or a planner's name."""
 
     task: str
     overrides: dict[str, Any]
     policy: policy_api.Policy | str
 
     def act(self, env: Any, deterministic: bool) -> Act:
-        """The batched `act` of the policy; ValueError where a trained policy does not fit the task."""
+        """The batched `act` of the policy; ValueError where it does not fit the task."""
         if isinstance(self.policy, str):
-            return simple_policy(self.policy, env)
+            return planner(self.policy, env)
         policy = self.policy
         sizes = (env.num_agents, env.observation_size, env.action_size)
         trained = (policy.sizes.agents, policy.sizes.observation, policy.sizes.action)
@@ -154,27 +168,30 @@ class Actor:
         return () if isinstance(self.policy, str) else self.policy.initial_memory(num_envs)
 
 
-def find_actor(
-    target: str, policy: str | None, overrides: Mapping[str, Any], control: str | None, default: str
-) -> Actor:
-    """Reads RUN|TASK and --policy; `default` acts on a task where nobody is named."""
-    given = dict(overrides) | ({} if control is None else {"control": control})
-    chosen: policy_api.Policy | str = default
-    task, env_values = target, given
+def find_actor(arguments: cli.Eval | cli.Render, default: str) -> Actor:
+    """Reads RUN|TASK, --policy and --planner; `default` acts on a task where nobody is named."""
+    target = arguments.target
+    given = parse_overrides(arguments.set) | ({} if arguments.control is None else {"control": arguments.control})
+    if arguments.planner is not None and arguments.policy is not None:
+        raise ValueError("planner: give --planner or --policy, not both")
+    if arguments.planner is not None and arguments.planner not in PLANNER_NAMES:
+        near = nearest(arguments.planner, PLANNER_NAMES)
+        raise ValueError(f"planner: unknown {arguments.planner!r}{near}; allowed: {', '.join(PLANNER_NAMES)}")
+    run = arguments.policy
     if is_run(target):
         _check_run(target)
         config = training.load_run_config(target)
         if config.task is None:
             raise ValueError(f"{target}: its {training.CONFIG_FILE} names no task")
         task, env_values = config.task, {**config.env, **given}
-        if policy is None:
-            chosen = policy_api.load_policy(target)
-    if policy is not None:
-        if policy not in SIMPLE_POLICIES and not is_run(policy):
-            allowed = ", ".join(SIMPLE_POLICIES)
-            raise ValueError(f"policy: unknown {policy!r}; allowed: {allowed}, or the folder of a run")
-        chosen = policy if policy in SIMPLE_POLICIES else policy_api.load_policy(policy)
-    return Actor(task, env_values, chosen)
+        run = Path(target) if run is None and arguments.planner is None else run
+    else:
+        task, env_values = target, given
+    if run is not None:
+        return Actor(task, env_values, policy_api.load_policy(run))
+    if default == "scripted" and task not in PLANNERS:
+        default = "forward"
+    return Actor(task, env_values, arguments.planner or default)
 
 
 def _check_run(target: str) -> None:
@@ -234,8 +251,7 @@ def evaluate(arguments: cli.Eval) -> dict[str, Any]:
     """Measures a policy and prints a table, or gives the object for `--json`."""
     if arguments.episodes < 1:
         raise ValueError(f"episodes: {arguments.episodes} is not allowed; it must be at least 1")
-    overrides = parse_overrides(arguments.set)
-    actor = find_actor(arguments.target, arguments.policy, overrides, arguments.control, "random")
+    actor = find_actor(arguments, "random")
     num_envs = min(arguments.num_envs, arguments.episodes)
     env, vector_env = make_env(actor.task, arguments.impl, actor.overrides, num_envs)
     result = evaluation.evaluate(
@@ -268,8 +284,7 @@ def render(arguments: cli.Render) -> None:
         if value is not None and not 0 < value <= 4096:
             raise ValueError(f"{name}: {value} is not allowed; it must be between 1 and 4096")
     rendering.check_output(arguments.output)
-    overrides = parse_overrides(arguments.set)
-    actor = find_actor(arguments.target, arguments.policy, overrides, arguments.control, "forward")
+    actor = find_actor(arguments, "scripted")
     env, _ = make_env(actor.task, arguments.impl, actor.overrides, arguments.best_of)
     drawn_by = draw(
         env,

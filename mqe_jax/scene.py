@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,9 @@ import mujoco
 import numpy as np
 
 from mqe_jax import robot as robots
+from mqe_jax.npc import Object, ObjectIndex, index_objects
 from mqe_jax.robot import Contacts, RobotIndex
 from mqe_jax.terrain import Layout, Track, build_terrain
-
-# A function that adds bodies (objects, NPCs, ramps, platforms) to the scene after the robots.
-# It is called with the spec and whether to add geoms that are only looked at.
-AddBodies = Callable[[mujoco.MjSpec, bool], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +24,7 @@ class Scene:
         track: ground, walls and spawn poses.
         num_robots: A.
         contacts: which parts of the robots touch what.
-        objects: called in order to add further bodies.
+        objects: everything else that is in it, added after the robots.
         friction: sliding friction of the robots' shapes and the ground.
         torque_control: the actuators take torques (N m) instead of PD joint targets (rad).
         foot_sensors: whether the feet's contact forces are measured too.
@@ -39,7 +36,7 @@ class Scene:
     track: Track
     num_robots: int = 2
     contacts: Contacts = dataclasses.field(default_factory=Contacts)
-    objects: tuple[AddBodies, ...] = ()
+    objects: tuple[Object, ...] = ()
     friction: float = 1.0
     torque_control: bool = False
     foot_sensors: bool = False
@@ -60,6 +57,7 @@ class CompiledScene:
         scene: what it was built from.
         model: for the physics, without the geoms that are only looked at.
         robot: index tables of the robots.
+        objects: where each object is, by name.
         layout: the track's walls, anchors and spawn poses.
         mocap_offset: of each moving wall from its anchor (W, 3), m; the anchor's z is 0.
         mocap_anchor: the anchor of each moving wall (W,).
@@ -68,6 +66,7 @@ class CompiledScene:
     scene: Scene
     model: mujoco.MjModel
     robot: RobotIndex
+    objects: Mapping[str, ObjectIndex]
     layout: Layout
     mocap_offset: np.ndarray
     mocap_anchor: np.ndarray
@@ -106,8 +105,8 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
             torque_control=scene.torque_control,
         )  # fmt: skip
         spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
-    for add in scene.objects:
-        add(spec, visual)
+    for item in scene.objects:
+        item.add(spec, visual)
     robots.add_sensors(spec, scene.num_robots, scene.contacts, feet=scene.foot_sensors)
     if visual:
         spec.worldbody.add_light(
@@ -129,6 +128,7 @@ def compile_scene(scene: Scene) -> CompiledScene:
         scene=scene,
         model=model,
         robot=robots.index_robots(model, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
+        objects=index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),
         mocap_anchor=np.array([wall.anchor for wall in moving], np.int32),

@@ -75,7 +75,7 @@ def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest
 
 
 def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", "fake", "--json", "--policy", "forward", "--episodes", "2"]) == 0
+    assert cli.main(["eval", "fake", "--json", "--planner", "forward", "--episodes", "2"]) == 0
     result = json.loads(capfd.readouterr().out)
     assert result["success_rate"] == 1.0
     assert result["average_step_reward"] == pytest.approx(0.05)
@@ -116,7 +116,8 @@ BAD = {
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
     "worlds": (["bench", "go1gate", "--num-envs", "0"], ["num_envs", "0"]),
     "episodes": (["eval", "fake", "--episodes", "0"], ["episodes", "0", "at least 1"]),
-    "policy": (["eval", "fake", "--policy", "randm"], ["'randm'", "random"]),
+    "planner": (["eval", "fake", "--planner", "randm"], ["'randm'", "random"]),
+    "no scripted planner": (["eval", "fake", "--planner", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
     "run": (["eval", "runs/none"], ["runs/none"]),
     "no run": (["eval", "."], ["config.yaml"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),

@@ -111,9 +111,8 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     state = gate.reset(jax.random.PRNGKey(0))
     before = readings([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
     # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
-    state = dataclasses.replace(
-        state, gates=jnp.array([[3.5, 0.0]]), task=gate.reset_task(jax.random.PRNGKey(0), before, state.gates)
-    )
+    task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.gates)
+    state = dataclasses.replace(state, gates=jnp.array([[3.5, 0.0]]), task=task)
     after = readings([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
     terms, _ = gate.rewards(state, after, jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
@@ -247,4 +246,4 @@ def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip().splitlines()[-1] == "[]"
-    assert mqe_jax.tasks() == ("go1plane", "go1gate")
+    assert mqe_jax.tasks() == ("go1plane", "go1gate", "go1sheep-easy", "go1sheep-hard", "go1pushbox")

@@ -11,7 +11,7 @@ import pytest
 from fake_env import FakeEnv
 
 from mqe_jax import render
-from mqe_jax.commands import simple_policy
+from mqe_jax.commands import planner
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def env() -> FakeEnv:
 
 @pytest.fixture(scope="module")
 def episode(env: FakeEnv) -> render.Episode:
-    act = simple_policy("forward", env)
+    act = planner("forward", env)
     return render.record(env, act, (), jax.random.PRNGKey(0), worlds=2, seconds=1.0)[1]
 
 

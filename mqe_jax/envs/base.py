@@ -222,7 +222,7 @@ class QuadrupedEnv:
             torque_control=control == "torque" or self.params.actuator_network is not None,
         )  # fmt: skip
         self.compiled = compile_scene(self._scene)
-        self.robot = self.compiled.robot
+        self.robot, self.objects = self.compiled.robot, self.compiled.objects
         self.physics = Physics(
             self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self.params.contacts_per_env,
             rows_per_env=self.params.rows_per_env,
@@ -254,13 +254,17 @@ class QuadrupedEnv:
         """Draws where movable objects start, into qpos (nq,) and qvel (nv,)."""
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, gates: jax.Array) -> Any:
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> Any:
         """Returns the task's own fields of a fresh world."""
         return None
 
     def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array | None:
         """Returns walk commands (R - A, 15) of the robots that are no agents."""
         return None
+
+    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
+        """Moves what has a will of its own: returns the world with its velocities for the next step."""
+        return data
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -365,7 +369,7 @@ class QuadrupedEnv:
             data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
             reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
             step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
-            world=self._draw_world(world_key), task=self.reset_task(task_key, readings, gates), aid=aid,
+            world=self._draw_world(world_key), task=self.reset_task(task_key, readings, data, gates), aid=aid,
             hold=self._draw_hold(aid_key, aid), key=next_key,
         )  # fmt: skip
         terms, _ = self.rewards(state, readings, no)
@@ -389,14 +393,14 @@ class QuadrupedEnv:
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
         action = jnp.where((state.step < state.hold)[:, None], 0.0, action)
-        key, push_key, noise_key = jax.random.split(state.key, 3)
+        key, push_key, noise_key, drive_key = jax.random.split(state.key, 4)
 
         before = self.read(state.data)
         target, control = self.controller.targets(
             state.control, action, before.projected_gravity, before.joint_position, before.joint_velocity,
             self.npc_commands(state, before),
         )  # fmt: skip
-        data = self._pushed(state.data, push_key)
+        data = self.drive(self._pushed(state.data, push_key), before, drive_key)
         data, control = self.controller.apply(
             control,
             data,
@@ -429,6 +433,10 @@ class QuadrupedEnv:
     def read(self, data: mjx.Data) -> RobotReadings:
         """Reads all robots of one world."""
         return go1.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
+
+    def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
+        """Returns the coordinates of an object by name, as its class gives them."""
+        return data.qpos[self.objects[name].qpos]
 
     def fallen(self, readings: RobotReadings) -> jax.Array:
         """Returns whether any robot lies on its side or back, or is too low or too high () bool."""

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mujoco import mjx
 
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
@@ -100,7 +101,7 @@ class Go1Gate(QuadrupedEnv):
         contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk", "foot"), object=())
         return Scene(track, num_robots=2, contacts=contacts)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, gates: jax.Array) -> GateState:
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> GateState:
         """Returns the task's own fields of a fresh world."""
         return GateState(self.target_distance(readings))
 

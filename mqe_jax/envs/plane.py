@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
 from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, others
@@ -66,7 +67,7 @@ class Go1Plane(QuadrupedEnv):
         )
         return Scene(track, num_robots=self.num_agents)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, gates: jax.Array) -> PlaneState:
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> PlaneState:
         """Returns the task's own fields of a fresh world."""
         return PlaneState(readings.position_w[:, 0])
 

@@ -7,6 +7,12 @@ from collections.abc import Callable
 import jax
 
 from mqe_jax.planners.gate import plan_gate
+from mqe_jax.planners.pushbox import plan_pushbox
+from mqe_jax.planners.sheep import plan_sheep_easy
 
 # Task id -> function from one world's observations (A, O) to its actions (A, action_size).
-PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {"go1gate": plan_gate}
+PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "go1gate": plan_gate,
+    "go1sheep-easy": plan_sheep_easy,
+    "go1pushbox": plan_pushbox,
+}

@@ -147,8 +147,8 @@ class TrainConfig:
 
 _POSITIVE = (
     "num_envs total_steps rollout_steps epochs minibatches learning_rate target_kl adam_eps max_grad_norm "
-    "aid_until failure_bootstrap_until advantage_clip advantage_clip_until clip value_clip huber_delta gru_size chunk_length "
-    "action_gain checkpoint_every checkpoints_kept "
+    "aid_until failure_bootstrap_until advantage_clip advantage_clip_until clip value_clip huber_delta gru_size "
+    "chunk_length action_gain checkpoint_every checkpoints_kept "
 ).split()
 _NOT_NEGATIVE = "seed value_coef entropy_coef entropy_coef_final".split()
 _SHARE = "gamma gae_lambda failure_bootstrap aid".split()

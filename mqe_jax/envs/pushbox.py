@@ -1,0 +1,141 @@
+"""go1pushbox, the paper's Push Box: two robots push a box, too heavy for one, through a gate."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.npc import Box
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Closing, Gate, Init, Track
+
+
+@dataclasses.dataclass(frozen=True)
+class PushBoxRewards:
+    """Weights of the reward terms.
+
+    Attributes:
+        progress: per m that the box moved along x.
+        success: while the box is past the gate.
+    """
+
+    progress: float = 10.0
+    success: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class PushBoxParams(TaskParams):
+    """Parameters of Push Box.
+
+    Attributes:
+        track_width: m.
+        gate_width: of the gap, m.
+        gate_random: half-widths of the range of the gap's centre in x and y, m.
+        past_gate: the box is through when its centre is so far behind the gate's, m.
+        box_size: full extents, m.
+        box_mass: kg.
+        box_friction: sliding friction with the ground.
+        box_x: of the box's centre at reset, m.
+        box_noise: half-width of the uniform noise on the box's position, m.
+        rewards: weights.
+    """
+
+    episode_length: float = 15.0
+    track_width: float = 5.0
+    gate_width: float = 1.5
+    gate_random: tuple[float, float] = (0.0, 0.5)
+    past_gate: float = 0.0
+    box_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    box_mass: float = 6.0
+    box_friction: float = 1.0
+    box_x: float = 2.5
+    box_noise: float = 0.5
+    contacts_per_env: int = 32
+    rewards: PushBoxRewards = PushBoxRewards()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PushBoxState:
+    """`x`: of the box after the last step (), m."""
+
+    x: jax.Array
+
+
+class Go1PushBox(QuadrupedEnv):
+    """Push Box.
+
+    - Scene: a track 5 m wide with a box of 1 m and 6 kg before a gate of 1.5 m.
+    - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2, box x, y, box quaternion 4.
+    - Reward: see `PushBoxRewards`; shared.
+    - End: a fall, or 15 s. Success: the box is past the gate.
+
+    Source: paper, section III and table of rewards.
+    """
+
+    name = "go1pushbox"
+    title = "Push Box"
+    Params: ClassVar[type[TaskParams]] = PushBoxParams
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        gate = Gate(5.0, width=params.gate_width, random=params.gate_random)
+        track = Track(blocks=(Init(2.0), gate, Closing()), width=params.track_width)
+        box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
+        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
+        return Scene(track, num_robots=2, contacts=contacts, objects=(box,))
+
+    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draws where the box starts."""
+        params = self.params
+        noise = jax.random.uniform(key, (2,), minval=-params.box_noise, maxval=params.box_noise)
+        pose = jnp.array([params.box_x, 0.0, params.box_size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
+        return qpos.at[self.objects["box"].qpos].set(pose), qvel
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> PushBoxState:
+        """Returns the task's own fields of a fresh world."""
+        return PushBoxState(self.object_pose(data, "box")[0])
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout(
+            (
+                Block("one_hot", 2, ONE_HOT),
+                Block("base", 6, BASE_INFO),
+                Block("mate", 6, BASE_INFO),
+                Block("gate", 2, "centre of the gap, m"),
+                Block("box", 2, "centre x, y, m"),
+                Block("box_quaternion", 4, "wxyz"),
+            )
+        )
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width)."""
+        info, pose = readings.base_info, self.object_pose(state.data, "box")
+        return {
+            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "gate": for_all(state.gates, 2),
+            "box": for_all(pose[:2], 2), "box_quaternion": for_all(pose[3:], 2),
+        }  # fmt: skip
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        x = self.object_pose(state.data, "box")[0]
+        terms = {"progress": x - state.task.x, "success": self.through(state).astype(jnp.float32)}
+        return terms, PushBoxState(x)
+
+    def through(self, state: State) -> jax.Array:
+        """Whether the box is past the gate () bool."""
+        return self.object_pose(state.data, "box")[0] > state.gates[0, 0] + self.params.past_gate
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: the box is past the gate; `success/way`: how far it came, m."""
+        return {"success": self.through(state), "success/way": state.task.x - self.params.box_x}

@@ -1,0 +1,208 @@
+"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: two robots drive sheep through a gate."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.npc import Sheep, flock
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+
+
+@dataclasses.dataclass(frozen=True)
+class SheepRewards:
+    """Weights of the reward terms.
+
+    Attributes:
+        success: per sheep past the gate.
+        progress: per m that the sheep moved along x, all together.
+        nearness: for each sheep that is not past the gate, exp(-distance to the gate's centre / 2 m).
+    """
+
+    success: float = 1.0
+    progress: float = 2.0
+    nearness: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class SheepEasyParams(TaskParams):
+    """Parameters of both tasks, with the values of the easy one.
+
+    Attributes:
+        track_width: m.
+        lengths: of the init block and of the free ground before and behind the gate, m.
+        spawn_x: of the robots, m.
+        spawn_apart: distance of the robots from each other, m.
+        gate_width: of the gap, m.
+        gate_random: half-widths of the range of the gap's centre in x and y, m.
+        past_gate: a sheep is through when it is so far behind the gate's centre, m.
+        flock: rows of sheep along x and along y.
+        flock_center: middle of the flock at reset, m.
+        flock_spacing: of the rows, m.
+        flock_noise: half-width of the uniform noise on each sheep's position, m.
+        restlessness: how much the sheep move of their own will (s in `mqe_jax.npc.flock`).
+        sheep_friction: sliding friction of the sheep with the ground.
+        rewards: weights.
+    """
+
+    episode_length: float = 15.0
+    end_on_collision: bool = True
+    track_width: float = 4.0
+    lengths: tuple[float, float, float] = (1.5, 3.0, 3.0)
+    spawn_x: float = 1.25
+    spawn_apart: float = 1.95
+    gate_width: float = 0.8
+    gate_random: tuple[float, float] = (0.0, 0.5)
+    past_gate: float = 0.0
+    flock: tuple[int, int] = (1, 1)
+    flock_center: tuple[float, float] = (3.0, 0.0)
+    flock_spacing: float = 1.5
+    flock_noise: float = 0.3
+    restlessness: float = 0.02
+    sheep_friction: float = 1.0
+    rewards: SheepRewards = SheepRewards()
+
+
+@dataclasses.dataclass(frozen=True)
+class SheepHardParams(SheepEasyParams):
+    """The same parameters with the values of the hard task."""
+
+    track_width: float = 6.0
+    lengths: tuple[float, float, float] = (2.0, 6.0, 6.0)
+    spawn_x: float = 1.5
+    spawn_apart: float = 3.0
+    gate_width: float = 1.5
+    gate_random: tuple[float, float] = (0.0, 1.0)
+    flock: tuple[int, int] = (3, 3)
+    flock_center: tuple[float, float] = (5.0, 0.0)
+    restlessness: float = 0.1
+    rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SheepState:
+    """`x`: of the sheep after the last step (S,), m."""
+
+    x: jax.Array
+
+
+class Go1SheepEasy(QuadrupedEnv):
+    """Sheep Dog: sheep flee from robots that come near, and must be driven through a gate.
+
+    - Scene: a track with a gate whose centre is drawn at reset; one sheep (hard: nine) before it.
+    - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2, each sheep's x, y.
+    - Reward: see `SheepRewards`; shared.
+    - End: a fall, a collision, or 15 s. Success: the share of the sheep that are past the gate.
+
+    Source: paper, section III and table of rewards.
+    """
+
+    name = "go1sheep-easy"
+    title = "Sheep Dog (Easy)"
+    Params: ClassVar[type[TaskParams]] = SheepEasyParams
+
+    @property
+    def num_sheep(self) -> int:
+        """How many sheep there are."""
+        rows, columns = self.params.flock
+        return rows * columns
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        before, middle, behind = params.lengths
+        init = Init(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
+        gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
+        track = Track(blocks=(init, Plane(middle), gate, Plane(behind), Closing()), width=params.track_width)
+        touching = ("trunk", "foot")
+        contacts = Contacts(ground=touching, wall=touching, robot=touching, object=touching)
+        flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
+        return Scene(track, num_robots=2, contacts=contacts, objects=flock)
+
+    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draws where the sheep start."""
+        params = self.params
+        rows, columns = params.flock
+        x, y = np.meshgrid(np.arange(rows) - (rows - 1) / 2, np.arange(columns) - (columns - 1) / 2, indexing="ij")
+        start = params.flock_center + params.flock_spacing * np.stack([x, y], axis=-1).reshape(-1, 2)
+        noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
+        return qpos.at[self._sheep("qpos")].set(start + noise), qvel
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> SheepState:
+        """Returns the task's own fields of a fresh world."""
+        return SheepState(self.sheep(data)[:, 0])
+
+    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
+        """Lets the sheep flee, wander and flock together."""
+        index = self._sheep("qvel")
+        velocity = flock(
+            key, self.sheep(data), data.qvel[index], readings.position_w[:, :2], step=self.dt,
+            restlessness=self.params.restlessness, friction=self.params.sheep_friction,
+        )  # fmt: skip
+        return data.replace(qvel=data.qvel.at[index].set(velocity))
+
+    def sheep(self, data: mjx.Data) -> jax.Array:
+        """Returns the sheep's positions (S, 2), m."""
+        return data.qpos[self._sheep("qpos")]
+
+    def _sheep(self, vector: str) -> np.ndarray:
+        """Where the sheep are in qpos or qvel (S, 2)."""
+        return np.stack([getattr(self.objects[f"sheep{number}"], vector) for number in range(self.num_sheep)])
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout(
+            (
+                Block("one_hot", 2, ONE_HOT),
+                Block("base", 6, BASE_INFO),
+                Block("mate", 6, BASE_INFO),
+                Block("gate", 2, "centre of the gap, m"),
+                Block("sheep", 2 * self.num_sheep, "x, y of each, m"),
+            )
+        )
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width)."""
+        info = readings.base_info
+        return {
+            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "gate": for_all(state.gates, 2),
+            "sheep": for_all(self.sheep(state.data), 2),
+        }  # fmt: skip
+
+    def through(self, state: State) -> jax.Array:
+        """Which sheep are past the gate (S,) bool."""
+        return self.sheep(state.data)[:, 0] > state.gates[0, 0] + self.params.past_gate
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        sheep, through = self.sheep(state.data), self.through(state)
+        distance = jnp.linalg.norm(sheep - state.gates[0], axis=-1)
+        terms = {
+            "success": jnp.sum(through).astype(jnp.float32),
+            "progress": jnp.sum(sheep[:, 0] - state.task.x),
+            "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-distance / 2.0))),
+        }
+        return terms, SheepState(sheep[:, 0])
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: the share of the sheep that are past the gate, however the episode ended."""
+        return {"success": jnp.mean(self.through(state))}
+
+
+class Go1SheepHard(Go1SheepEasy):
+    """Sheep Dog with nine sheep; see `Go1SheepEasy`."""
+
+    name = "go1sheep-hard"
+    title = "Sheep Dog (Hard)"
+    Params: ClassVar[type[TaskParams]] = SheepHardParams

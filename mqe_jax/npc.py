@@ -1,0 +1,262 @@
+"""Everything in a scene that is no agent and no wall: boxes, balls, sheep, doors, planks, platforms.
+
+An object is a small frozen dataclass that adds one body named `object/<name>` to a scene; `index_objects` says
+where the coordinates of a compiled scene's objects are. The rules that drive NPCs are pure functions beside them.
+
+Frame: the environment's; metre, kilogram, second, radian, newton.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mqe_jax.robot import GROUND_BIT, OBJECT_BIT, WALL_BIT
+
+GRAVITY = 9.81  # m/s^2
+
+Color = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
+
+_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+# What touches ground, walls, other objects, and those parts of robots that answer to objects.
+_FREE = {"contype": OBJECT_BIT, "conaffinity": GROUND_BIT | WALL_BIT | OBJECT_BIT}
+# What the scene holds in place or at its height: it need not touch the ground.
+_HELD = {"contype": OBJECT_BIT, "conaffinity": WALL_BIT | OBJECT_BIT}
+# What robots and free objects stand on.
+_FLOOR = {"contype": GROUND_BIT, "conaffinity": 0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Object:
+    """Base of all objects.
+
+    Attributes:
+        name: unique in the scene.
+    """
+
+    name: str
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the body, and the geoms that are only looked at if `visual`."""
+        raise TypeError(f"object {type(self).__name__}: add() is not defined")
+
+    def _body(
+        self, spec: mujoco.MjSpec, position: Sequence[float], mass: float, inertia: Sequence[float] | np.ndarray
+    ) -> Any:
+        body = spec.worldbody.add_body(name=f"object/{self.name}", pos=position)
+        body.explicitinertial, body.mass, body.inertia = True, mass, inertia
+        return body
+
+    def _joint(self, body: Any, suffix: str, kind: Any, damping: float = 0.0, **shape: Any) -> None:
+        body.add_joint(name=f"object/{self.name}/{suffix}", type=kind, damping=(damping, 0, 0), **shape)
+
+    def _slides(self, body: Any, axes: str, damping: float = 0.0) -> None:
+        for axis in axes:
+            self._joint(body, axis, _JOINT.mjJNT_SLIDE, damping, axis=_AXES[axis])
+
+    def _solid(self, body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **shape: Any) -> None:
+        body.add_geom(
+            name=f"object/{self.name}", type=kind, condim=3, friction=(friction, 0.005, 0.0001), rgba=color,
+            group=group, mass=0.0, **shape,
+        )  # fmt: skip
+
+
+def _look(body: Any, kind: Any, color: Color, **shape: Any) -> None:
+    body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class Box(Object):
+    """A box to push. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
+
+    Attributes:
+        size: full extents, m.
+        mass: kg.
+        friction: sliding friction with the ground.
+    """
+
+    size: Vector = (1.0, 1.0, 1.0)
+    mass: float = 6.0
+    friction: float = 1.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the box."""
+        x, y, z = np.square(self.size)
+        body = self._body(spec, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
+        self._joint(body, "free", _JOINT.mjJNT_FREE)
+        half = np.array(self.size) / 2
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.80, 0.62, 0.38, 1.0), self.friction, size=half, **_FREE)
+        if visual:  # bands, so that one sees it turn
+            for side in (-1, 1):
+                _look(
+                    body, _GEOM.mjGEOM_BOX, (0.55, 0.40, 0.22, 1.0), pos=(0, 0, side * 0.35 * self.size[2]),
+                    size=(half[0] * 1.003, half[1] * 1.003, 0.04 * self.size[2]),
+                )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Ball(Object):
+    """A football that rolls and comes to rest. Coordinates and velocity as those of `Box`.
+
+    Attributes:
+        radius: m.
+        mass: kg.
+        drag: resistance to its motion, N s/m.
+        spin_drag: resistance to its rotation, N m s/rad.
+    """
+
+    radius: float = 0.1
+    mass: float = 0.318
+    drag: float = 0.1
+    spin_drag: float = 0.0003
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the ball, a thin shell; three slides and a ball joint, because a free joint has no drag of its own."""
+        body = self._body(spec, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
+        self._slides(body, "xyz", self.drag)
+        self._joint(body, "turn", _JOINT.mjJNT_BALL, self.spin_drag)
+        self._solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
+        if visual:  # dark patches, so that one sees it roll
+            for axis in _AXES.values():
+                for side in (-1, 1):
+                    _look(
+                        body, _GEOM.mjGEOM_SPHERE, (0.1, 0.1, 0.12, 1.0), size=(0.5 * self.radius, 0, 0),
+                        pos=np.array(axis) * side * 0.56 * self.radius,
+                    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Sheep(Object):
+    """An upright sheep that slides over the ground without turning. Coordinates: x, y; velocity likewise.
+
+    Its friction with the ground is part of `flock`, so that it costs no contacts.
+
+    Attributes:
+        radius: m.
+        height: m.
+        mass: kg.
+    """
+
+    radius: float = 0.2
+    height: float = 0.5
+    mass: float = 5.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the sheep: a capsule that is full at the ground and round at the top."""
+        body = self._body(spec, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
+        self._slides(body, "xy")
+        fleece = (0.96, 0.95, 0.90, 1.0)
+        self._solid(
+            body, _GEOM.mjGEOM_CAPSULE, fleece, group=3 if visual else 1, size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height - self.radius), **_HELD,
+        )  # fmt: skip
+        if visual:
+            dark = (0.16, 0.14, 0.13, 1.0)
+            top, wide = self.height, self.radius
+            _look(body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=(wide, 0.75 * wide, 0.32 * top), pos=(0, 0, 0.62 * top))
+            _look(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
+            _look(
+                body, _GEOM.mjGEOM_ELLIPSOID, dark, size=(0.45 * wide, 0.3 * wide, 0.3 * wide),
+                pos=(1.15 * wide, 0, 0.82 * top),
+            )  # fmt: skip
+            for x in (-0.5, 0.5):
+                for y in (-0.35, 0.35):
+                    _look(
+                        body, _GEOM.mjGEOM_CAPSULE, dark, size=(0.12 * wide, 0, 0),
+                        fromto=(x * wide, y * wide, 0.02, x * wide, y * wide, 0.4 * top),
+                    )  # fmt: skip
+
+
+def flock(
+    key: jax.Array,
+    position: jax.Array,
+    velocity: jax.Array,
+    dogs: jax.Array,
+    *,
+    restlessness: float,
+    step: float,
+    friction: float = 1.0,
+    top_speed: float = 2.0,
+) -> jax.Array:
+    """Returns the velocities (S, 2), m/s, with which S sheep go through the next environment step.
+
+    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over dogs of 0.2 r / q^1.4, with c the herd's centre (left
+    out for one sheep), r = p - p_dog and q = |r squared element by element|, dropped beyond q = 9; then each
+    component is kept within the top speed. Half of what the ground's friction takes off in a step is taken
+    before and half after that, so that the sheep moves on at the mean speed of the step.
+    Source: the paper's sheep, section III, with the figures of the released system.
+
+    Args:
+        key: random key.
+        position: of the sheep (S, 2), m.
+        velocity: of the sheep (S, 2), m/s.
+        dogs: positions of the robots (A, 2), m.
+        restlessness: s.
+        step: environment step, s.
+        friction: sliding friction with the ground.
+        top_speed: of each component, m/s.
+    """
+    half = friction * GRAVITY * step / 2
+    velocity = slowed(velocity, half)
+    velocity += 2 * restlessness * jax.random.normal(key, position.shape)
+    if len(position) > 1:
+        inward = jnp.mean(position, axis=0) - position
+        velocity += restlessness / 1.5 * inward / jnp.maximum(_length(inward), 1e-6)
+    away = position[:, None] - dogs[None]
+    nearness = jnp.maximum(_length(jnp.square(away)), 1e-3)
+    velocity += jnp.sum(jnp.where(nearness > 9.0, 0.0, 0.2 * away / nearness**1.4), axis=1)
+    return slowed(jnp.clip(velocity, -top_speed, top_speed), half)
+
+
+def slowed(velocity: jax.Array, loss: float) -> jax.Array:
+    """Returns velocities (..., 2) made slower by `loss` m/s, at most to a stop."""
+    speed = jnp.maximum(_length(velocity), 1e-9)
+    return velocity * jnp.maximum(1.0 - loss / speed, 0.0)
+
+
+def _length(vector: jax.Array) -> jax.Array:
+    return jnp.linalg.norm(vector, axis=-1, keepdims=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectIndex:
+    """Where one object of a compiled model is; host integers.
+
+    Attributes:
+        qpos: its coordinates in qpos (C,).
+        qvel: its velocities in qvel (V,).
+        body: body id.
+        geom: id of its collision shape.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    body: int
+    geom: int
+
+
+def index_objects(model: mujoco.MjModel, objects: Sequence[Object]) -> Mapping[str, ObjectIndex]:
+    """Looks up by name, once, where every object of a compiled model is."""
+    found = {}
+    for item in objects:
+        body = model.body(f"object/{item.name}")
+        joints = range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]) if body.jntnum[0] else ()
+        widths = {_JOINT.mjJNT_FREE: (7, 6), _JOINT.mjJNT_BALL: (4, 3)}
+        qpos, qvel = [], []
+        for joint in joints:
+            coordinates, speeds = widths.get(_JOINT(model.jnt_type[joint]), (1, 1))
+            qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
+            qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
+        as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
+        found[item.name] = ObjectIndex(
+            as_int(qpos), as_int(qvel), int(body.id), int(model.geom(f"object/{item.name}").id)
+        )
+    return found

@@ -1,0 +1,207 @@
+"""Objects and NPCs: how boxes, balls and sheep move, and the tasks that are built of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mqe_jax import npc
+from mqe_jax.envs import QuadrupedEnv, State, VectorEnv, make
+from mqe_jax.envs.reward import weigh
+from mqe_jax.npc import Ball, Box, Sheep, flock
+from mqe_jax.planners import PLANNERS
+from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.terrain import Init, Plane, Track
+
+STEP = 0.02
+
+
+@pytest.fixture(scope="module")
+def box_env() -> QuadrupedEnv:
+    return make("go1pushbox", impl="c", control="position")
+
+
+@pytest.fixture(scope="module")
+def herd() -> QuadrupedEnv:
+    return make("go1sheep-hard", impl="c", control="position")
+
+
+def with_object(env: QuadrupedEnv, state: State, name: str, values: Any) -> State:
+    """The state with one object somewhere else."""
+    qpos = state.data.qpos.at[env.objects[name].qpos].set(jnp.asarray(values))
+    return dataclasses.replace(state, data=state.data.replace(qpos=qpos))
+
+
+def plain(*objects: npc.Object) -> Any:
+    return compile_scene(Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
+
+
+def test_a_ball_that_was_kicked_rolls_and_comes_to_rest() -> None:
+    scene = plain(Ball("ball"))
+    index, data = scene.objects["ball"], mujoco.MjData(scene.model)
+    data.qpos[index.qpos[:3]] = [2.0, 3.0, 0.1]
+    data.qvel[index.qvel[:3]] = [3.0, 0.0, 0.0]
+    mujoco.mj_step(scene.model, data, 100)
+    speed, spin = data.qvel[index.qvel[0]], data.qvel[index.qvel[4]]
+    assert 1.0 < speed < 2.0 and spin == pytest.approx(speed / 0.1, rel=0.05)  # rolls without slipping
+    mujoco.mj_step(scene.model, data, 5000)
+    assert np.abs(data.qvel[index.qvel[:2]]).max() < 0.02
+    x, y, z = data.qpos[index.qpos[:3]]
+    assert 2.0 < x - 2.0 < 9.0 and abs(y - 3.0) < 0.01 and z == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_box_slides_under_more_than_its_friction_only() -> None:
+    scene = plain(Box("box", friction=0.5))
+    index = scene.objects["box"]
+    weight = 6.0 * npc.GRAVITY
+    moved = []
+    for force in (0.3 * weight, 0.8 * weight):
+        data = mujoco.MjData(scene.model)
+        data.qpos[index.qpos] = [2.0, 3.0, 0.5, 1, 0, 0, 0]
+        data.xfrc_applied[index.body, 0] = force
+        mujoco.mj_step(scene.model, data, 200)
+        moved.append(data.qpos[index.qpos[0]] - 2.0)
+    # The floor's friction 1.0 is the larger of the two, so neither 0.3 nor 0.8 of the weight moves it...
+    assert abs(moved[0]) < 0.02 and abs(moved[1]) < 0.05
+    data = mujoco.MjData(scene.model)
+    data.qpos[index.qpos] = [2.0, 3.0, 0.5, 1, 0, 0, 0]
+    data.xfrc_applied[index.body, 0] = 1.5 * weight
+    mujoco.mj_step(scene.model, data, 200)
+    assert data.qpos[index.qpos[0]] - 2.0 > 1.0  # ... and 1.5 of it does: 0.5 g for a second is 2.4 m
+
+
+def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0) -> np.ndarray:
+    """Positions (T, S, 2) of sheep that nothing stops."""
+
+    def move(carry: Any, key: Any) -> Any:
+        position, velocity = carry
+        velocity = flock(key, position, velocity, jnp.asarray(dogs), restlessness=restlessness, step=STEP)
+        return (position + STEP * velocity, velocity), position
+
+    start = jnp.asarray(position, jnp.float32)
+    keys = jax.random.split(jax.random.PRNGKey(0), steps)
+    return np.asarray(jax.lax.scan(move, (start, jnp.zeros_like(start)), keys)[1])
+
+
+def test_one_sheep_flees_from_a_dog_at_08_m_and_not_at_2_m() -> None:
+    near = run_flock([[3.0, 0.0]], [[2.2, 0.0]], 25)
+    assert near[-1, 0, 0] > 3.05 and abs(near[-1, 0, 1]) < 1e-6
+    far = run_flock([[3.0, 0.0]], [[1.0, 0.0]], 200)
+    np.testing.assert_array_equal(far[-1], far[0])
+
+
+def test_the_law_of_the_flock_by_hand() -> None:
+    """One sheep at rest 0.5 m from a dog: q = 0.25, 0.2 * 0.5 / 0.25^1.4 = 0.6964 m/s, less 0.0981 m/s of friction."""
+    velocity = flock(
+        jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)), jnp.array([[0.5, 0.0]]),
+        restlessness=0.0, step=STEP,
+    )  # fmt: skip
+    np.testing.assert_allclose(velocity, [[0.2 * 0.5 / 0.25**1.4 - 0.0981, 0.0]], atol=1e-4)
+    fast = flock(
+        jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)), jnp.array([[0.9, 0.0]]),
+        restlessness=0.0, step=STEP,
+    )  # fmt: skip
+    np.testing.assert_allclose(fast, [[2.0 - 0.0981, 0.0]], atol=1e-4)  # the top speed
+
+
+def test_a_herd_wanders_and_stays_together() -> None:
+    start = np.stack(np.meshgrid([3.5, 5.0, 6.5], [-1.5, 0.0, 1.5]), -1).reshape(-1, 2)
+    track = run_flock(start, [[-20.0, 0.0]], 750, restlessness=0.1)
+    spread = np.linalg.norm(track - track.mean(1, keepdims=True), axis=-1).max(1)
+    assert np.abs(track[-1] - track[0]).max(1).min() > 0.01
+    assert spread[-1] < spread[0] + 0.3
+
+
+def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
+    env = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
+    state = env.reset(jax.random.PRNGKey(0))
+    state = with_object(env, state, "sheep0", [2.0, 1.0])
+    index = env.robot.base_qpos
+    qpos = state.data.qpos.at[index[0, :2]].set(jnp.array([1.2, 1.0])).at[index[1, :2]].set(jnp.array([0.5, -1.5]))
+    state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
+    step = jax.jit(env.step)
+    after = step(state, jnp.zeros((2, 12)))
+    speed = 0.2 * 0.8 / 0.64**1.4 - 0.0981
+    assert float(env.sheep(after.data)[0, 0]) == pytest.approx(2.0 + STEP * speed, abs=1e-3)
+    cornered = with_object(env, state, "sheep0", [2.0, 1.75])
+    cornered = dataclasses.replace(
+        cornered, data=cornered.data.replace(qpos=cornered.data.qpos.at[index[0, :2]].set(jnp.array([2.0, 1.2])))
+    )
+    for _ in range(50):
+        cornered = step(cornered, jnp.zeros((2, 12)))
+    assert float(env.sheep(cornered.data)[0, 1]) < 1.85  # the side wall is at 2.0, the sheep's radius 0.2
+
+
+def test_pushbox_rewards_and_success(box_env: QuadrupedEnv) -> None:
+    state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), gates=jnp.array([[4.5, 0.2]]))
+    state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.float32(4.47)))
+    robots, no = box_env.read(state.data), jnp.array(False)
+    before = with_object(box_env, state, "box", [4.49, 0.2, 0.5, 1, 0, 0, 0])
+    terms, task = box_env.rewards(before, robots, no)
+    reward, _ = weigh(terms, box_env.params.rewards, 2)
+    np.testing.assert_allclose(reward, [10 * 0.02] * 2, atol=1e-4)
+    assert float(task.x) == pytest.approx(4.49) and float(box_env.outcome(before, robots, no)["success"]) == 0
+    behind = with_object(box_env, state, "box", [4.52, 0.2, 0.5, 1, 0, 0, 0])
+    reward, _ = weigh(box_env.rewards(behind, robots, no)[0], box_env.params.rewards, 2)
+    np.testing.assert_allclose(reward, [10 * 0.05 + 1] * 2, atol=1e-4)
+    assert float(box_env.outcome(behind, robots, no)["success"]) == 1
+
+
+def test_pushbox_observation(box_env: QuadrupedEnv) -> None:
+    state = with_object(box_env, box_env.reset(jax.random.PRNGKey(0)), "box", [3.0, 0.4, 0.5, 0.8, 0, 0, 0.6])
+    robots = box_env.read(state.data)
+    obs = np.asarray(box_env.observation_layout.pack(box_env.observe(state, robots)))
+    info = np.asarray(robots.base_info)
+    for agent in range(2):
+        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.gates[0])]
+        np.testing.assert_allclose(obs[agent], [*expected, 3.0, 0.4, 0.8, 0, 0, 0.6], atol=1e-6)
+
+
+def test_sheep_rewards_easy_and_hard(herd: QuadrupedEnv) -> None:
+    easy = make("go1sheep-easy", impl="c", control="position")
+    state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), gates=jnp.array([[5.0, 0.3]]))
+    state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.array([4.98])))
+    state = with_object(easy, state, "sheep0", [5.01, 0.3])
+    robots, no = easy.read(state.data), jnp.array(False)
+    reward, _ = weigh(easy.rewards(state, robots, no)[0], easy.params.rewards, 2)
+    np.testing.assert_allclose(reward, [1 + 2 * 0.03] * 2, atol=1e-4)
+
+    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), gates=jnp.array([[8.5, 0.0]]))
+    for number in range(9):  # two are through; the others stand 3 m and 4 m away from the gate: hypot = 5
+        state = with_object(herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0])
+    reward, _ = weigh(herd.rewards(state, herd.read(state.data), no)[0], herd.params.rewards, 2)
+    np.testing.assert_allclose(reward, [2 + 7 * np.exp(-2.5)] * 2, atol=1e-4)
+    assert float(herd.outcome(state, herd.read(state.data), no)["success"]) == pytest.approx(2 / 9)
+
+
+def test_the_herd_starts_as_listed(herd: QuadrupedEnv) -> None:
+    states = jax.vmap(herd.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
+    sheep = np.asarray(jax.vmap(herd.sheep)(states.data))
+    rows = np.stack(np.meshgrid([3.5, 5.0, 6.5], [-1.5, 0.0, 1.5], indexing="ij"), -1).reshape(9, 2)
+    assert np.abs(sheep - rows).max() <= 0.3 and np.abs(sheep - rows).max() > 0.25
+    assert herd.observation_size == 34
+    assert np.all(np.abs(np.asarray(states.gates)[:, 0] - [8.5, 0.0]) <= [0.0, 1.0])
+
+
+@pytest.mark.parametrize(("task", "share"), [("go1pushbox", 0.5), ("go1sheep-easy", 0.7)])
+def test_the_planner_wins(task: str, share: float) -> None:
+    """Through the walk policy, over a few episodes; `mqe eval TASK --planner scripted` measures many."""
+    from mqe_jax.train.evaluate import evaluate
+
+    worlds = VectorEnv(make(task, impl="c", num_envs=16), 16)
+    plan = jax.vmap(PLANNERS[task])
+    result = evaluate(worlds, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
+    assert result.to_dict()["success_rate"] >= share
+
+
+def test_objects_are_indexed_by_name() -> None:
+    scene = plain(Box("box"), Sheep("dolly"))
+    assert scene.objects["box"].qpos.shape == (7,) and scene.objects["box"].qvel.shape == (6,)
+    assert scene.objects["dolly"].qpos.shape == (2,)
+    assert scene.model.body(scene.objects["dolly"].body).name == "object/dolly"
