@@ -28,7 +28,7 @@ def box_env() -> QuadrupedEnv:
 
 
 @pytest.fixture(scope="module")
-def herd() -> QuadrupedEnv:
+def herd() -> Any:
     return make("go1sheep-hard", impl="c", control="position")
 
 
@@ -119,7 +119,7 @@ def test_a_herd_wanders_and_stays_together() -> None:
 
 
 def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
-    env = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
+    env: Any = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
     state = env.reset(jax.random.PRNGKey(0))
     state = with_object(env, state, "sheep0", [2.0, 1.0])
     index = env.robot.base_qpos
@@ -138,7 +138,7 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     assert float(env.sheep(cornered.data)[0, 1]) < 1.85  # the side wall is at 2.0, the sheep's radius 0.2
 
 
-def test_pushbox_rewards_and_success(box_env: QuadrupedEnv) -> None:
+def test_pushbox_rewards_and_success(box_env: Any) -> None:
     state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), gates=jnp.array([[4.5, 0.2]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.float32(4.47)))
     robots, no = box_env.read(state.data), jnp.array(False)
@@ -153,7 +153,7 @@ def test_pushbox_rewards_and_success(box_env: QuadrupedEnv) -> None:
     assert float(box_env.outcome(behind, robots, no)["success"]) == 1
 
 
-def test_pushbox_observation(box_env: QuadrupedEnv) -> None:
+def test_pushbox_observation(box_env: Any) -> None:
     state = with_object(box_env, box_env.reset(jax.random.PRNGKey(0)), "box", [3.0, 0.4, 0.5, 0.8, 0, 0, 0.6])
     robots = box_env.read(state.data)
     obs = np.asarray(box_env.observation_layout.pack(box_env.observe(state, robots)))
@@ -163,8 +163,8 @@ def test_pushbox_observation(box_env: QuadrupedEnv) -> None:
         np.testing.assert_allclose(obs[agent], [*expected, 3.0, 0.4, 0.8, 0, 0, 0.6], atol=1e-6)
 
 
-def test_sheep_rewards_easy_and_hard(herd: QuadrupedEnv) -> None:
-    easy = make("go1sheep-easy", impl="c", control="position")
+def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
+    easy: Any = make("go1sheep-easy", impl="c", control="position")
     state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), gates=jnp.array([[5.0, 0.3]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.array([4.98])))
     state = with_object(easy, state, "sheep0", [5.01, 0.3])
@@ -180,7 +180,7 @@ def test_sheep_rewards_easy_and_hard(herd: QuadrupedEnv) -> None:
     assert float(herd.outcome(state, herd.read(state.data), no)["success"]) == pytest.approx(2 / 9)
 
 
-def test_the_herd_starts_as_listed(herd: QuadrupedEnv) -> None:
+def test_the_herd_starts_as_listed(herd: Any) -> None:
     states = jax.vmap(herd.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
     sheep = np.asarray(jax.vmap(herd.sheep)(states.data))
     rows = np.stack(np.meshgrid([3.5, 5.0, 6.5], [-1.5, 0.0, 1.5], indexing="ij"), -1).reshape(9, 2)
