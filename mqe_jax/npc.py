@@ -65,7 +65,7 @@ class Object:
     def _solid(self, body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **shape: Any) -> None:
         body.add_geom(
             name=f"object/{self.name}", type=kind, condim=3, friction=(friction, 0.005, 0.0001), rgba=color,
-            group=group, mass=0.0, **shape,
+            priority=1, group=group, mass=0.0, **shape,
         )  # fmt: skip
 
 
@@ -80,7 +80,7 @@ class Box(Object):
     Attributes:
         size: full extents, m.
         mass: kg.
-        friction: sliding friction with the ground.
+        friction: sliding friction with the ground, which takes precedence over the ground's own.
     """
 
     size: Vector = (1.0, 1.0, 1.0)

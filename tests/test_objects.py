@@ -61,19 +61,14 @@ def test_a_box_slides_under_more_than_its_friction_only() -> None:
     index = scene.objects["box"]
     weight = 6.0 * npc.GRAVITY
     moved = []
-    for force in (0.3 * weight, 0.8 * weight):
+    for share in (0.3, 0.8):
         data = mujoco.MjData(scene.model)
         data.qpos[index.qpos] = [2.0, 3.0, 0.5, 1, 0, 0, 0]
-        data.xfrc_applied[index.body, 0] = force
+        data.xfrc_applied[index.body, 0] = share * weight
         mujoco.mj_step(scene.model, data, 200)
         moved.append(data.qpos[index.qpos[0]] - 2.0)
-    # The floor's friction 1.0 is the larger of the two, so neither 0.3 nor 0.8 of the weight moves it...
-    assert abs(moved[0]) < 0.02 and abs(moved[1]) < 0.05
-    data = mujoco.MjData(scene.model)
-    data.qpos[index.qpos] = [2.0, 3.0, 0.5, 1, 0, 0, 0]
-    data.xfrc_applied[index.body, 0] = 1.5 * weight
-    mujoco.mj_step(scene.model, data, 200)
-    assert data.qpos[index.qpos[0]] - 2.0 > 1.0  # ... and 1.5 of it does: 0.5 g for a second is 2.4 m
+    assert abs(moved[0]) < 0.02
+    assert moved[1] == pytest.approx(0.3 * npc.GRAVITY / 2, rel=0.1)  # (0.8 - 0.5) g for a second
 
 
 def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0) -> np.ndarray:
