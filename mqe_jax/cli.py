@@ -163,6 +163,8 @@ class Eval:
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Who acts in place of a trained policy: scripted (written by hand for the task), random, idle (zero
     commands), forward (straight on at half speed). Default for a task: random."""
+    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Who plays team 1 of a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Folder of the run whose policy acts. Default: the run given."""
     set: Set = field(default_factory=list)
@@ -182,6 +184,8 @@ class Render:
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Who acts in place of a trained policy: scripted (written by hand for the task), random, idle (zero
     commands), forward (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Who plays team 1 of a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Folder of the run whose policy acts. Default: the run given."""
     best_of: int = 1

@@ -113,6 +113,18 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
+def against(act: Act, opponent: Act, env: Any) -> Act:
+    """Lets `act` play team 0 and `opponent`, which remembers nothing, team 1."""
+    second = jnp.asarray([agent in env.teams[1] for agent in range(env.num_agents)])[:, None]
+
+    def both(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        own_key, other_key = jax.random.split(key)
+        action, memory = act(obs, memory, own_key)
+        return jnp.where(second, opponent(obs, (), other_key)[0], action), memory
+
+    return both
+
+
 def planner(name: str, env: Any) -> Act:
     """What acts without training; `act` as in `evaluate`. ValueError where the task has no scripted planner."""
     shape = (env.num_agents, env.action_size)
@@ -145,9 +157,18 @@ class Actor:
     task: str
     overrides: dict[str, Any]
     policy: policy_api.Policy | str
+    opponent: str | None = None
 
     def act(self, env: Any, deterministic: bool) -> Act:
-        """The batched `act` of the policy; ValueError where it does not fit the task."""
+        """The batched `act` of the policy, against the opponent in a match; ValueError where it does not fit the task."""
+        act = self._own_act(env, deterministic)
+        if self.opponent is not None and len(env.teams) < 2:
+            raise ValueError(f"opponent: {self.task} is no match; leave --opponent out")
+        if len(env.teams) < 2 or self.opponent == "self":
+            return act
+        return against(act, planner(self.opponent or "idle", env), env)
+
+    def _own_act(self, env: Any, deterministic: bool) -> Act:
         if isinstance(self.policy, str):
             return planner(self.policy, env)
         policy = self.policy
@@ -174,9 +195,12 @@ def find_actor(arguments: cli.Eval | cli.Render, default: str) -> Actor:
     given = parse_overrides(arguments.set) | ({} if arguments.control is None else {"control": arguments.control})
     if arguments.planner is not None and arguments.policy is not None:
         raise ValueError("planner: give --planner or --policy, not both")
-    if arguments.planner is not None and arguments.planner not in PLANNER_NAMES:
-        near = nearest(arguments.planner, PLANNER_NAMES)
-        raise ValueError(f"planner: unknown {arguments.planner!r}{near}; allowed: {', '.join(PLANNER_NAMES)}")
+    for flag, name, allowed in (
+        ("planner", arguments.planner, PLANNER_NAMES),
+        ("opponent", arguments.opponent, (*PLANNER_NAMES, "self")),
+    ):
+        if name is not None and name not in allowed:
+            raise ValueError(f"{flag}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}")
     run = arguments.policy
     if is_run(target):
         _check_run(target)
@@ -188,10 +212,10 @@ def find_actor(arguments: cli.Eval | cli.Render, default: str) -> Actor:
     else:
         task, env_values = target, given
     if run is not None:
-        return Actor(task, env_values, policy_api.load_policy(run))
+        return Actor(task, env_values, policy_api.load_policy(run), arguments.opponent)
     if default == "scripted" and task not in PLANNERS:
         default = "forward"
-    return Actor(task, env_values, arguments.planner or default)
+    return Actor(task, env_values, arguments.planner or default, arguments.opponent)
 
 
 def _check_run(target: str) -> None:

@@ -134,6 +134,170 @@ class Ball(Object):
 
 
 @dataclasses.dataclass(frozen=True)
+class Cylinder(Object):
+    """An upright cylinder that slides along y only. Coordinate: y, m; velocity likewise.
+
+    Its shape for contacts is a capsule that is full up to its height; its friction with the ground is that of the
+    slide, so that it costs no contacts.
+
+    Attributes:
+        position: of its axis at y = 0 (x, y), m.
+        radius: m.
+        height: m.
+        mass: kg.
+        friction: sliding friction with the ground.
+        reach: how far it may slide either way, m.
+    """
+
+    position: tuple[float, float] = (0.0, 0.0)
+    radius: float = 1.2
+    height: float = 0.5
+    mass: float = 3.0
+    friction: float = 1.0
+    reach: float = 1.8
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the cylinder."""
+        body = self._body(spec, (*self.position, 0.0), self.mass, (1.0, 1.0, 1.0))
+        self._joint(
+            body, "y", _JOINT.mjJNT_SLIDE, axis=_AXES["y"], limited=True, range=(-self.reach, self.reach),
+            frictionloss=self.friction * self.mass * GRAVITY,
+        )  # fmt: skip
+        white = (0.95, 0.95, 0.95, 1.0)
+        self._solid(
+            body, _GEOM.mjGEOM_CAPSULE, white, group=3, size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height), **_HELD,
+        )  # fmt: skip
+        if visual:
+            half = self.height / 2
+            _look(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
+
+
+@dataclasses.dataclass(frozen=True)
+class Door(Object):
+    """A revolving door: a panel on a vertical hinge in its middle. Coordinate: angle, rad, 0 along y; velocity likewise.
+
+    Attributes:
+        position: of the hinge (x, y), m.
+        size: thickness, width and height, m.
+        mass: kg.
+        inertia: about the hinge, kg m^2.
+        damping: of the hinge, N m s/rad.
+    """
+
+    position: tuple[float, float] = (0.0, 0.0)
+    size: Vector = (0.08, 1.95, 0.8)
+    mass: float = 4.0
+    inertia: float = 1.232
+    damping: float = 0.5
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the door."""
+        body = self._body(spec, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
+        self._joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.93, 0.93, 0.93, 1.0), size=np.array(self.size) / 2, **_HELD)
+
+
+@dataclasses.dataclass(frozen=True)
+class Seesaw(Object):
+    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative where the near end is down.
+
+    Attributes:
+        hinge: position (x, y, z), m.
+        size: length, width and thickness of the plank, m.
+        behind: how far the plank's middle is before the hinge, towards the near end, m.
+        mass: kg; the centre of mass is in the hinge, so that the plank stays as it is.
+        inertia: about the hinge, kg m^2.
+        limit: greatest angle either way, rad; at the lower limit the near end lies on the ground.
+        damping: of the hinge, N m s/rad, which limits its speed.
+    """
+
+    hinge: Vector = (5.6, 0.0, 0.545)
+    size: Vector = (4.123, 1.0, 0.03)
+    behind: float = 0.103
+    mass: float = 100.0
+    inertia: float = 100.0
+    limit: float = 0.254
+    damping: float = 500.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the plank, and the posts that carry it to look at."""
+        body = self._body(spec, self.hinge, self.mass, (self.inertia,) * 3)
+        self._joint(
+            body, "pitch", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["y"], limited=True,
+            range=(-self.limit, self.limit),
+        )  # fmt: skip
+        half, white = np.array(self.size) / 2, (0.95, 0.95, 0.95, 1.0)
+        self._solid(body, _GEOM.mjGEOM_BOX, white, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
+        if visual:
+            x, y, z = self.hinge
+            grey = (0.55, 0.55, 0.58, 1.0)
+            _look(
+                spec.worldbody, _GEOM.mjGEOM_CYLINDER, grey, size=(0.05, 0, 0),
+                fromto=(x, y - half[1] - 0.08, z, x, y + half[1] + 0.08, z),
+            )  # fmt: skip
+            for side in (-1, 1):
+                post = y + side * (half[1] + 0.06)
+                _look(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Platform(Object):
+    """A fixed block to stand on. No coordinates.
+
+    Attributes:
+        center: of its top face (x, y, z), m.
+        size: full extents, m.
+        column: radius of the column that carries it to look at, m; none if 0.
+    """
+
+    center: Vector = (0.0, 0.0, 1.0)
+    size: Vector = (1.0, 1.0, 1.0)
+    column: float = 0.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the block."""
+        x, y, top = self.center
+        body = spec.worldbody.add_body(name=f"object/{self.name}", pos=(x, y, top - self.size[2] / 2))
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.95, 0.95, 0.95, 1.0), size=np.array(self.size) / 2, **_FLOOR)
+        if visual and self.column:
+            foot = top - self.size[2]
+            _look(
+                spec.worldbody, _GEOM.mjGEOM_CYLINDER, (0.75, 0.75, 0.78, 1.0), size=(self.column, foot / 2, 0),
+                pos=(x, y, foot / 2),
+            )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Ring(Object):
+    """A circle drawn on the ground: nothing that can be touched. No coordinates.
+
+    Attributes:
+        center: (x, y, z), m.
+        radius: m.
+        width: of the line, m.
+    """
+
+    center: Vector = (0.0, 0.0, 0.0)
+    radius: float = 1.7
+    width: float = 0.04
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the line, made of short pieces."""
+        body = spec.worldbody.add_body(name=f"object/{self.name}", pos=self.center)
+        if not visual:
+            return
+        pieces = 72
+        half = np.pi * self.radius / pieces * 1.05
+        for angle in np.arange(pieces) * 2 * np.pi / pieces:
+            _look(
+                body, _GEOM.mjGEOM_BOX, (0.2, 0.2, 0.22, 1.0), size=(self.width / 2, half, 0.004),
+                pos=(self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0),
+                quat=(np.cos(angle / 2), 0, 0, np.sin(angle / 2)),
+            )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
 class Sheep(Object):
     """An upright sheep that slides over the ground without turning. Coordinates: x, y; velocity likewise.
 
@@ -234,7 +398,7 @@ class ObjectIndex:
         qpos: its coordinates in qpos (C,).
         qvel: its velocities in qvel (V,).
         body: body id.
-        geom: id of its collision shape.
+        geom: id of its collision shape, -1 if it has none.
     """
 
     qpos: np.ndarray
@@ -256,7 +420,6 @@ def index_objects(model: mujoco.MjModel, objects: Sequence[Object]) -> Mapping[s
             qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
             qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
         as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
-        found[item.name] = ObjectIndex(
-            as_int(qpos), as_int(qvel), int(body.id), int(model.geom(f"object/{item.name}").id)
-        )
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"object/{item.name}")
+        found[item.name] = ObjectIndex(as_int(qpos), as_int(qvel), int(body.id), geom)
     return found

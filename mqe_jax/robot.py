@@ -162,17 +162,20 @@ def build_robot(
     visual: bool = True,
     friction: float = 1.0,
     torque_control: bool = False,
+    color: int | None = None,
 ) -> mujoco.MjSpec:
     """Builds one Go1 with a free base as an `MjSpec`, to be attached to a scene under a prefix.
 
     Args:
-        robot: which agent it is (its colour and collision bits).
+        robot: which robot of the scene it is (its collision bits).
         num_robots: how many robots share the scene.
         contacts: which parts touch what.
         visual: whether to add the geoms that are only looked at.
         friction: sliding friction of its shapes, which takes precedence over the other shape's.
         torque_control: actuators take torques (N m) instead of PD joint targets (rad).
+        color: index of its colour in `COLORS`; `robot` if None.
     """
+    paint = COLORS[(robot if color is None else color) % len(COLORS)]
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, STAND_HEIGHT))
@@ -233,9 +236,9 @@ def build_robot(
             pos=(0, 0, -CALF_LENGTH),
         )
         if visual:
-            _add_leg_look(hip, thigh, calf, front, left, COLORS[robot % len(COLORS)])
+            _add_leg_look(hip, thigh, calf, front, left, paint)
     if visual:
-        _add_trunk_look(trunk, COLORS[robot % len(COLORS)])
+        _add_trunk_look(trunk, paint)
     for index, name in enumerate(JOINT_NAMES):
         gain, bias = (1.0, (0.0, 0.0, 0.0)) if torque_control else (KP, (0.0, -KP, -KD))
         actuator = spec.add_actuator(

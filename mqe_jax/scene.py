@@ -25,6 +25,7 @@ class Scene:
         num_robots: A.
         contacts: which parts of the robots touch what.
         objects: everything else that is in it, added after the robots.
+        colors: of the robots, as indices of `mqe_jax.robot.COLORS`; one after the other if empty.
         friction: sliding friction of the robots' shapes and the ground.
         torque_control: the actuators take torques (N m) instead of PD joint targets (rad).
         foot_sensors: whether the feet's contact forces are measured too.
@@ -37,6 +38,7 @@ class Scene:
     num_robots: int = 2
     contacts: Contacts = dataclasses.field(default_factory=Contacts)
     objects: tuple[Object, ...] = ()
+    colors: tuple[int, ...] = ()
     friction: float = 1.0
     torque_control: bool = False
     foot_sensors: bool = False
@@ -47,6 +49,8 @@ class Scene:
     def __post_init__(self) -> None:
         if not 1 <= self.num_robots <= robots.MAX_ROBOTS:
             raise ValueError(f"Scene.num_robots: {self.num_robots} is not between 1 and {robots.MAX_ROBOTS}")
+        if self.colors and len(self.colors) != self.num_robots:
+            raise ValueError(f"Scene.colors: {self.colors} has not one of each of the {self.num_robots} robots")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +106,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
     for robot in range(scene.num_robots):
         body = robots.build_robot(
             robot, scene.num_robots, scene.contacts, visual=visual, friction=scene.friction,
-            torque_control=scene.torque_control,
+            torque_control=scene.torque_control, color=scene.colors[robot] if scene.colors else robot,
         )  # fmt: skip
         spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
     for item in scene.objects:

@@ -12,10 +12,11 @@ from mqe_jax.envs.overrides import override
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.pushbox import Go1PushBox
 from mqe_jax.envs.sheep import Go1SheepEasy, Go1SheepHard
+from mqe_jax.envs.tug import Go1Tug
 from mqe_jax.terrain import nearest
 
 TASKS: dict[str, type[QuadrupedEnv]] = {
-    task.name: task for task in (Go1Plane, Go1Gate, Go1SheepEasy, Go1SheepHard, Go1PushBox)
+    task.name: task for task in (Go1Plane, Go1Gate, Go1SheepEasy, Go1SheepHard, Go1PushBox, Go1Tug)
 }
 
 

@@ -262,6 +262,10 @@ class QuadrupedEnv:
         """Returns walk commands (R - A, 15) of the robots that are no agents."""
         return None
 
+    def to_world(self, action: jax.Array) -> jax.Array:
+        """Turns actions (A, action_size), each in its agent's own frame, into those that the robots carry out."""
+        return action
+
     def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
         """Moves what has a will of its own: returns the world with its velocities for the next step."""
         return data
@@ -392,7 +396,7 @@ class QuadrupedEnv:
         action = self._checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
-        action = jnp.where((state.step < state.hold)[:, None], 0.0, action)
+        action = self.to_world(jnp.where((state.step < state.hold)[:, None], 0.0, action))
         key, push_key, noise_key, drive_key = jax.random.split(state.key, 4)
 
         before = self.read(state.data)
@@ -417,8 +421,7 @@ class QuadrupedEnv:
         terms, task = self.rewards(state, readings, collision)
         reward, logged = weigh(terms, self.params.rewards, self.num_agents)
         state = dataclasses.replace(state, task=task)
-        fallen = self.fallen(readings)
-        failed = fallen | diverged | (collision & self.params.end_on_collision)
+        failed = jnp.any(self.fallen(readings)) | diverged | (collision & self.params.end_on_collision)
         terminated = failed | self.ending(state, readings)
         metrics = {**logged, **self.outcome(state, readings, failed), "collision": collision}
         clean = lambda x: jnp.where(diverged, 0.0, jnp.asarray(x, jnp.float32))  # noqa: E731
@@ -439,15 +442,12 @@ class QuadrupedEnv:
         return data.qpos[self.objects[name].qpos]
 
     def fallen(self, readings: RobotReadings) -> jax.Array:
-        """Returns whether any robot lies on its side or back, or is too low or too high () bool."""
+        """Returns which robots lie on their side or back, or are too low or too high (R,) bool."""
         params = self.params
-        roll, pitch, height = (
-            jnp.abs(readings.euler[:, 0]),
-            jnp.abs(readings.euler[:, 1]),
-            readings.position_w[:, 2],
-        )
+        roll, pitch = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1])
+        height = readings.position_w[:, 2]
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
-        return jnp.any(out | (height < params.min_height) | (height > params.max_height))
+        return out | (height < params.min_height) | (height > params.max_height)
 
     def external_forces(self, state: State) -> jax.Array | None:
         """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""

@@ -9,6 +9,7 @@ import jax
 from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
 from mqe_jax.planners.sheep import plan_sheep_easy, plan_sheep_hard
+from mqe_jax.planners.tug import plan_tug
 
 # Task id -> function from one world's observations (A, O) to its actions (A, action_size).
 PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -16,4 +17,5 @@ PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1sheep-easy": plan_sheep_easy,
     "go1sheep-hard": plan_sheep_hard,
     "go1pushbox": plan_pushbox,
+    "go1tug": plan_tug,
 }

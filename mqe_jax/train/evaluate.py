@@ -28,11 +28,12 @@ class EvalResult:
     mean_length: float  # steps per episode
     diverged: int  # episodes ended by the guard against divergence
     success: dict[str, float]  # other ends by name, mean over episodes, from metrics `success/<name>`
+    match: dict[str, float]  # win_rate, draw_rate, loss_rate of the first team; empty where there is no opponent
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; further successes become `success/<name>`."""
-        values = {k: v for k, v in vars(self).items() if k != "success"}
-        return {**values, **{f"success/{name}": value for name, value in self.success.items()}}
+        """Returns plain values for JSON; further successes become `success/<name>`, a match's rates their own."""
+        values = {k: v for k, v in vars(self).items() if k not in ("success", "match")}
+        return {**values, **self.match, **{f"success/{name}": value for name, value in self.success.items()}}
 
 
 class _Progress(NamedTuple):
@@ -134,4 +135,5 @@ def _result(task: str, episodes: int, progress: _Progress) -> EvalResult:
         mean_length=steps / episodes,
         diverged=round(per_episode.get("diverged", 0.0) * episodes),
         success={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
+        match={f"{n}_rate": per_episode[f"team0/{n}"] for n in ("win", "draw", "loss") if f"team0/{n}" in per_episode},
     )

@@ -1,0 +1,103 @@
+"""Matches: two teams of the same size against each other, with zero-sum rewards and mirrored observations.
+
+A match looks the same from both sides after a half turn about its centre ("turn") or after a reflection across the
+track ("reflect"). Every agent observes the world so that its own side is the first: one policy plays both.
+
+Team 0 has the first half of the agents, team 1 the second half.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.robot import NUM_JOINTS, RobotReadings
+
+# How a command changes where left and right are swapped.
+_MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}
+# Joints of the other side's legs (FL <-> FR, RL <-> RR), and how they turn there: the hips the other way.
+_OTHER_SIDE = np.arange(NUM_JOINTS).reshape(4, 3)[[1, 0, 3, 2]].ravel()
+_OTHER_SIGN = np.tile([-1.0, 1.0, 1.0], 4).astype(np.float32)
+
+
+class Match(QuadrupedEnv):
+    """Base of the competitive tasks.
+
+    Reward: every side has terms of its own, and gets them less the opponent's: what one gains the other loses.
+    Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended now; they count when it
+    ends. `success` is a win of team 0.
+    """
+
+    symmetry: ClassVar[str] = "turn"
+    center: ClassVar[tuple[float, float]] = (0.0, 0.0)
+
+    @property
+    def teams(self) -> tuple[tuple[int, ...], ...]:
+        """Agents of each team."""
+        half = self.num_agents // 2
+        return tuple(range(half)), tuple(range(half, self.num_agents))
+
+    @property
+    def team_of(self) -> np.ndarray:
+        """Team of each agent (A,)."""
+        return np.repeat([0, 1], self.num_agents // 2)
+
+    # -- what a match says ----------------------------------------------------------------------------------------
+
+    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+        """Returns which team wins if the episode ends now (2,) bool; a draw if both or none do."""
+        raise TypeError(f"{type(self).__name__}: wins() is not defined")
+
+    # -- both sides' views ----------------------------------------------------------------------------------------
+
+    def views(self, info: jax.Array) -> jax.Array:
+        """Shows base information (R, 6), position and roll, pitch, yaw, to both teams: (2, R, 6)."""
+        position, (roll, pitch, yaw) = self.view_points(info[:, :3])[1], jnp.moveaxis(info[:, 3:], -1, 0)
+        if self.symmetry == "turn":
+            euler = jnp.stack([roll, pitch, jnp.arctan2(-jnp.sin(yaw), -jnp.cos(yaw))], axis=-1)
+        else:
+            euler = jnp.stack([-roll, pitch, -yaw], axis=-1)
+        return jnp.stack([info, jnp.concatenate([position, euler], axis=-1)])
+
+    def view_points(self, points: jax.Array) -> jax.Array:
+        """Shows points (..., 3), m, to both teams: (2, ..., 3)."""
+        middle = jnp.array([*self.center, 0.0])
+        return self.view_vectors(points - middle) + middle
+
+    def view_vectors(self, vectors: jax.Array) -> jax.Array:
+        """Shows vectors (..., 3), such as velocities, to both teams: (2, ..., 3)."""
+        other = jnp.array([-1.0, -1.0, 1.0] if self.symmetry == "turn" else [1.0, -1.0, 1.0])
+        return jnp.stack([vectors, vectors * other])
+
+    def to_world(self, action: jax.Array) -> jax.Array:
+        """Mirrors the actions (A, action_size) of team 1 where it sees left and right swapped."""
+        if self.symmetry == "turn":
+            return action
+        if self.control == "command":
+            names = self.params.commands
+            mirrored = action * np.array([_MIRRORED_COMMANDS.get(name, 1.0) for name in names], np.float32)
+        else:
+            mirrored = action[:, _OTHER_SIDE] * _OTHER_SIGN
+        return jnp.where(self.team_of[:, None] == 1, mirrored, action)
+
+    # -- rewards and result ---------------------------------------------------------------------------------------
+
+    def versus(self, own: jax.Array) -> jax.Array:
+        """Turns both teams' own terms (2,) into zero-sum ones of every agent (A,)."""
+        own = jnp.asarray(own, jnp.float32)
+        return (own - own[::-1])[self.team_of]
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Win, draw and loss of each team; `success` is a win of team 0."""
+        wins = self.wins(state, readings)
+        decided = wins & ~wins[::-1]
+        result = {}
+        for team in (0, 1):
+            result[f"team{team}/win"] = decided[team]
+            result[f"team{team}/draw"] = ~jnp.any(decided)
+            result[f"team{team}/loss"] = decided[1 - team]
+        return {"success": decided[0], **result}
