@@ -160,7 +160,7 @@ class Actor:
     opponent: str | None = None
 
     def act(self, env: Any, deterministic: bool) -> Act:
-        """The batched `act` of the policy, against the opponent in a match; ValueError where it does not fit the task."""
+        """The batched `act`, against the opponent in a match; ValueError where it does not fit the task."""
         act = self._own_act(env, deterministic)
         if self.opponent is not None and len(env.teams) < 2:
             raise ValueError(f"opponent: {self.task} is no match; leave --opponent out")

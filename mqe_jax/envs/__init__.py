@@ -7,17 +7,34 @@ from typing import Any
 
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.envs.base import QuadrupedEnv, Randomization, State, TaskParams
+from mqe_jax.envs.bridge import Go1Bridge
+from mqe_jax.envs.door import Go1RevolvingDoor
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.overrides import override
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.pushbox import Go1PushBox
 from mqe_jax.envs.sheep import Go1SheepEasy, Go1SheepHard
 from mqe_jax.envs.tug import Go1Tug
+from mqe_jax.envs.wrestling import Go1Wrestling
 from mqe_jax.terrain import nearest
 
 TASKS: dict[str, type[QuadrupedEnv]] = {
-    task.name: task for task in (Go1Plane, Go1Gate, Go1SheepEasy, Go1SheepHard, Go1PushBox, Go1Tug)
+    task.name: task
+    for task in (
+        Go1Plane,
+        Go1Gate,
+        Go1SheepEasy,
+        Go1SheepHard,
+        Go1PushBox,
+        Go1Tug,
+        Go1RevolvingDoor,
+        Go1Wrestling,
+        Go1Bridge,
+    )
 }
+
+# Other names of tasks, from the released system.
+ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
 
 def tasks() -> tuple[str, ...]:
@@ -41,6 +58,7 @@ def make(
     Raises:
         ValueError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
     """
+    task = ALIASES.get(task, task)
     if task not in TASKS:
         raise ValueError(f"task: unknown id {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
     cls = TASKS[task]

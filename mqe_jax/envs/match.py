@@ -73,6 +73,11 @@ class Match(QuadrupedEnv):
         other = jnp.array([-1.0, -1.0, 1.0] if self.symmetry == "turn" else [1.0, -1.0, 1.0])
         return jnp.stack([vectors, vectors * other])
 
+    def duel(self, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the blocks `base` and `opponent` (2, 6) of one robot against one, each in its own frame."""
+        views = self.views(readings.base_info)
+        return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}
+
     def to_world(self, action: jax.Array) -> jax.Array:
         """Mirrors the actions (A, action_size) of team 1 where it sees left and right swapped."""
         if self.symmetry == "turn":

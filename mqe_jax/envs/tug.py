@@ -139,11 +139,10 @@ class Go1Tug(Match):
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width), each in its agent's frame."""
-        views = self.views(readings.base_info)
         speed = state.data.qvel[self.objects["cylinder"].qvel[0]]
         side = jnp.array([1.0, -1.0])
         return {
-            "base": jnp.stack([views[0, 0], views[1, 1]]),
+            "base": self.duel(readings)["base"],
             "cylinder": jnp.stack([side * self.cylinder_y(state.data), side * speed], axis=-1),
             "distance": self.distance(readings, self.cylinder_y(state.data))[:, None],
             "last_cylinder": (side * state.task.previous_y)[:, None],

@@ -6,10 +6,13 @@ from collections.abc import Callable
 
 import jax
 
+from mqe_jax.planners.bridge import plan_bridge
+from mqe_jax.planners.door import plan_revolving_door
 from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
 from mqe_jax.planners.sheep import plan_sheep_easy, plan_sheep_hard
 from mqe_jax.planners.tug import plan_tug
+from mqe_jax.planners.wrestling import plan_wrestling
 
 # Task id -> function from one world's observations (A, O) to its actions (A, action_size).
 PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -18,4 +21,7 @@ PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1sheep-hard": plan_sheep_hard,
     "go1pushbox": plan_pushbox,
     "go1tug": plan_tug,
+    "go1revolvingdoor": plan_revolving_door,
+    "go1wrestling": plan_wrestling,
+    "go1bridge": plan_bridge,
 }

@@ -1,0 +1,136 @@
+"""go1bridge, the paper's Traverse Bridge: two robots meet on a bridge for one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.match import Match
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.npc import Platform
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Init, Plane, Track
+
+
+@dataclasses.dataclass(frozen=True)
+class BridgeRewards:
+    """Weights of the reward terms; every side's own less the opponent's.
+
+    Attributes:
+        win: when the opponent is off the bridge or has fallen.
+        far_side: while the robot is on the opponent's platform.
+    """
+
+    win: float = 10.0
+    far_side: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class BridgeParams(TaskParams):
+    """Parameters of Traverse Bridge.
+
+    Attributes:
+        platform: extents of both platforms along x and y, m.
+        platform_x: of their middles, m.
+        top: height of platforms and bridge, m.
+        bridge_width: m.
+        bridge_thickness: m.
+        spawn_x: of the robots, m.
+        off_height: a trunk below is off the bridge, m.
+        rewards: weights.
+    """
+
+    episode_length: float = 20.0
+    spawn_height: float = 1.4
+    platform: tuple[float, float] = (2.5, 1.3)
+    platform_x: tuple[float, float] = (2.35, 7.65)
+    top: float = 1.02
+    bridge_width: float = 0.7
+    bridge_thickness: float = 0.3
+    spawn_x: tuple[float, float] = (2.0, 7.5)
+    off_height: float = 0.5
+    rewards: BridgeRewards = BridgeRewards()
+
+
+class Go1Bridge(Match):
+    """Traverse Bridge.
+
+    - Scene: two platforms, 1 m high, and between them a bridge 0.7 m wide; the robots start on one each.
+    - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
+    - Reward: see `BridgeRewards`; zero-sum.
+    - End: one is off the bridge or has fallen, or 20 s. Win: the opponent is, or at the time limit one is on the
+      opponent's platform and the opponent is not on one's own.
+
+    Source: paper, section III.
+    """
+
+    name = "go1bridge"
+    title = "Traverse Bridge"
+    center = (5.0, 0.0)
+    Params: ClassVar[type[TaskParams]] = BridgeParams
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        first, second = params.platform_x
+        length, width = params.platform
+        blocks = [
+            Platform(f"platform{side}", center=(x, 0.0, params.top), size=(length, width, params.top))
+            for side, x in enumerate(params.platform_x)
+        ]
+        middle = ((first + second) / 2, 0.0, params.top)
+        span = second - first - length
+        deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
+        track = Track(blocks=(Init(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
+        contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
+        return Scene(track, num_robots=2, contacts=contacts, objects=(*blocks, deck), colors=(0, 2))
+
+    def spawn(self, key: jax.Array) -> jax.Array:
+        """Draws poses x, y, z, yaw (2, 4), m and rad: one on each platform, facing the bridge."""
+        params = self.params
+        noise = jax.random.uniform(key, (2, 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        place = jnp.array([[params.spawn_x[0], 0.0], [params.spawn_x[1], 0.0]]) + noise
+        rest = jnp.array([[params.spawn_height, 0.0], [params.spawn_height, jnp.pi]])
+        return jnp.concatenate([place, rest], axis=-1)
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
+        return self.duel(readings)
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        out = self.out(readings)
+        terms = {"win": self.versus(out[::-1] & ~out), "far_side": self.versus(self.across(readings))}
+        return terms, None
+
+    def out(self, readings: RobotReadings) -> jax.Array:
+        """Which robots are off the bridge or have fallen (2,) bool."""
+        return self.fallen(readings) | (readings.position_w[:, 2] < self.params.off_height)
+
+    def across(self, readings: RobotReadings) -> jax.Array:
+        """Which robots are on the opponent's platform (2,) bool."""
+        params = self.params
+        x, height = readings.position_w[:, 0], readings.position_w[:, 2]
+        first, second = params.platform_x
+        half = params.platform[0] / 2
+        reached = jnp.stack([x[0] > second - half, x[1] < first + half])
+        return reached & (height > params.top)
+
+    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+        """The opponent is out and oneself is not; if neither is, who alone has come across."""
+        out, across = self.out(readings), self.across(readings)
+        return jnp.where(jnp.any(out), out[::-1] & ~out, across & ~across[::-1])
+
+    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+        """One is off the bridge or has fallen."""
+        return jnp.any(self.out(readings))

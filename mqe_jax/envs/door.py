@@ -1,0 +1,142 @@
+"""go1revolvingdoor, the paper's Revolving Door: two robots race through a door that lets one pass at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.match import Match
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.npc import Door
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Closing, Init, Plane, Rotation, Track
+
+
+@dataclasses.dataclass(frozen=True)
+class DoorRewards:
+    """Weights of the reward terms; every side's own less the opponent's.
+
+    Attributes:
+        win: for being the first past the line.
+        approach: per m by which the robot came closer to the line's middle.
+    """
+
+    win: float = 10.0
+    approach: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class DoorParams(TaskParams):
+    """Parameters of Revolving Door.
+
+    Attributes:
+        track_width: m.
+        gap: width of the gap that the door stands in, m.
+        door_x: of the hinge, m.
+        door_size: thickness, width and height of the door, m.
+        door_mass: kg.
+        door_damping: of the hinge, N m s/rad.
+        spawn_x: of the robots, m.
+        spawn_y: distance of the robots from the middle line, m.
+        line_x: who is first past it wins, m.
+        rewards: weights.
+    """
+
+    episode_length: float = 5.0
+    track_width: float = 3.5
+    gap: float = 2.0
+    door_x: float = 2.6
+    door_size: tuple[float, float, float] = (0.08, 1.95, 0.8)
+    door_mass: float = 4.0
+    door_damping: float = 0.5
+    spawn_x: float = 0.5
+    spawn_y: float = 1.0
+    line_x: float = 3.85
+    rewards: DoorRewards = DoorRewards()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DoorState:
+    """`distance`: of each robot to the middle of the line after the last step (2,), m."""
+
+    distance: jax.Array
+
+
+class Go1RevolvingDoor(Match):
+    """Revolving Door.
+
+    - Scene: a wall with a gap of 2 m in which a door turns about its middle; both robots on the same side.
+    - Observation, the first on the right in its own view: own base info 6, the other's base info 6.
+    - Reward: see `DoorRewards`; zero-sum.
+    - End: one is past the line, a fall, or 5 s. Win: past the line first.
+
+    Source: paper, section III.
+    """
+
+    name = "go1revolvingdoor"
+    title = "Revolving Door"
+    symmetry = "reflect"
+    Params: ClassVar[type[TaskParams]] = DoorParams
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        wall = Rotation(1.0, width=params.gap)
+        blocks = (Init(params.door_x - 0.5), wall, Plane(2.5), Closing())
+        door = Door(
+            "door", position=(params.door_x, 0.0), size=params.door_size, mass=params.door_mass,
+            damping=params.door_damping,
+        )  # fmt: skip
+        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
+        return Scene(
+            Track(blocks=blocks, width=params.track_width, wall_height=0.85), num_robots=2, contacts=contacts,
+            objects=(door,), colors=(0, 2),
+        )  # fmt: skip
+
+    def spawn(self, key: jax.Array) -> jax.Array:
+        """Draws poses x, y, z, yaw (2, 4), m and rad: side by side before the door."""
+        params = self.params
+        noise = jax.random.uniform(key, (2, 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        place = jnp.array([[params.spawn_x, -params.spawn_y], [params.spawn_x, params.spawn_y]]) + noise
+        return jnp.concatenate([place, jnp.tile(jnp.array([params.spawn_height, 0.0]), (2, 1))], axis=-1)
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DoorState:
+        """Returns the task's own fields of a fresh world."""
+        return DoorState(self.distance(readings))
+
+    def distance(self, readings: RobotReadings) -> jax.Array:
+        """Returns each robot's horizontal distance to the middle of the line (2,), m."""
+        return jnp.linalg.norm(readings.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1)
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
+        return self.duel(readings)
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        distance = self.distance(readings)
+        terms = {
+            "win": self.versus(self.wins(state, readings)),
+            "approach": self.versus(state.task.distance - distance),
+        }
+        return terms, DoorState(distance)
+
+    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+        """Past the line."""
+        return readings.position_w[:, 0] > self.params.line_x
+
+    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+        """One is past the line."""
+        return jnp.any(self.wins(state, readings))

@@ -1,0 +1,116 @@
+"""go1wrestling, the paper's Sumo Wrestling: two robots try to push or tip each other out of a ring."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.match import Match
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.npc import Platform, Ring
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Init, Plane, Track
+
+
+@dataclasses.dataclass(frozen=True)
+class WrestlingRewards:
+    """Weights: `win`, of the side whose opponent falls or leaves the ring, less the opponent's."""
+
+    win: float = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class WrestlingParams(TaskParams):
+    """Parameters of Sumo Wrestling.
+
+    A robot has lost when its |roll| or |pitch| is over the limit, or its trunk is outside the ring or too low.
+
+    Attributes:
+        platform: extents of the platform, m; a part of it is in the ground.
+        platform_top: height of its top, m.
+        ring_radius: m.
+        ring_depth: a trunk this far below the platform's top has left it, m.
+        spawn_y: distance of the robots from the ring's middle, m.
+        rewards: weights.
+    """
+
+    episode_length: float = 15.0
+    spawn_height: float = 0.74
+    max_roll: float = 0.4 * np.pi
+    platform: tuple[float, float, float] = (4.37, 4.37, 0.5)
+    platform_top: float = 0.4
+    ring_radius: float = 1.7
+    ring_depth: float = 0.2
+    spawn_y: float = 1.0
+    rewards: WrestlingRewards = WrestlingRewards()
+
+
+class Go1Wrestling(Match):
+    """Sumo Wrestling.
+
+    - Scene: a platform with a ring of 3.4 m marked on it; the robots face each other, 2 m apart.
+    - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
+    - Reward: see `WrestlingRewards`; zero-sum.
+    - End: one has fallen or left the ring, or 15 s. Win: the opponent has, and oneself has not.
+
+    Source: paper, section III.
+    """
+
+    name = "go1wrestling"
+    title = "Sumo Wrestling"
+    center = (3.1, 0.0)
+    Params: ClassVar[type[TaskParams]] = WrestlingParams
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        x, y = self.center
+        top = params.platform_top
+        platform = Platform("platform", center=(x, y, top), size=params.platform)
+        ring = Ring("ring", center=(x, y, top), radius=params.ring_radius)
+        track = Track(blocks=(Init(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
+        contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
+        return Scene(track, num_robots=2, contacts=contacts, objects=(platform, ring), colors=(0, 2))
+
+    def spawn(self, key: jax.Array) -> jax.Array:
+        """Draws poses x, y, z, yaw (2, 4), m and rad: facing each other across the ring."""
+        params = self.params
+        noise = jax.random.uniform(key, (2, 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        place = jnp.array(self.center) + jnp.array([[0.0, -params.spawn_y], [0.0, params.spawn_y]]) + noise
+        rest = jnp.array([[params.spawn_height, 0.5 * jnp.pi], [params.spawn_height, -0.5 * jnp.pi]])
+        return jnp.concatenate([place, rest], axis=-1)
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
+        return self.duel(readings)
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        return {"win": self.versus(self.wins(state, readings))}, None
+
+    def out(self, readings: RobotReadings) -> jax.Array:
+        """Which robots have fallen or left the ring (2,) bool."""
+        params = self.params
+        apart = jnp.linalg.norm(readings.position_w[:, :2] - jnp.array(self.center), axis=-1)
+        below = readings.position_w[:, 2] < params.platform_top - params.ring_depth
+        return self.fallen(readings) | (apart > params.ring_radius) | below
+
+    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+        """The opponent has fallen or left the ring, and oneself has not."""
+        out = self.out(readings)
+        return out[::-1] & ~out
+
+    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+        """One has fallen or left the ring."""
+        return jnp.any(self.out(readings))
