@@ -1,0 +1,277 @@
+"""The matches: mirrored views, zero-sum rewards, results and endings on states made by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mqe_jax.envs import TASKS, QuadrupedEnv, make
+from mqe_jax.envs.match import Match
+from mqe_jax.npc import Cylinder, Door
+from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.terrain import Init, Plane, Track
+from tests.worlds import observation, placed, still, terms_of
+
+MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
+ENVS: dict[str, Any] = {}
+STEPS: dict[str, Any] = {}
+PI = np.pi
+
+
+def env_of(task: str) -> Any:
+    """The task on the C engine, made once."""
+    if task not in ENVS:
+        ENVS[task] = make(task, impl="c", control="position")
+        STEPS[task] = jax.jit(ENVS[task].step)
+    return ENVS[task]
+
+
+def stepped(env: QuadrupedEnv, state: Any) -> Any:
+    return STEPS[env.name](state, still(env))
+
+
+def result(env: Any, state: Any) -> tuple[float, float]:
+    """Wins of both teams, as if the episode ended now."""
+    out = env.outcome(state, env.read(state.data), jnp.array(False))
+    assert float(out["team0/win"] + out["team0/draw"] + out["team0/loss"]) == 1
+    assert float(out["team0/win"]) == float(out["team1/loss"]) and float(out["team0/draw"]) == float(out["team1/draw"])
+    assert float(out["success"]) == float(out["team0/win"])
+    return float(out["team0/win"]), float(out["team1/win"])
+
+
+@pytest.mark.parametrize("task", MATCHES)
+def test_teams_and_zero_sum(task: str) -> None:
+    env = env_of(task)
+    half = env.num_agents // 2
+    assert env.teams == (tuple(range(half)), tuple(range(half, 2 * half)))
+    state = env.reset(jax.random.PRNGKey(0))
+    for seed in range(3):
+        action = jax.random.uniform(jax.random.PRNGKey(seed), (env.num_agents, 12), minval=-1.0)
+        state = STEPS[task](state, action)
+        assert float(jnp.sum(state.reward)) == pytest.approx(0.0, abs=1e-5)
+        assert np.abs(np.asarray(state.reward)).max() < 1
+
+
+@pytest.mark.parametrize("task", MATCHES)
+def test_both_sides_see_the_same_of_a_mirrored_world(task: str) -> None:
+    """Robots and objects half turned (or reflected) and the teams swapped: the observations are swapped."""
+    env = env_of(task)
+    random = np.random.default_rng(0)
+    agents = env.num_agents
+    position = random.uniform([1, -2, 0.3], [4, 2, 0.5], (agents, 3))
+    euler = random.uniform(-0.5, 0.5, (agents, 3)) + np.array([0, 0, 1.0])
+    middle = np.array([*env.center, 0.0])
+    if env.symmetry == "turn":
+        other, turned = 2 * middle - position, euler + np.array([0, 0, PI])
+        other[:, 2] = position[:, 2]
+    else:
+        other, turned = position * [1, -1, 1], euler * [-1, 1, -1]
+    swap = np.roll(np.arange(agents), agents // 2)
+    there, here = {}, {}
+    if "cylinder" in env.objects:
+        there, here = {"cylinder": [0.3]}, {"cylinder": [-0.3]}
+    if "ball" in env.objects:
+        there = {"ball": [6.0, 1.0, 0.1, 1, 0, 0, 0]}
+        here = {"ball": [8.0, -1.0, 0.1, 1, 0, 0, 0]}
+    first = placed(env, position, euler, there)
+    second = placed(env, other[swap], turned[swap], here)
+    if "cylinder" in env.objects:
+        first = dataclasses.replace(first, task=dataclasses.replace(first.task, previous_y=jnp.float32(0.2)))
+        second = dataclasses.replace(second, task=dataclasses.replace(second.task, previous_y=jnp.float32(-0.2)))
+    np.testing.assert_allclose(observation(env, first), observation(env, second)[swap], atol=1e-5)
+    assert np.abs(observation(env, first) - observation(env, second)).max() > 0.1
+
+
+def test_actions_are_mirrored_where_left_and_right_are_swapped() -> None:
+    command = TASKS["go1revolvingdoor"](impl="c")
+    np.testing.assert_allclose(
+        command.to_world(jnp.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]])), [[0.1, 0.2, 0.3], [0.1, -0.2, -0.3]]
+    )
+    env = env_of("go1revolvingdoor")
+    legs = jnp.arange(12.0)[None] / 12
+    mirrored = 12 * np.asarray(env.to_world(jnp.tile(legs, (2, 1))))
+    np.testing.assert_allclose(mirrored[0], np.arange(12))
+    np.testing.assert_allclose(mirrored[1], [-3, 4, 5, -0, 1, 2, -9, 10, 11, -6, 7, 8], atol=1e-5)
+    turned = env_of("go1tug")
+    np.testing.assert_allclose(turned.to_world(jnp.tile(legs, (2, 1)))[1], legs[0])
+
+
+# ---------------------------------------------------------------- Push Cylinder
+
+
+def tug_state(env: Any, y: float) -> Any:
+    """Robot 0 is 1.43 m and robot 1 1.5 m from the axis when the cylinder is at 0.13."""
+    state = placed(env, [[1.6, -1.3, 0.3], [1.6, 1.63, 0.3]], [[0, 0, PI / 2], [0, 0, -PI / 2]], {"cylinder": [y]})
+    task = dataclasses.replace(
+        state.task, y=jnp.float32(0.1), previous_y=jnp.float32(0.08), distance=jnp.array([1.5, 1.4])
+    )
+    return dataclasses.replace(state, task=task)
+
+
+def test_tug_observation_and_rewards() -> None:
+    env = env_of("go1tug")
+    state = tug_state(env, 0.13)
+    obs = observation(env, state)
+    np.testing.assert_allclose(obs[0], [1.6, -1.3, 0.3, 0, 0, PI / 2, 0.13, 0, 1.43, 0.08], atol=1e-5)
+    np.testing.assert_allclose(obs[1], [1.6, -1.63, 0.3, 0, 0, PI / 2, -0.13, 0, 1.5, -0.08], atol=1e-5)
+    terms, reward = terms_of(env, state)
+    # Own terms: the cylinder went 0.03 m towards robot 1, who counts half of that as lost; robot 0 came 0.07 m
+    # closer to it, robot 1 got 0.1 m away. Less the opponent's: 0.045 m and 0.17 m.
+    np.testing.assert_allclose(terms["push"], [0.045, -0.045], atol=1e-6)
+    np.testing.assert_allclose(terms["approach"], [0.17, -0.17], atol=1e-6)
+    np.testing.assert_allclose(reward, [10 * 0.045 + 2 * 0.17, -10 * 0.045 - 2 * 0.17], atol=1e-5)
+
+
+def test_tug_result_and_end() -> None:
+    env = env_of("go1tug")
+    assert result(env, tug_state(env, 0.13)) == (1, 0)
+    assert result(env, tug_state(env, -0.13)) == (0, 1)
+    assert result(env, tug_state(env, 0.05)) == (0, 0)
+    state = tug_state(env, 0.0)
+    assert not stepped(env, state).terminated
+    assert stepped(env, dataclasses.replace(state, step=jnp.int32(env.max_steps - 1))).truncated
+    fallen = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0, 0, 0]])
+    assert stepped(env, fallen).terminated
+
+
+def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_the_arena() -> None:
+    scene = compile_scene(
+        Scene(Track((Init(2.0),), walled=False), num_robots=1, objects=(Cylinder("can", position=(9.0, 0.0)),))
+    )
+    index = scene.objects["can"]
+    way = {}
+    for force in (20.0, 40.0, -200.0):
+        data = mujoco.MjData(scene.model)
+        data.xfrc_applied[index.body, :2] = [100.0, force]
+        mujoco.mj_step(scene.model, data, 100)
+        way[force] = float(data.qpos[index.qpos[0]])
+    assert abs(way[20.0]) < 0.01
+    assert way[40.0] == pytest.approx((40 - 3 * 9.81) / 3 * 0.5**2 / 2, rel=0.1)
+    assert way[-200.0] == pytest.approx(-1.8, abs=0.05)
+
+
+# ---------------------------------------------------------------- Revolving Door
+
+
+def test_door_rewards_result_and_end() -> None:
+    env = env_of("go1revolvingdoor")
+    state = placed(env, [[3.9, 0.0, 0.3], [3.0, 0.5, 0.3]])
+    state = dataclasses.replace(state, task=dataclasses.replace(state.task, distance=jnp.array([0.08, 1.0])))
+    terms, reward = terms_of(env, state)
+    np.testing.assert_allclose(terms["win"], [1, -1])
+    # Robot 0 is 0.05 m from the line's middle, robot 1 hypot(0.85, 0.5) = 0.98615 m: 0.03 m and 0.01385 m closer.
+    np.testing.assert_allclose(terms["approach"], [0.01615, -0.01615], atol=1e-4)
+    np.testing.assert_allclose(reward, [10.01615, -10.01615], atol=1e-4)
+    assert result(env, state) == (1, 0) and stepped(env, state).terminated
+    assert result(env, placed(env, [[3.0, 0.0, 0.3], [3.9, 0.5, 0.3]])) == (0, 1)
+    assert result(env, placed(env, [[3.9, 0.0, 0.3], [3.9, 0.5, 0.3]])) == (0, 0)
+    both = placed(env, [[0.6, -1.0, 0.3], [0.6, 1.0, 0.3]])
+    assert not stepped(env, both).terminated
+    assert env.max_steps == 250
+
+
+def test_a_door_turns_about_its_middle_and_lets_one_side_through_at_a_time() -> None:
+    scene = compile_scene(
+        Scene(Track((Init(2.0), Plane(4.0)), walled=False), num_robots=1, objects=(Door("door", position=(4.0, 0.0)),))
+    )
+    index, data = scene.objects["door"], mujoco.MjData(scene.model)
+    body = scene.model.body(index.body)
+    assert float(body.mass[0]) == 4.0 and float(body.inertia[2]) == pytest.approx(1.232)
+    data.xfrc_applied[index.body, 5] = 2.0
+    mujoco.mj_step(scene.model, data, 100)  # 2 N m for half a second against 0.5 N m s/rad: about 0.2 rad
+    angle = float(data.qpos[index.qpos[0]])
+    assert angle == pytest.approx(2.0 / 1.232 * 0.5**2 / 2, rel=0.15)
+    ends = data.geom_xpos[index.geom] + data.geom_xmat[index.geom].reshape(3, 3)[:, 1:2].T * [[0.975], [-0.975]]
+    assert ends[0, 0] < 3.9 and ends[1, 0] > 4.1
+
+
+# ---------------------------------------------------------------- Sumo Wrestling
+
+
+def ring(env: Any, first: Any, second: Any, roll: float = 0.0) -> Any:
+    return placed(env, [first, second], [[0, 0, PI / 2], [roll, 0, -PI / 2]])
+
+
+def test_wrestling_rewards_result_and_end() -> None:
+    env = env_of("go1wrestling")
+    inside, out = [3.1, -0.5, 0.7], [3.1, 1.75, 0.7]
+    play = ring(env, inside, [3.1, 0.6, 0.7])
+    assert result(env, play) == (0, 0) and not stepped(env, play).terminated
+    np.testing.assert_allclose(terms_of(env, play)[1], [0, 0])
+    won = ring(env, inside, out)
+    assert result(env, won) == (1, 0) and stepped(env, won).terminated
+    np.testing.assert_allclose(terms_of(env, won)[1], [10, -10])
+    np.testing.assert_allclose(terms_of(env, ring(env, [1.3, 0.0, 0.7], [3.1, 0.6, 0.7]))[1], [-10, 10])
+    assert result(env, ring(env, [3.1, -1.75, 0.7], out)) == (0, 0)
+    assert result(env, ring(env, inside, [3.1, 0.6, 0.7], roll=1.26)) == (1, 0)  # over 0.4 pi
+    assert result(env, ring(env, inside, [3.1, 0.6, 0.7], roll=1.25)) == (0, 0)
+    assert result(env, ring(env, inside, [3.1, 0.6, 0.15])) == (1, 0)
+
+
+def test_the_ring_carries_robots_and_its_platform_is_as_large_as_listed() -> None:
+    env = env_of("go1wrestling")
+    geom = env.compiled.model.geom(env.objects["platform"].geom)
+    np.testing.assert_allclose(2 * geom.size, [4.37, 4.37, 0.5])
+    state = ring(env, [3.1, -1.0, 0.74], [3.1, 1.0, 0.74])
+    for _ in range(50):
+        state = stepped(env, state)
+    height = np.asarray(env.read(state.data).position_w)[:, 2]
+    assert np.all(np.abs(height - 0.4 - 0.3) < 0.04) and not state.terminated
+
+
+# ---------------------------------------------------------------- Traverse Bridge
+
+
+def test_bridge_rewards_result_and_end() -> None:
+    env = env_of("go1bridge")
+    facing = [[0, 0, 0], [0, 0, PI]]
+    apart = placed(env, [[3.0, 0, 1.32], [7.0, 0, 1.32]], facing)
+    np.testing.assert_allclose(terms_of(env, apart)[1], [0, 0])
+    assert result(env, apart) == (0, 0) and not stepped(env, apart).terminated
+    across = placed(env, [[6.5, 0.3, 1.32], [7.5, 0, 1.32]], facing)
+    np.testing.assert_allclose(terms_of(env, across)[1], [1, -1])
+    assert result(env, across) == (1, 0) and not stepped(env, across).terminated
+    swapped = placed(env, [[7.0, 0.3, 1.32], [3.0, 0, 1.32]], facing)
+    np.testing.assert_allclose(terms_of(env, swapped)[1], [0, 0])
+    assert result(env, swapped) == (0, 0)
+    off = placed(env, [[6.5, 0.3, 1.32], [5.0, 0.6, 0.45]], facing)
+    np.testing.assert_allclose(terms_of(env, off)[1], [11, -11])
+    assert result(env, off) == (1, 0) and stepped(env, off).terminated
+    both = placed(env, [[5.0, -0.6, 0.4], [5.0, 0.6, 0.45]], facing)
+    assert result(env, both) == (0, 0) and stepped(env, both).terminated
+    assert result(env, placed(env, [[3.0, 0, 1.32], [5.0, 0.6, 0.45]], facing)) == (1, 0)
+
+
+def test_the_bridge_carries_a_robot_and_its_side_does_not() -> None:
+    env = env_of("go1bridge")
+    state = placed(env, [[5.0, 0.0, 1.34], [5.6, 0.75, 1.34]])
+    for _ in range(40):
+        state = stepped(env, state)
+    position = np.asarray(env.read(state.data).position_w)
+    assert abs(position[0, 2] - 1.02 - 0.3) < 0.04
+    assert position[1, 2] < 0.9
+
+
+@pytest.mark.parametrize(
+    ("task", "colors"),
+    [("go1tug", (0, 2)), ("go1revolvingdoor", (0, 2)), ("go1wrestling", (0, 2)), ("go1bridge", (0, 2))],
+)
+def test_robots_start_as_listed(task: str, colors: tuple[int, int]) -> None:
+    env = env_of(task)
+    spawn = np.asarray(jax.vmap(env.spawn)(jax.random.split(jax.random.PRNGKey(0), 64)))
+    mean = {
+        "go1tug": [[1.6, -2.5, 0.34, PI / 2], [1.6, 2.5, 0.34, -PI / 2]],
+        "go1revolvingdoor": [[0.5, -1, 0.42, 0], [0.5, 1, 0.42, 0]],
+        "go1wrestling": [[3.1, -1, 0.74, PI / 2], [3.1, 1, 0.74, -PI / 2]],
+        "go1bridge": [[2.0, 0, 1.4, 0], [7.5, 0, 1.4, PI]],
+    }[task]
+    spread = [1.0, 0, 0, 0] if task == "go1tug" else [0.1, 0.1, 0, 0]
+    assert np.all(np.abs(spawn - mean) <= np.array(spread) + 1e-5)
+    assert np.abs(spawn - mean)[..., 0].max() > 0.8 * spread[0]
+    assert env.compiled.scene.colors == colors

@@ -1,0 +1,51 @@
+"""States made by hand: robots and objects put somewhere, at rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax import robot as go1
+from mqe_jax.envs import QuadrupedEnv, State
+
+
+def placed(
+    env: QuadrupedEnv, position: Any, euler: Any = None, objects: Mapping[str, Sequence[float]] | None = None,
+    state: State | None = None,
+) -> State:  # fmt: skip
+    """A fresh world with the robots at positions (R, 3), m, with roll, pitch, yaw (R, 3), rad, and default joints.
+
+    Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the reset.
+    """
+    state = env.reset(jax.random.PRNGKey(0)) if state is None else state
+    index, position = env.robot, jnp.asarray(position, jnp.float32)
+    turn = go1.euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
+    qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))
+    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
+    for name, coordinates in (objects or {}).items():
+        qpos = qpos.at[env.objects[name].qpos].set(jnp.asarray(coordinates, jnp.float32))
+    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
+
+
+def observation(env: QuadrupedEnv, state: State) -> np.ndarray:
+    """What the agents (A, O) see in a state."""
+    return np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
+
+
+def terms_of(env: QuadrupedEnv, state: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The unweighted terms and the agents' rewards (A,) of a state that a step has led to."""
+    from mqe_jax.envs.reward import weigh
+
+    terms, _ = env.rewards(state, env.read(state.data), jnp.array(False))
+    reward, _ = weigh(terms, env.params.rewards, env.num_agents)
+    return {name: np.asarray(value) for name, value in terms.items()}, np.asarray(reward)
+
+
+def still(env: QuadrupedEnv) -> jax.Array:
+    """The action of agents that do nothing."""
+    return jnp.zeros((env.num_agents, env.action_size))
