@@ -53,6 +53,7 @@ class Object:
     ) -> Any:
         body = spec.worldbody.add_body(name=f"object/{self.name}", pos=position)
         body.explicitinertial, body.mass, body.inertia = True, mass, inertia
+        body.ipos = (0, 0, 0)  # or MuJoCo puts the centre of mass at `position` from the body
         return body
 
     def _joint(self, body: Any, suffix: str, kind: Any, damping: float = 0.0, **shape: Any) -> None:
@@ -209,7 +210,8 @@ class Seesaw(Object):
         mass: kg; the centre of mass is in the hinge, so that the plank stays as it is.
         inertia: about the hinge, kg m^2.
         limit: greatest angle either way, rad; at the lower limit the near end lies on the ground.
-        damping: of the hinge, N m s/rad, which limits its speed.
+        damping: of the hinge, N m s/rad, which limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge,
+            turns it at 0.21 rad/s.
     """
 
     hinge: Vector = (5.6, 0.0, 0.545)
@@ -218,7 +220,7 @@ class Seesaw(Object):
     mass: float = 100.0
     inertia: float = 100.0
     limit: float = 0.254
-    damping: float = 500.0
+    damping: float = 1000.0
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the plank, and the posts that carry it to look at."""

@@ -8,12 +8,14 @@ import jax
 
 from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
+from mqe_jax.planners.seesaw import plan_seesaw
 from mqe_jax.planners.sheep import plan_sheep_easy, plan_sheep_hard
 from mqe_jax.planners.tug import plan_tug
 
 # Task id -> function from one world's observations (A, O) to its actions (A, action_size).
 PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1gate": plan_gate,
+    "go1seesaw": plan_seesaw,
     "go1sheep-easy": plan_sheep_easy,
     "go1sheep-hard": plan_sheep_hard,
     "go1pushbox": plan_pushbox,
