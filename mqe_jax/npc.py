@@ -234,12 +234,12 @@ class Seesaw(Object):
         if visual:
             x, y, z = self.hinge
             grey = (0.55, 0.55, 0.58, 1.0)
-            _look(
-                spec.worldbody, _GEOM.mjGEOM_CYLINDER, grey, size=(0.05, 0, 0),
-                fromto=(x, y - half[1] - 0.08, z, x, y + half[1] + 0.08, z),
-            )  # fmt: skip
             for side in (-1, 1):
-                post = y + side * (half[1] + 0.06)
+                edge, post = y + side * half[1], y + side * (half[1] + 0.06)
+                _look(
+                    spec.worldbody, _GEOM.mjGEOM_CYLINDER, grey, size=(0.05, 0, 0),
+                    fromto=(x, edge, z, x, edge + side * 0.08, z),
+                )  # fmt: skip
                 _look(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
 
 
