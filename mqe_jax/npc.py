@@ -176,7 +176,7 @@ class Cylinder(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Door(Object):
-    """A revolving door: a panel on a vertical hinge in its middle. Coordinate: angle, rad, 0 along y; velocity likewise.
+    """A revolving door: a panel on a vertical hinge in its middle. Coordinate: angle, rad, 0 along y, and its velocity.
 
     Attributes:
         position: of the hinge (x, y), m.

@@ -136,7 +136,9 @@ class Go1Seesaw(QuadrupedEnv):
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        return ObservationLayout((Block("one_hot", 2, ONE_HOT), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO)))
+        return ObservationLayout(
+            (Block("one_hot", 2, ONE_HOT), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO))
+        )
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
