@@ -13,6 +13,7 @@ from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.overrides import override
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.pushbox import Go1PushBox
+from mqe_jax.envs.seesaw import Go1Seesaw
 from mqe_jax.envs.sheep import Go1SheepEasy, Go1SheepHard
 from mqe_jax.envs.tug import Go1Tug
 from mqe_jax.envs.wrestling import Go1Wrestling
@@ -23,6 +24,7 @@ TASKS: dict[str, type[QuadrupedEnv]] = {
     for task in (
         Go1Plane,
         Go1Gate,
+        Go1Seesaw,
         Go1SheepEasy,
         Go1SheepHard,
         Go1PushBox,

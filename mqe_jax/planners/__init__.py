@@ -10,6 +10,7 @@ from mqe_jax.planners.bridge import plan_bridge
 from mqe_jax.planners.door import plan_revolving_door
 from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
+from mqe_jax.planners.seesaw import plan_seesaw
 from mqe_jax.planners.sheep import plan_sheep_easy, plan_sheep_hard
 from mqe_jax.planners.tug import plan_tug
 from mqe_jax.planners.wrestling import plan_wrestling
@@ -17,6 +18,7 @@ from mqe_jax.planners.wrestling import plan_wrestling
 # Task id -> function from one world's observations (A, O) to its actions (A, action_size).
 PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1gate": plan_gate,
+    "go1seesaw": plan_seesaw,
     "go1sheep-easy": plan_sheep_easy,
     "go1sheep-hard": plan_sheep_hard,
     "go1pushbox": plan_pushbox,

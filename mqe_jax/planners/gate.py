@@ -14,7 +14,7 @@ def plan_gate(obs: jax.Array) -> jax.Array:
     before = gate - jnp.array([0.65, 0.0])
     behind = gate + jnp.array([0.75, 0.0])
     side = jnp.array([1.0, -1.0])
-    wait = gate + jnp.stack([jnp.array([-0.65, -1.3]), 0.7 * side], axis=-1)
+    wait = gate + jnp.stack([jnp.array([-0.65, -1.3]), -0.7 * side], axis=-1)  # each on the side where it starts
     rest = jnp.stack([jnp.full(2, 5.3), 0.75 * side], axis=-1)
     x = position[:, 0] - gate[:, 0]
     lined_up = (jnp.abs(position[:, 1] - gate[:, 1]) < 0.1) & (x > -1.0)
