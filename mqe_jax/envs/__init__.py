@@ -7,6 +7,7 @@ from typing import Any
 
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.envs.base import QuadrupedEnv, Randomization, State, TaskParams
+from mqe_jax.envs.football import Go1Football1vs1, Go1Football2vs2, Go1FootballDefender
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.overrides import override
 from mqe_jax.envs.plane import Go1Plane
@@ -16,7 +17,11 @@ from mqe_jax.envs.tug import Go1Tug
 from mqe_jax.terrain import nearest
 
 TASKS: dict[str, type[QuadrupedEnv]] = {
-    task.name: task for task in (Go1Plane, Go1Gate, Go1SheepEasy, Go1SheepHard, Go1PushBox, Go1Tug)
+    task.name: task
+    for task in (
+        *(Go1Plane, Go1Gate, Go1SheepEasy, Go1SheepHard, Go1PushBox, Go1FootballDefender),
+        *(Go1Tug, Go1Football1vs1, Go1Football2vs2),
+    )
 }
 
 
