@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import jax
 
+from mqe_jax.planners.football import plan_1vs1, plan_2vs2, plan_defender
 from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
 from mqe_jax.planners.sheep import plan_sheep_easy, plan_sheep_hard
@@ -17,5 +18,8 @@ PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1sheep-easy": plan_sheep_easy,
     "go1sheep-hard": plan_sheep_hard,
     "go1pushbox": plan_pushbox,
+    "go1football-defender": plan_defender,
     "go1tug": plan_tug,
+    "go1football-1vs1": plan_1vs1,
+    "go1football-2vs2": plan_2vs2,
 }
