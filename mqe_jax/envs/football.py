@@ -80,8 +80,7 @@ class Football(QuadrupedEnv):
             wall_height=params.wall_height,
         )  # fmt: skip
         ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
-        # A standing trunk is above the ball.
-        contacts = Contacts(robot=("trunk", "foot"), object=("foot", "calf"))
+        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         robots = len(self.kick_off)
         return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
 
