@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from mqe_jax import robot as go1
-from mqe_jax.envs import QuadrupedEnv, State, VectorEnv, make
+from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import PLANNERS
+from mqe_jax.walk_policy import default_commands
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -24,6 +25,19 @@ TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
 @pytest.fixture(scope="module")
 def envs() -> dict[str, Any]:
     return {task: make(task, impl="c", control="position") for task in TASKS}
+
+
+@pytest.fixture(scope="module")
+def drawn(envs: dict[str, Any]) -> dict[str, State]:
+    """64 fresh worlds of every task."""
+    keys = jax.random.split(jax.random.PRNGKey(0), 64)
+    return {task: jax.jit(jax.vmap(env.reset))(keys) for task, env in envs.items()}
+
+
+@pytest.fixture(scope="module")
+def fresh(drawn: dict[str, State]) -> dict[str, State]:
+    """A fresh world of every task."""
+    return {task: jax.tree.map(lambda x: x[0], states) for task, states in drawn.items()}
 
 
 @pytest.fixture(scope="module")
@@ -46,25 +60,33 @@ def attack_step(attack: Any) -> Any:
     return jax.jit(attack.step)
 
 
+def placed(state: State, qpos: np.ndarray, qvel: np.ndarray) -> State:
+    return dataclasses.replace(state, data=state.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
+
+
 def with_ball(env: QuadrupedEnv, state: State, position: Any, velocity: Any = (0.0, 0.0, 0.0)) -> State:
     """The state with the ball somewhere else, moving."""
-    ball = env.objects["ball"]
-    position = [*position, 0.1] if len(position) == 2 else position
-    qpos = state.data.qpos.at[ball.qpos[:3]].set(jnp.asarray(position))
-    qvel = state.data.qvel.at[ball.qvel[:3]].set(jnp.asarray(velocity))
-    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=qvel))
+    ball, qpos, qvel = env.objects["ball"], np.array(state.data.qpos), np.array(state.data.qvel)
+    qpos[ball.qpos[:3]] = [*position, 0.1] if len(position) == 2 else position
+    qvel[ball.qvel[:3]] = velocity
+    return placed(state, qpos, qvel)
 
 
 def standing(env: QuadrupedEnv, state: State, places: Any, roll: float = 0.0) -> State:
-    """The state with all robots at x, y, yaw, standing still; the first one rolled over."""
-    places, index = np.asarray(places, np.float32), env.robot
-    euler = np.zeros((len(places), 3), np.float32)
-    euler[:, 2], euler[0, 0] = places[:, 2], roll
-    position = np.c_[places[:, :2], np.full(len(places), 0.31)]
-    qpos = state.data.qpos.at[index.base_qpos[:, :3]].set(position)
-    qpos = qpos.at[index.base_qpos[:, 3:]].set(go1.euler_to_quaternion(jnp.asarray(euler)))
-    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
-    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
+    """The state with all robots at x, y, yaw, standing still; the first one, instead, rolled over at yaw 0."""
+    places, index, qpos = np.asarray(places), env.robot, np.array(state.data.qpos)
+    qpos[index.base_qpos[:, :3]] = np.c_[places[:, :2], np.full(len(places), 0.31)]
+    none = np.zeros(len(places))
+    qpos[index.base_qpos[:, 3:]] = np.stack([np.cos(places[:, 2] / 2), none, none, np.sin(places[:, 2] / 2)], -1)
+    if roll:
+        qpos[index.base_qpos[0, 3:]] = [np.cos(roll / 2), np.sin(roll / 2), 0, 0]
+    qpos[index.joint_qpos] = go1.DEFAULT_JOINTS
+    return placed(state, qpos, np.zeros(env.compiled.model.nv, np.float32))
+
+
+def seen(env: QuadrupedEnv, state: State) -> np.ndarray:
+    """What the agents of a state made by hand observe."""
+    return np.asarray(jax.jit(lambda s: env.observation_layout.pack(env.observe(s, env.read(s.data))))(state))
 
 
 def rest(env: QuadrupedEnv) -> jax.Array:
@@ -75,10 +97,10 @@ def rest(env: QuadrupedEnv) -> jax.Array:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_everything_starts_as_listed(envs: dict[str, Any], task: str) -> None:
+def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str) -> None:
     env = envs[task]
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 64))
-    robots = jax.vmap(env.read)(states.data)
+    states = drawn[task]
+    robots = jax.jit(jax.vmap(env.read))(states.data)
     listed = {
         "go1football-defender": ([(4, -2), (4, 2), (10, 0)], [0, 0, 1], (5, -2.1)),
         "go1football-1vs1": ([(4, 0), (10, 0)], [0, 1], (7, 0)),
@@ -123,8 +145,8 @@ def test_the_robots_have_their_teams_colours(envs: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("y", "inside"), [(0.0, True), (0.7, True), (-1.3, False)])
-def test_a_shot_goes_into_the_mouth_or_bounces_off_the_wall(duel: Any, duel_step: Any, y: float, inside: bool) -> None:
-    state = standing(duel, duel.reset(jax.random.PRNGKey(0)), [(4, 4, 0), (10, -4, np.pi)])
+def test_a_shot_goes_in_or_bounces_off(duel: Any, duel_step: Any, fresh: Any, y: float, inside: bool) -> None:
+    state = standing(duel, fresh[duel.name], [(4, 4, 0), (10, -4, np.pi)])
     state = with_ball(duel, state, (11.0, y), (3.0, 0.0, 0.0))
     scored = False
     for _ in range(40):
@@ -148,23 +170,23 @@ def turned(places: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("task", TASKS[1:])
-def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], task: str) -> None:
+def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], fresh: Any, task: str) -> None:
     env = envs[task]
     count, half = env.num_agents, env.num_agents // 2
     places = PLACES[:count]
-    state = env.reset(jax.random.PRNGKey(0))
+    state = fresh[env.name]
     here = with_ball(env, standing(env, state, places), (6.3, 1.1, 0.4), (0.8, -0.3, 0.1))
     there = standing(env, state, np.roll(turned(places), half, axis=0))
     there = with_ball(env, there, (14 - 6.3, -1.1, 0.4), (-0.8, 0.3, 0.1))
-    seen, mirrored = (np.asarray(env.observation_layout.pack(env.observe(s, env.read(s.data)))) for s in (here, there))
-    np.testing.assert_allclose(mirrored, np.roll(seen, half, axis=0), atol=1e-5)
-    assert np.abs(seen[0] - seen[half]).max() > 0.5  # and the two sides do not see the same here
+    ours, theirs = seen(env, here), seen(env, there)
+    np.testing.assert_allclose(theirs, np.roll(ours, half, axis=0), atol=1e-5)
+    assert np.abs(ours[0] - ours[half]).max() > 0.5  # and the two sides do not see the same here
 
 
-def test_observations_are_what_is_listed(envs: dict[str, Any]) -> None:
+def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
     env = envs["go1football-2vs2"]
-    state = with_ball(env, standing(env, env.reset(jax.random.PRNGKey(0)), PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
-    obs = np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
+    state = with_ball(env, standing(env, fresh[env.name], PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
+    obs = seen(env, state)
     info = [[x, y, 0.31, 0, 0, yaw] for x, y, yaw in PLACES]
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
     np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *info[2], *info[3], *ball], atol=1e-5)
@@ -174,13 +196,13 @@ def test_observations_are_what_is_listed(envs: dict[str, Any]) -> None:
     np.testing.assert_allclose(obs[3], [0, 1, *other[3], *other[2], *other[0], *other[1], *ball], atol=1e-5)
 
     env = envs["go1football-1vs1"]
-    state = with_ball(env, standing(env, env.reset(jax.random.PRNGKey(0)), PLACES[:2]), (6.3, 1.1))
-    obs = np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
+    state = with_ball(env, standing(env, fresh[env.name], PLACES[:2]), (6.3, 1.1))
+    obs = seen(env, state)
     np.testing.assert_allclose(obs[1], [1, *other[1], *other[0], 7.7, -1.1, 0.1, 0, 0, 0], atol=1e-5)
 
     env = envs["go1football-defender"]
-    state = with_ball(env, standing(env, env.reset(jax.random.PRNGKey(0)), PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
-    obs = np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
+    state = with_ball(env, standing(env, fresh[env.name], PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
+    obs = seen(env, state)
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
     np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *ball], atol=1e-5)
     np.testing.assert_allclose(obs[1], [0, 1, *info[1], *info[0], *ball], atol=1e-5)
@@ -197,8 +219,8 @@ def test_observations_are_what_is_listed(envs: dict[str, Any]) -> None:
         ((2.01, 0.0), (0, 0)), ((1.99, 1.01), (0, 0)), ((7.0, 0.0), (0, 0)),
     ],
 )  # fmt: skip
-def test_goals_at_both_ends(duel: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
-    state = with_ball(duel, duel.reset(jax.random.PRNGKey(0)), ball)
+def test_goals_at_both_ends(duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
+    state = with_ball(duel, fresh[duel.name], ball)
     robots = duel.read(state.data)
     np.testing.assert_array_equal(duel.wins(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
@@ -209,10 +231,10 @@ def test_goals_at_both_ends(duel: Any, ball: tuple[float, float], goals: tuple[i
     assert float(outcome["success"]) == goals[0]
 
 
-def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any]) -> None:
+def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh: Any) -> None:
     """Before: the ball in the middle, 5 m from both goals. After: as each comment says."""
     env = envs["go1football-2vs2"]
-    state = env.reset(jax.random.PRNGKey(0))
+    state = fresh[env.name]
     before = with_ball(env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0))
     task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.gates)
     np.testing.assert_allclose(task.goal, [5, 5], atol=1e-5)
@@ -235,10 +257,10 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any]) -> Non
     assert abs(expected + 10) < 5  # the goal is most of it
 
 
-def test_match_endings(duel: Any, duel_step: Any) -> None:
+def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
     """A goal, a fall and the time limit end a match; play does not."""
     places = [(4, 0, 0), (10, 0, np.pi)]
-    state = standing(duel, duel.reset(jax.random.PRNGKey(0)), places)
+    state = standing(duel, fresh[duel.name], places)
     play = duel_step(state, rest(duel))
     assert not play.terminated and not play.truncated
     late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), rest(duel))
@@ -252,8 +274,8 @@ def test_match_endings(duel: Any, duel_step: Any) -> None:
         np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
 
 
-def test_attack_rewards_and_success(attack: Any, attack_step: Any) -> None:
-    state = standing(attack, attack.reset(jax.random.PRNGKey(0)), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -> None:
+    state = standing(attack, fresh[attack.name], [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
     robots = attack.read(state.data)
     for ball, expected in (((9.0, 0.0), 3 * np.exp(-1)), ((12.3, 0.4), 10 + 3 * np.exp(-0.5 / 3))):
         reward, _ = weigh(attack.rewards(with_ball(attack, state, ball), robots, NO)[0], attack.params.rewards, 2)
@@ -308,23 +330,30 @@ def test_the_defender_steps_sideways_towards_the_line() -> None:
     assert float(far[1]) == pytest.approx(-0.5)
 
 
-def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, attack_step: Any) -> None:
-    """It walks there by the walk policy, follows a ball to the other side, and stays where it is if it is idle."""
-    start = standing(attack, attack.reset(jax.random.PRNGKey(1)), [(4, -4, 0), (4, 4, 0), (10, 0, np.pi)])
+def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, attack_step: Any, fresh: Any) -> None:
+    """It walks there by the walk policy and follows a ball to the other side."""
+    start = standing(attack, fresh[attack.name], [(4, -4, 0), (4, 4, 0), (10, 0, np.pi)])
     goal, state = np.array([12.0, 0.0]), start
     for ball in ((8.0, -2.0), (8.0, 2.0)):
         state = with_ball(attack, state, ball)
-        for _ in range(350):
+        for _ in range(250):
             state = attack_step(state, rest(attack))
         assert not np.asarray(state.terminated)
         target = goal + 0.6 * (np.array(ball) - goal)
         place = np.asarray(attack.read(state.data).position_w)[2, :2]
         assert np.linalg.norm(place - target) < 0.35
+
+
+def test_an_idle_defender_is_told_to_stand(attack: Any, fresh: Any) -> None:
+    state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
     idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
-    state, step = with_ball(idle, start, (8.0, -2.0)), jax.jit(idle.step)
-    for _ in range(150):
-        state = step(state, rest(idle))
-    assert np.linalg.norm(np.asarray(idle.read(state.data).position_w)[2, :2] - [10.0, 0.0]) < 0.3
+    robots = attack.read(state.data)
+    rest = default_commands()
+    np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
+    told = np.asarray(attack.npc_commands(state, robots))[0]
+    # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
+    np.testing.assert_allclose(told[:2], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(told[3:], rest[3:])
 
 
 # -- the whole --------------------------------------------------------------------------------------------------------
@@ -335,12 +364,18 @@ def test_wrong_numbers_of_robots_are_named() -> None:
         make("go1football-1vs1", impl="c", num_agents=4)
 
 
-def test_the_planner_scores() -> None:
-    """Through the walk policy, over a few episodes; `mqe eval TASK --planner scripted` measures many."""
-    from mqe_jax.train.evaluate import evaluate
+def test_the_planner_dribbles_to_the_goal() -> None:
+    """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --planner scripted` measures many."""
+    worlds = make("go1football-1vs1", impl="c", num_envs=4)
+    plan = jax.vmap(PLANNERS[worlds.name])
 
-    worlds = VectorEnv(make("go1football-1vs1", impl="c", num_envs=8), 8)
-    plan = jax.vmap(PLANNERS["go1football-1vs1"])
-    act = lambda obs, memory, _: (plan(obs).at[:, 1].set(0.0), memory)  # noqa: E731
-    result = evaluate(worlds, act, 8, jax.random.PRNGKey(0), memory=())
-    assert result.match["win_rate"] >= 0.5
+    def step(state: State, _: None) -> tuple[State, jax.Array]:
+        state = jax.vmap(worlds.step)(state, plan(state.obs).at[:, 1].set(0.0))
+        return state, jax.vmap(worlds.object_pose, (0, None))(state.data, "ball")[:, 0]
+
+    @jax.jit
+    def play(key: jax.Array) -> jax.Array:
+        return jax.lax.scan(step, jax.vmap(worlds.reset)(jax.random.split(key, 4)), None, 400)[1]
+
+    furthest = np.asarray(play(jax.random.PRNGKey(0))).max(0)
+    assert np.median(furthest) > 11.0  # from 7.0, past the opponent at 10.0
