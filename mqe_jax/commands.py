@@ -19,7 +19,7 @@ import yaml
 from mqe_jax import bench as benchmark
 from mqe_jax import plots
 from mqe_jax import render as rendering
-from mqe_jax.envs import TASKS, VectorEnv, make
+from mqe_jax.envs import ALIASES, TASKS, VectorEnv, make
 from mqe_jax.planners import PLANNERS
 from mqe_jax.terrain import nearest
 from mqe_jax.train import config as configs
@@ -210,7 +210,7 @@ def find_actor(arguments: cli.Eval | cli.Render, default: str) -> Actor:
         task, env_values = config.task, {**config.env, **given}
         run = Path(target) if run is None and arguments.planner is None else run
     else:
-        task, env_values = target, given
+        task, env_values = ALIASES.get(target, target), given
     if run is not None:
         return Actor(task, env_values, policy_api.load_policy(run), arguments.opponent)
     if default == "scripted" and task not in PLANNERS:

@@ -388,6 +388,36 @@ def slowed(velocity: jax.Array, loss: float) -> jax.Array:
     return velocity * jnp.maximum(1.0 - loss / speed, 0.0)
 
 
+def defend(position: jax.Array, yaw: jax.Array, ball: jax.Array, goal: jax.Array) -> jax.Array:
+    """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that keeps between ball and goal.
+
+    With p its position, g the goal, t = 0.6 ball + 0.4 g the place to stand and wrap() an angle in [-pi, pi]:
+
+        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (it faces away from its goal)
+        vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the goal as t)
+        vy       = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
+
+    Source: the paper's defender, section III, with the figures of the released system.
+
+    Args:
+        position: of the robot (2,), m.
+        yaw: of the robot (), rad.
+        ball: (2,), m.
+        goal: middle of the goal line (2,), m.
+    """
+    own, way = position - goal, 0.6 * (ball - goal)
+    distance = jnp.linalg.norm(way)
+    turn = jnp.arctan2(own[1], own[0]) - yaw
+    left = (way[0] * own[1] - way[1] * own[0]) / jnp.maximum(distance, 1e-6)
+    return jnp.stack(
+        [
+            jnp.clip(distance - jnp.linalg.norm(own), -0.5, 0.5),
+            -jnp.clip(left, -0.5, 0.5),
+            jnp.clip(jnp.arctan2(jnp.sin(turn), jnp.cos(turn)), -0.3, 0.3) / 0.3,
+        ]
+    )
+
+
 def _length(vector: jax.Array) -> jax.Array:
     return jnp.linalg.norm(vector, axis=-1, keepdims=True)
 

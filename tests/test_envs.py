@@ -246,4 +246,8 @@ def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip().splitlines()[-1] == "[]"
-    assert mqe_jax.tasks() == ("go1plane", "go1gate", "go1sheep-easy", "go1sheep-hard", "go1pushbox")
+    assert mqe_jax.tasks() == (
+        "go1plane", "go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender",
+        "go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2",
+    )  # fmt: skip
+    assert type(make("go1bridgewrestling", impl="c", control="position")) is TASKS["go1wrestling"]

@@ -9,6 +9,7 @@ from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.envs.base import QuadrupedEnv, Randomization, State, TaskParams
 from mqe_jax.envs.bridge import Go1Bridge
 from mqe_jax.envs.door import Go1RevolvingDoor
+from mqe_jax.envs.football import Go1Football1vs1, Go1Football2vs2, Go1FootballDefender
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.overrides import override
 from mqe_jax.envs.plane import Go1Plane
@@ -28,10 +29,13 @@ TASKS: dict[str, type[QuadrupedEnv]] = {
         Go1SheepEasy,
         Go1SheepHard,
         Go1PushBox,
+        Go1FootballDefender,
         Go1Tug,
         Go1RevolvingDoor,
         Go1Wrestling,
         Go1Bridge,
+        Go1Football1vs1,
+        Go1Football2vs2,
     )
 }
 

@@ -8,6 +8,7 @@ import jax
 
 from mqe_jax.planners.bridge import plan_bridge
 from mqe_jax.planners.door import plan_revolving_door
+from mqe_jax.planners.football import plan_1vs1, plan_2vs2, plan_defender
 from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
 from mqe_jax.planners.seesaw import plan_seesaw
@@ -22,8 +23,11 @@ PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1sheep-easy": plan_sheep_easy,
     "go1sheep-hard": plan_sheep_hard,
     "go1pushbox": plan_pushbox,
+    "go1football-defender": plan_defender,
     "go1tug": plan_tug,
     "go1revolvingdoor": plan_revolving_door,
     "go1wrestling": plan_wrestling,
     "go1bridge": plan_bridge,
+    "go1football-1vs1": plan_1vs1,
+    "go1football-2vs2": plan_2vs2,
 }

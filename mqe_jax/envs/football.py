@@ -1,0 +1,374 @@
+"""Football on one field: two attackers against a defender that plays by rule, and the matches 1 vs 1 and 2 vs 2.
+
+The field lies between x 2 and 12; its goals are the gaps in the thick walls behind both goal lines.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.match import Match
+from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.npc import Ball, defend
+from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.scene import Scene
+from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.walk_policy import command_index, default_commands
+
+# Middles of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
+GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
+_GOAL_DEPTH = 1.0  # m
+
+_VELOCITY = "m/s"
+_POSITION = "centre, m"
+
+
+@dataclasses.dataclass(frozen=True)
+class FootballParams(TaskParams):
+    """Parameters of all football tasks.
+
+    Attributes:
+        field_width: m.
+        goal_width: of the mouths, m.
+        wall_height: of all walls, m.
+        ball_radius: m.
+        ball_mass: kg.
+        ball_drag: resistance to its motion, N s/m.
+        ball_noise: half-width of the uniform noise on the ball's position at reset, m.
+    """
+
+    episode_length: float = 20.0
+    field_width: float = 9.0
+    goal_width: float = 2.0
+    wall_height: float = 1.0
+    ball_radius: float = 0.1
+    ball_mass: float = 0.318
+    ball_drag: float = 0.1
+    ball_noise: float = 0.0
+
+
+class Football(QuadrupedEnv):
+    """Base of the football tasks: the field, the ball and where everything starts.
+
+    A task says its robots' kick-off poses x, y, yaw (m, rad), its ball's place (m) and its robots' colours.
+    """
+
+    kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()
+    ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)
+    colors: ClassVar[tuple[int, ...]] = ()
+    agents: ClassVar[int] = 2
+
+    def __init__(self, params: TaskParams | None = None, **engine: Any) -> None:
+        if params is not None and params.num_agents != self.agents:
+            raise ValueError(f"num_agents: {params.num_agents}; {self.name} is for {self.agents} robots")
+        super().__init__(params, **engine)
+
+    def scene(self) -> Scene:
+        """Says what is in the world."""
+        params = self.params
+        goal = Gate(_GOAL_DEPTH, width=params.goal_width, depth=_GOAL_DEPTH)
+        length = float(GOALS[0, 0] - GOALS[1, 0])
+        track = Track(
+            blocks=(Init(1.0), goal, Plane(length), goal, Closing()), width=params.field_width,
+            wall_height=params.wall_height,
+        )  # fmt: skip
+        ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
+        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
+        robots = len(self.kick_off)
+        return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
+
+    def spawn(self, key: jax.Array) -> jax.Array:
+        """Draws poses x, y, z, yaw (R, 4), m and rad, of all robots."""
+        params = self.params
+        x, y, yaw = jnp.array(self.kick_off).T
+        pose = jnp.stack([x, y, jnp.full(len(x), params.spawn_height), yaw], axis=-1)
+        noise = jax.random.uniform(key, (len(x), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        return pose.at[:, :2].add(noise)
+
+    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Puts the ball on its spot."""
+        params = self.params
+        noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)
+        position = jnp.array([*self.ball_spot, params.ball_radius]).at[:2].add(noise)
+        return qpos.at[self.objects["ball"].qpos[:3]].set(position), qvel
+
+    def ball(self, data: mjx.Data) -> jax.Array:
+        """Returns the ball's position (3,), m."""
+        return self.object_pose(data, "ball")[:3]
+
+    def ball_velocity(self, data: mjx.Data) -> jax.Array:
+        """Returns the ball's velocity (3,), m/s."""
+        return data.qvel[self.objects["ball"].qvel[:3]]
+
+    def in_goal(self, data: mjx.Data) -> jax.Array:
+        """Returns whether the ball's centre is past each goal line of `GOALS`, inside the mouth (2,) bool."""
+        x, y, _ = self.ball(data)
+        return jnp.stack([x > GOALS[0, 0], x < GOALS[1, 0]]) & (jnp.abs(y) < self.params.goal_width / 2)
+
+    def goal_distance(self, data: mjx.Data) -> jax.Array:
+        """Returns the ball's horizontal distance to the middle of each goal line of `GOALS` (2,), m."""
+        return jnp.linalg.norm(self.ball(data)[:2] - GOALS, axis=-1)
+
+
+# -- two against a defender -------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class DefenderRewards:
+    """Weights of the reward terms.
+
+    Attributes:
+        goal: while the ball is in the goal.
+        nearness: times exp(-distance of the ball to the goal's middle / 3 m).
+    """
+
+    goal: float = 10.0
+    nearness: float = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class DefenderParams(FootballParams):
+    """Parameters of Football (2 vs 1).
+
+    Attributes:
+        defender_idle: the defender stands still.
+        rewards: weights.
+    """
+
+    contacts_per_env: int = 36
+    rows_per_env: int = 192
+    defender_idle: bool = False
+    rewards: DefenderRewards = DefenderRewards()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DefenderState:
+    """`scored`: whether the ball has been in the goal in this episode () bool."""
+
+    scored: jax.Array
+
+
+class Go1FootballDefender(Football):
+    """Football (2 vs 1).
+
+    - Scene: the field, a ball, and a third robot that defends the goal at x 12 (see `mqe_jax.npc.defend`).
+    - Observation: one-hot 2, own base info 6, mate's base info 6, ball position 3, ball velocity 3.
+    - Reward: see `DefenderRewards`; shared.
+    - End: a fall, or 20 s. Success: a goal, at any time in the episode.
+
+    Source: paper, section III and table of rewards.
+    """
+
+    name = "go1football-defender"
+    title = "Football (2 vs 1)"
+    Params: ClassVar[type[TaskParams]] = DefenderParams
+    kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi))
+    ball_spot = (5.0, -2.1)
+    colors = (0, 1, 2)
+
+    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array:
+        """Returns the defender's walk commands (1, 15)."""
+        commands = jnp.asarray(default_commands(self.params.gait))
+        if not self.params.defender_idle:
+            move = defend(
+                readings.position_w[2, :2], readings.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
+            )
+            commands = commands.at[np.array([command_index(name) for name in ("vx", "vy", "yaw_rate")])].set(move)
+        return commands[None]
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DefenderState:
+        """Returns the task's own fields of a fresh world."""
+        return DefenderState(jnp.zeros((), bool))
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout(
+            (
+                Block("one_hot", 2, ONE_HOT),
+                Block("base", 6, BASE_INFO),
+                Block("mate", 6, BASE_INFO),
+                Block("ball", 3, _POSITION),
+                Block("ball_velocity", 3, _VELOCITY),
+            )
+        )
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width)."""
+        info = readings.base_info[:2]
+        return {
+            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "ball": for_all(self.ball(state.data), 2),
+            "ball_velocity": for_all(self.ball_velocity(state.data), 2),
+        }  # fmt: skip
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        goal = self.in_goal(state.data)[0]
+        terms = {"goal": goal, "nearness": jnp.exp(-self.goal_distance(state.data)[0] / 3.0)}
+        return terms, DefenderState(state.task.scored | goal)
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: a goal in this episode."""
+        return {"success": state.task.scored}
+
+
+# -- matches ----------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class FootballMatchRewards:
+    """Weights of the reward terms; every side's own less the opponent's.
+
+    The release has no rewards for these matches; the two small terms beside the goal are ours.
+
+    Attributes:
+        goal: when the ball is in the goal that the team attacks, which ends the episode.
+        progress: per m by which the ball came closer to the middle of that goal.
+        approach: per m by which the team's robot nearest to the ball came closer to it.
+    """
+
+    goal: float = 10.0
+    progress: float = 0.3
+    approach: float = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Football1vs1Params(FootballParams):
+    """Parameters of Football (1 vs 1).
+
+    Attributes:
+        rewards: weights.
+    """
+
+    rewards: FootballMatchRewards = FootballMatchRewards()
+
+
+@dataclasses.dataclass(frozen=True)
+class Football2vs2Params(FootballParams):
+    """Parameters of Football (2 vs 2).
+
+    Attributes:
+        rewards: weights.
+    """
+
+    num_agents: int = 4
+    contacts_per_env: int = 48
+    rows_per_env: int = 256
+    rewards: FootballMatchRewards = FootballMatchRewards()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class FootballMatchState:
+    """After the last step: distances of the ball, m, for each team.
+
+    `goal`: to the middle of the goal that it attacks (2,); `robot`: to its nearest robot (2,).
+    """
+
+    goal: jax.Array
+    robot: jax.Array
+
+
+class FootballMatch(Football, Match):
+    """Base of the football matches.
+
+    - Scene: the field with the ball in its middle. Team 0 attacks the goal at x 12, team 1 that at x 2.
+    - Observation, own side first: one-hot within the team, own base info 6, mate's, opponents', ball position 3,
+      ball velocity 3.
+    - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
+    - End: a goal, a fall, or 20 s. Win: a goal.
+
+    Source: paper, section III; rewards and observations as the released system leaves them open.
+    """
+
+    symmetry: ClassVar[str] = "turn"
+    center: ClassVar[tuple[float, float]] = (7.0, 0.0)
+
+    def reset_task(
+        self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array
+    ) -> FootballMatchState:
+        """Returns the task's own fields of a fresh world."""
+        return self.distances(readings, data)
+
+    def distances(self, readings: RobotReadings, data: mjx.Data) -> FootballMatchState:
+        """Returns the ball's distances to what matters to each team, m."""
+        apart = jnp.linalg.norm(readings.position_w[:, :2] - self.ball(data)[:2], axis=-1)
+        return FootballMatchState(self.goal_distance(data), jnp.min(apart.reshape(2, -1), axis=1))
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        team = self.num_agents // 2
+        mate = (Block("mate", 6 * (team - 1), BASE_INFO),) if team > 1 else ()
+        return ObservationLayout(
+            (
+                Block("one_hot", team, ONE_HOT + " within its team"),
+                Block("base", 6, BASE_INFO),
+                *mate,
+                Block("opponents", 6 * team, BASE_INFO),
+                Block("ball", 3, _POSITION),
+                Block("ball_velocity", 3, _VELOCITY),
+            )
+        )
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (A, width), each in its agent's frame."""
+        team, side = self.num_agents // 2, self.team_of
+        both = self.views(readings.base_info).reshape(2, 2, team, 6)  # as seen by a team, of a team
+        own, opponents = both[[0, 1], [0, 1]], both[[0, 1], [1, 0]].reshape(2, -1)
+        blocks = {
+            "one_hot": jnp.tile(jnp.eye(team), (2, 1)), "base": own.reshape(-1, 6), "opponents": opponents[side],
+            "ball": self.view_points(self.ball(state.data))[side],
+            "ball_velocity": self.view_vectors(self.ball_velocity(state.data))[side],
+        }  # fmt: skip
+        if team > 1:
+            blocks["mate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
+        return blocks
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        after = self.distances(readings, state.data)
+        terms = {
+            "goal": self.versus(self.in_goal(state.data)),
+            "progress": self.versus(state.task.goal - after.goal),
+            "approach": self.versus(state.task.robot - after.robot),
+        }
+        return terms, after
+
+    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+        """A goal ends the episode."""
+        return jnp.any(self.in_goal(state.data))
+
+    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+        """The ball is in the goal that the team attacks."""
+        return self.in_goal(state.data)
+
+
+class Go1Football1vs1(FootballMatch):
+    """Football (1 vs 1), see `FootballMatch`."""
+
+    name = "go1football-1vs1"
+    title = "Football (1 vs 1)"
+    Params: ClassVar[type[TaskParams]] = Football1vs1Params
+    kick_off = ((4.0, 0.0, 0.0), (10.0, 0.0, np.pi))
+    colors = (0, 2)
+
+
+class Go1Football2vs2(FootballMatch):
+    """Football (2 vs 2), see `FootballMatch`."""
+
+    name = "go1football-2vs2"
+    title = "Football (2 vs 2)"
+    Params: ClassVar[type[TaskParams]] = Football2vs2Params
+    # The second half is the first turned about the middle: both sides see the same kick-off.
+    kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 2.0, np.pi), (10.0, -2.0, np.pi))
+    colors = (0, 1, 2, 3)
+    agents = 4

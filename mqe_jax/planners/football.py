@@ -1,0 +1,66 @@
+"""Football by hand: get behind the ball on the line to a free part of the goal, then walk through it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.planners.steering import go_to
+
+_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, places in the goal
+_GOAL = jnp.array([12.0, 0.0])  # m
+
+
+def plan_defender(obs: jax.Array) -> jax.Array:
+    """Returns both robots' actions (2, 3) from their observations (2, 20); where the defender is, they must guess."""
+    ball = obs[:, 14:16]
+    opponents = (0.6 * ball + 0.4 * _GOAL)[:, None]
+    return jax.vmap(_play)(obs[:, 2:8], obs[:, 8:14], opponents, ball, obs[:, 17:19])
+
+
+def plan_1vs1(obs: jax.Array) -> jax.Array:
+    """Returns both robots' actions (2, 3) from their observations (2, 19), each in its own frame."""
+    nobody = jnp.full((2, 6), 1e3)
+    return jax.vmap(_play)(obs[:, 1:7], nobody, obs[:, None, 7:9], obs[:, 13:15], obs[:, 16:18])
+
+
+def plan_2vs2(obs: jax.Array) -> jax.Array:
+    """Returns all robots' actions (4, 3) from their observations (4, 32), each in its own frame."""
+    opponents = obs[:, 14:26].reshape(-1, 2, 6)[..., :2]
+    return jax.vmap(_play)(obs[:, 2:8], obs[:, 8:14], opponents, obs[:, 26:28], obs[:, 29:31])
+
+
+def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Returns one robot's action (3,): the nearer of two goes for the ball, the other stays behind it.
+
+    Args:
+        own: base information (6,).
+        mate: likewise (6,).
+        opponents: positions (K, 2), m.
+        ball: position (2,), m.
+        velocity: of the ball (2,), m/s.
+    """
+    position, yaw = own[:2], own[5]
+    ball = ball + 0.3 * velocity
+    facing = jnp.array([jnp.cos(yaw), jnp.sin(yaw)])
+    offset = position - ball
+    distance = jnp.linalg.norm(offset)
+    # The aim that is freest and needs the least turning.
+    ways = _AIMS - ball
+    ways = ways / jnp.linalg.norm(ways, axis=-1, keepdims=True)
+    lefts = ways[:, ::-1] * jnp.array([-1.0, 1.0])
+    ahead, apart = ways @ (opponents - ball).T, jnp.abs(lefts @ (opponents - ball).T)
+    free = jnp.min(jnp.where(ahead > 0, jnp.minimum(apart, 0.5), 0.5), axis=1)
+    straight = ways @ (facing - offset / jnp.maximum(distance, 1.0))
+    best = jnp.argmax(2 * free + straight)
+    way, left = ways[best], lefts[best]
+    along, aside = offset @ way, offset @ left
+    lined_up = (along < -0.2) & (jnp.abs(aside) < 0.1 + 0.3 * jnp.maximum(-along - 0.3, 0.0))
+    between_legs = (distance < 0.35) & (jnp.abs(aside) < 0.25) & (facing @ way > 0.5)
+    push = position + 0.8 * way - 1.5 * aside * left
+    around = ball - 0.5 * way + jnp.where(along > -0.3, 0.45 * jnp.sign(aside), 0.0) * left
+    attack = jnp.where(lined_up | between_legs, push, around)
+    support = ball - 1.5 * way + 0.8 * jnp.sign(aside) * left
+    nearer = distance < jnp.linalg.norm(mate[:2] - ball)
+    heading = jnp.arctan2(way[1], way[0])
+    return go_to(position[None], yaw[None], jnp.where(nearer, attack, support)[None], heading)[0]

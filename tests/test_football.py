@@ -1,0 +1,381 @@
+"""Football: field, mirrored observations, rewards and endings on states made by hand, and the defender's law."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mqe_jax import robot as go1
+from mqe_jax.envs import QuadrupedEnv, State, make
+from mqe_jax.envs.reward import weigh
+from mqe_jax.npc import defend
+from mqe_jax.planners import PLANNERS
+from mqe_jax.walk_policy import default_commands
+
+NO = jnp.array(False)
+TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
+
+
+@pytest.fixture(scope="module")
+def envs() -> dict[str, Any]:
+    return {task: make(task, impl="c", control="position") for task in TASKS}
+
+
+@pytest.fixture(scope="module")
+def drawn(envs: dict[str, Any]) -> dict[str, State]:
+    """64 fresh worlds of every task."""
+    keys = jax.random.split(jax.random.PRNGKey(0), 64)
+    return {task: jax.jit(jax.vmap(env.reset))(keys) for task, env in envs.items()}
+
+
+@pytest.fixture(scope="module")
+def fresh(drawn: dict[str, State]) -> dict[str, State]:
+    """A fresh world of every task."""
+    return {task: jax.tree.map(lambda x: x[0], states) for task, states in drawn.items()}
+
+
+@pytest.fixture(scope="module")
+def duel(envs: dict[str, Any]) -> Any:
+    return envs["go1football-1vs1"]
+
+
+@pytest.fixture(scope="module")
+def duel_step(duel: Any) -> Any:
+    return jax.jit(duel.step)
+
+
+@pytest.fixture(scope="module")
+def attack(envs: dict[str, Any]) -> Any:
+    return envs["go1football-defender"]
+
+
+@pytest.fixture(scope="module")
+def attack_step(attack: Any) -> Any:
+    return jax.jit(attack.step)
+
+
+def placed(state: State, qpos: np.ndarray, qvel: np.ndarray) -> State:
+    return dataclasses.replace(state, data=state.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
+
+
+def with_ball(env: QuadrupedEnv, state: State, position: Any, velocity: Any = (0.0, 0.0, 0.0)) -> State:
+    """The state with the ball somewhere else, moving."""
+    ball, qpos, qvel = env.objects["ball"], np.array(state.data.qpos), np.array(state.data.qvel)
+    qpos[ball.qpos[:3]] = [*position, 0.1] if len(position) == 2 else position
+    qvel[ball.qvel[:3]] = velocity
+    return placed(state, qpos, qvel)
+
+
+def standing(env: QuadrupedEnv, state: State, places: Any, roll: float = 0.0) -> State:
+    """The state with all robots at x, y, yaw, standing still; the first one, instead, rolled over at yaw 0."""
+    places, index, qpos = np.asarray(places), env.robot, np.array(state.data.qpos)
+    qpos[index.base_qpos[:, :3]] = np.c_[places[:, :2], np.full(len(places), 0.31)]
+    none = np.zeros(len(places))
+    qpos[index.base_qpos[:, 3:]] = np.stack([np.cos(places[:, 2] / 2), none, none, np.sin(places[:, 2] / 2)], -1)
+    if roll:
+        qpos[index.base_qpos[0, 3:]] = [np.cos(roll / 2), np.sin(roll / 2), 0, 0]
+    qpos[index.joint_qpos] = go1.DEFAULT_JOINTS
+    return placed(state, qpos, np.zeros(env.compiled.model.nv, np.float32))
+
+
+def seen(env: QuadrupedEnv, state: State) -> np.ndarray:
+    """What the agents of a state made by hand observe."""
+    return np.asarray(jax.jit(lambda s: env.observation_layout.pack(env.observe(s, env.read(s.data))))(state))
+
+
+def rest(env: QuadrupedEnv) -> jax.Array:
+    return jnp.zeros((env.num_agents, env.action_size))
+
+
+# -- the field --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str) -> None:
+    env = envs[task]
+    states = drawn[task]
+    robots = jax.jit(jax.vmap(env.read))(states.data)
+    listed = {
+        "go1football-defender": ([(4, -2), (4, 2), (10, 0)], [0, 0, 1], (5, -2.1)),
+        "go1football-1vs1": ([(4, 0), (10, 0)], [0, 1], (7, 0)),
+        "go1football-2vs2": ([(4, -2), (4, 2), (10, 2), (10, -2)], [0, 0, 1, 1], (7, 0)),
+    }
+    places, turned, ball = listed[task]
+    away = np.abs(np.asarray(robots.position_w)[..., :2] - np.array(places))
+    assert away.max() <= 0.1 + 1e-5 and away.max() > 0.09
+    np.testing.assert_allclose(robots.position_w[..., 2], 0.42, atol=1e-6)
+    np.testing.assert_allclose(jnp.cos(robots.euler[..., 2]), np.tile(1 - 2 * np.array(turned), (64, 1)), atol=1e-5)
+    np.testing.assert_allclose(jax.vmap(env.ball)(states.data), np.tile([*ball, 0.1], (64, 1)), atol=1e-6)
+    assert env.max_steps == 1000
+
+
+def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
+    """Rays at the height of the ball, from the field's middle outwards, end where the listed walls are."""
+    model, data = duel.compiled.model, mujoco.MjData(duel.compiled.model)
+    data.qpos[duel.robot.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
+    data.qpos[duel.robot.base_qpos[:, 0]] = [3.0, 4.0]
+    data.qpos[duel.objects["ball"].qpos[:3]] = [11.0, -4.0, 0.1]
+    mujoco.mj_forward(model, data)
+
+    def reach(x: float, y: float, direction: tuple[float, float], z: float = 0.1) -> float:
+        geom = np.zeros(1, np.int32)
+        return mujoco.mj_ray(model, data, np.array([x, y, z]), np.array([*direction, 0.0]), None, 1, -1, geom)
+
+    for y in (-0.95, 0.0, 0.95):  # through the mouths
+        assert reach(7.0, y, (1, 0)) == pytest.approx(13.0 - 7.0, abs=1e-3)
+        assert reach(7.0, y, (-1, 0)) == pytest.approx(7.0, abs=1e-3)
+    for y in (-1.05, 1.05, -3.0):  # beside them, up to the walls' height
+        for z in (0.1, 0.99):
+            assert reach(7.0, y, (1, 0), z) == pytest.approx(12.0 - 7.0, abs=1e-3)
+            assert reach(7.0, y, (-1, 0), z) == pytest.approx(7.0 - 2.0, abs=1e-3)
+    assert reach(12.5, 0.0, (0, 1)) == pytest.approx(1.0, abs=1e-3)  # the goal's own side
+    assert reach(7.0, 0.0, (0, 1)) == reach(7.0, 0.0, (0, -1)) == pytest.approx(4.5, abs=1e-3)
+    np.testing.assert_allclose(model.geom_size[duel.objects["ball"].geom, 0], 0.1)
+    assert model.body_mass[duel.objects["ball"].body] == pytest.approx(0.318)
+
+
+def test_the_robots_have_their_teams_colours(envs: dict[str, Any]) -> None:
+    assert [envs[task].compiled.scene.colors for task in TASKS] == [(0, 1, 2), (0, 2), (0, 1, 2, 3)]
+
+
+@pytest.mark.parametrize(("y", "inside"), [(0.0, True), (0.7, True), (-1.3, False)])
+def test_a_shot_goes_in_or_bounces_off(duel: Any, duel_step: Any, fresh: Any, y: float, inside: bool) -> None:
+    state = standing(duel, fresh[duel.name], [(4, 4, 0), (10, -4, np.pi)])
+    state = with_ball(duel, state, (11.0, y), (3.0, 0.0, 0.0))
+    scored = False
+    for _ in range(40):
+        state = duel_step(state, rest(duel))
+        x = float(duel.ball(state.data)[0])
+        scored |= bool(duel.wins(state, duel.read(state.data))[0])
+        assert inside or x < 11.95  # the wall is at 12, the ball's radius 0.1
+        if inside and x > 12.0:
+            assert state.terminated
+    assert scored == inside
+
+
+# -- observations -----------------------------------------------------------------------------------------------------
+
+PLACES = [(4.2, 0.7, 0.3), (9.1, -1.2, 2.8), (8.4, 2.2, -2.0), (10.6, 0.4, 3.0)]
+
+
+def turned(places: Any) -> np.ndarray:
+    """Poses x, y, yaw after a half turn about the field's middle."""
+    return np.array([(14 - x, -y, yaw + np.pi) for x, y, yaw in places])
+
+
+@pytest.mark.parametrize("task", TASKS[1:])
+def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], fresh: Any, task: str) -> None:
+    env = envs[task]
+    count, half = env.num_agents, env.num_agents // 2
+    places = PLACES[:count]
+    state = fresh[env.name]
+    here = with_ball(env, standing(env, state, places), (6.3, 1.1, 0.4), (0.8, -0.3, 0.1))
+    there = standing(env, state, np.roll(turned(places), half, axis=0))
+    there = with_ball(env, there, (14 - 6.3, -1.1, 0.4), (-0.8, 0.3, 0.1))
+    ours, theirs = seen(env, here), seen(env, there)
+    np.testing.assert_allclose(theirs, np.roll(ours, half, axis=0), atol=1e-5)
+    assert np.abs(ours[0] - ours[half]).max() > 0.5  # and the two sides do not see the same here
+
+
+def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
+    env = envs["go1football-2vs2"]
+    state = with_ball(env, standing(env, fresh[env.name], PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
+    obs = seen(env, state)
+    info = [[x, y, 0.31, 0, 0, yaw] for x, y, yaw in PLACES]
+    ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
+    np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *info[2], *info[3], *ball], atol=1e-5)
+    np.testing.assert_allclose(obs[1], [0, 1, *info[1], *info[0], *info[2], *info[3], *ball], atol=1e-5)
+    other = [[x, y, 0.31, 0, 0, (yaw + np.pi) % (2 * np.pi) - np.pi] for x, y, yaw in turned(PLACES)]
+    ball = [7.7, -1.1, 0.1, -0.8, 0.3, 0.1]
+    np.testing.assert_allclose(obs[3], [0, 1, *other[3], *other[2], *other[0], *other[1], *ball], atol=1e-5)
+
+    env = envs["go1football-1vs1"]
+    state = with_ball(env, standing(env, fresh[env.name], PLACES[:2]), (6.3, 1.1))
+    obs = seen(env, state)
+    np.testing.assert_allclose(obs[1], [1, *other[1], *other[0], 7.7, -1.1, 0.1, 0, 0, 0], atol=1e-5)
+
+    env = envs["go1football-defender"]
+    state = with_ball(env, standing(env, fresh[env.name], PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
+    obs = seen(env, state)
+    ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
+    np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *ball], atol=1e-5)
+    np.testing.assert_allclose(obs[1], [0, 1, *info[1], *info[0], *ball], atol=1e-5)
+
+
+# -- goals, rewards, endings ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ball", "goals"),
+    [
+        ((12.01, 0.0), (1, 0)), ((12.01, 0.99), (1, 0)), ((12.9, -0.9), (1, 0)), ((11.99, 0.0), (0, 0)),
+        ((12.01, 1.01), (0, 0)), ((12.01, -1.01), (0, 0)), ((1.99, 0.0), (0, 1)), ((1.99, -0.99), (0, 1)),
+        ((2.01, 0.0), (0, 0)), ((1.99, 1.01), (0, 0)), ((7.0, 0.0), (0, 0)),
+    ],
+)  # fmt: skip
+def test_goals_at_both_ends(duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
+    state = with_ball(duel, fresh[duel.name], ball)
+    robots = duel.read(state.data)
+    np.testing.assert_array_equal(duel.wins(state, robots), np.array(goals, bool))
+    assert bool(duel.ending(state, robots)) == any(goals)
+    outcome = duel.outcome(state, robots, NO)
+    assert [float(outcome[f"team{team}/win"]) for team in (0, 1)] == list(goals)
+    assert [float(outcome[f"team{team}/loss"]) for team in (1, 0)] == list(goals)
+    assert float(outcome["team0/draw"]) == float(outcome["team1/draw"]) == 1 - sum(goals)
+    assert float(outcome["success"]) == goals[0]
+
+
+def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh: Any) -> None:
+    """Before: the ball in the middle, 5 m from both goals. After: as each comment says."""
+    env = envs["go1football-2vs2"]
+    state = fresh[env.name]
+    before = with_ball(env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0))
+    task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.gates)
+    np.testing.assert_allclose(task.goal, [5, 5], atol=1e-5)
+    np.testing.assert_allclose(task.robot, [2, 3], atol=1e-5)
+    # The ball at (8, 0): 4 m from team 0's goal (+1), 6 m from team 1's (-1): 1 - (-1) = 2.
+    # Team 0's nearest robot, now at (6.5, 0), is 1.5 m away (+0.5), team 1's 2 m (+1): 0.5 - 1 = -0.5.
+    after = with_ball(env, standing(env, state, [(4, -2, 0), (6.5, 0, 0), (10, 0, 0), (10, -4, 0)]), (8.0, 0.0))
+    after = dataclasses.replace(after, task=task)
+    terms, moved = env.rewards(after, env.read(after.data), NO)
+    reward, _ = weigh(terms, env.params.rewards, 4)
+    np.testing.assert_allclose(reward, np.array([1, 1, -1, -1]) * (0.3 * 2 - 0.1 * 0.5), atol=1e-4)
+    np.testing.assert_allclose(moved.goal, [4, 6], atol=1e-5)
+    np.testing.assert_allclose(moved.robot, [1.5, 2], atol=1e-5)
+    # A goal of team 1: the ball at (1.9, 0), 10.1 m from the far goal (-6.1), 0.1 m from the near one (+5.9).
+    # Nearest robots: team 0's (4, -2) at hypot(2.1, 2) = 2.9 m (-1.4), team 1's at 8.1 m (-6.1).
+    goal = dataclasses.replace(with_ball(env, after, (1.9, 0.0)), task=moved)
+    reward, _ = weigh(env.rewards(goal, env.read(goal.data), NO)[0], env.params.rewards, 4)
+    expected = -10 + 0.3 * (-6.1 - 5.9) + 0.1 * (-1.4 + 6.1)
+    np.testing.assert_allclose(reward, np.array([1, 1, -1, -1]) * expected, atol=1e-4)
+    assert abs(expected + 10) < 5  # the goal is most of it
+
+
+def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
+    """A goal, a fall and the time limit end a match; play does not."""
+    places = [(4, 0, 0), (10, 0, np.pi)]
+    state = standing(duel, fresh[duel.name], places)
+    play = duel_step(state, rest(duel))
+    assert not play.terminated and not play.truncated
+    late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), rest(duel))
+    assert late.truncated and not late.terminated and float(late.metrics["team0/draw"]) == 1
+    fallen = duel_step(standing(duel, state, places, roll=1.0), rest(duel))
+    assert fallen.terminated and float(fallen.metrics["team0/draw"]) == 1
+    for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
+        goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), rest(duel))
+        assert goal.terminated and float(goal.metrics["team0/win"]) == (sign == 1)
+        assert float(goal.metrics["reward/goal"]) == 10 * sign
+        np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
+
+
+def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -> None:
+    state = standing(attack, fresh[attack.name], [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+    robots = attack.read(state.data)
+    for ball, expected in (((9.0, 0.0), 3 * np.exp(-1)), ((12.3, 0.4), 10 + 3 * np.exp(-0.5 / 3))):
+        reward, _ = weigh(attack.rewards(with_ball(attack, state, ball), robots, NO)[0], attack.params.rewards, 2)
+        np.testing.assert_allclose(reward, [expected] * 2, atol=1e-4)
+    # The agents' own goal is none.
+    own = with_ball(attack, state, (1.9, 0.0))
+    assert float(attack.rewards(own, robots, NO)[0]["goal"]) == 0
+    # A goal counts until the end of the episode, also when the ball comes out again.
+    scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), rest(attack))
+    assert float(scored.metrics["success"]) == 1 and not scored.terminated
+    out = attack_step(with_ball(attack, scored, (11.0, 0.5)), rest(attack))
+    assert float(out.metrics["success"]) == 1 and float(out.metrics["reward/goal"]) == 0
+    late = attack_step(dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)), rest(attack))
+    assert late.truncated and not late.terminated and float(late.metrics["success"]) == 0
+    fallen = standing(attack, state, [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)], roll=1.0)
+    assert attack_step(fallen, rest(attack)).terminated
+
+
+# -- the defender -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "ball", "move"),
+    [
+        # Where it should be: 3 m before the goal, 0.6 of the way to a ball 5 m away; it faces away from the goal.
+        ((9.0, 0.0), np.pi, (7.0, 0.0), (0.0, 0.0, 0.0)),
+        # 0.3 m too near the goal: forward, which is away from it. 2 m too near: as fast as it may.
+        ((9.3, 0.0), np.pi, (7.0, 0.0), (0.3, 0.0, 0.0)),
+        ((11.0, 0.0), np.pi, (7.0, 0.0), (0.5, 0.0, 0.0)),
+        # The ball is behind it, 1 m from the goal: back to 0.6 m.
+        ((9.0, 0.0), np.pi, (11.0, 0.0), (-0.5, 0.0, 0.0)),
+        # Facing +x of the world it must turn, the short way and at full rate.
+        ((9.0, 0.0), 0.1, (7.0, 0.0), (0.0, 0.0, 1.0)),
+        ((9.0, 0.0), -0.1, (7.0, 0.0), (0.0, 0.0, -1.0)),
+        # 0.15 rad off: half of full rate, also across the cut at pi.
+        ((9.0, 0.0), np.pi - 0.15, (7.0, 0.0), (0.0, 0.0, 0.5)),
+        ((9.0, 0.0), -np.pi + 0.15, (7.0, 0.0), (0.0, 0.0, -0.5)),
+    ],
+)  # fmt: skip
+def test_the_law_of_the_defender_by_hand(position: Any, yaw: float, ball: Any, move: Any) -> None:
+    law = defend(jnp.array(position), jnp.array(yaw), jnp.array(ball), jnp.array([12.0, 0.0]))
+    np.testing.assert_allclose(law, move, atol=1e-5)
+
+
+def test_the_defender_steps_sideways_towards_the_line() -> None:
+    """Ball straight ahead, the defender 0.2 m to the right of the line as it looks (y +0.2): it goes left, to -y."""
+    own = np.hypot(3.0, 0.2)
+    facing = np.arctan2(0.2, -3.0)
+    law = defend(jnp.array([9.0, 0.2]), jnp.array(facing), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
+    np.testing.assert_allclose(law, [3.0 - own, 0.2, 0.0], atol=1e-5)
+    far = defend(jnp.array([9.0, -1.0]), jnp.array(np.pi), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
+    assert float(far[1]) == pytest.approx(-0.5)
+
+
+def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, attack_step: Any, fresh: Any) -> None:
+    """It walks there by the walk policy and follows a ball to the other side."""
+    start = standing(attack, fresh[attack.name], [(4, -4, 0), (4, 4, 0), (10, 0, np.pi)])
+    goal, state = np.array([12.0, 0.0]), start
+    for ball in ((8.0, -2.0), (8.0, 2.0)):
+        state = with_ball(attack, state, ball)
+        for _ in range(250):
+            state = attack_step(state, rest(attack))
+        assert not np.asarray(state.terminated)
+        target = goal + 0.6 * (np.array(ball) - goal)
+        place = np.asarray(attack.read(state.data).position_w)[2, :2]
+        assert np.linalg.norm(place - target) < 0.35
+
+
+def test_an_idle_defender_is_told_to_stand(attack: Any, fresh: Any) -> None:
+    state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
+    idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
+    robots = attack.read(state.data)
+    rest = default_commands()
+    np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
+    told = np.asarray(attack.npc_commands(state, robots))[0]
+    # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
+    np.testing.assert_allclose(told[:2], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(told[3:], rest[3:])
+
+
+# -- the whole --------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_numbers_of_robots_are_named() -> None:
+    with pytest.raises(ValueError, match="num_agents: 4; go1football-1vs1 is for 2 robots"):
+        make("go1football-1vs1", impl="c", num_agents=4)
+
+
+def test_the_planner_dribbles_to_the_goal() -> None:
+    """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --planner scripted` measures many."""
+    worlds = make("go1football-1vs1", impl="c", num_envs=4)
+    plan = jax.vmap(PLANNERS[worlds.name])
+
+    def step(state: State, _: None) -> tuple[State, jax.Array]:
+        state = jax.vmap(worlds.step)(state, plan(state.obs).at[:, 1].set(0.0))
+        return state, jax.vmap(worlds.object_pose, (0, None))(state.data, "ball")[:, 0]
+
+    @jax.jit
+    def play(key: jax.Array) -> jax.Array:
+        return jax.lax.scan(step, jax.vmap(worlds.reset)(jax.random.split(key, 4)), None, 400)[1]
+
+    furthest = np.asarray(play(jax.random.PRNGKey(0))).max(0)
+    assert np.median(furthest) > 11.0  # from 7.0, past the opponent at 10.0
