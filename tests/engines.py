@@ -1,0 +1,125 @@
+"""The same worlds on two engines, and worlds full of random actions on Warp.
+
+`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp`, or `... crowd FOLDER warp`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+import sys
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs import TASKS, State, VectorEnv, make
+from mqe_jax.physics import STATE_FIELDS
+
+SETTLE, STEPS = 40, 20  # environment steps: until the robots stand, and compared
+
+
+def settled(task: str, worlds: int) -> tuple[Any, State]:
+    """Worlds of a task on MuJoCo's C engine in which the robots stand after their drop."""
+    env: Any = make(task, impl="c", control="position", episode_length=1000.0, num_envs=worlds)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
+    states = rolled(env, states, jnp.zeros((SETTLE, worlds, env.num_agents, 12)))[0]
+    return env, states
+
+
+def rolled(env: Any, states: State, actions: jax.Array) -> tuple[State, jax.Array]:
+    """Steps worlds through actions (T, N, A, D), without auto-reset; returns the last states and qpos (T, N, nq)."""
+
+    def advance(states: State, action: jax.Array) -> tuple[State, jax.Array]:
+        states = jax.vmap(env.step)(states, action)
+        return states, states.data.qpos
+
+    return jax.jit(lambda s, a: jax.lax.scan(advance, s, a))(states, actions)
+
+
+def actions_of(env: Any, worlds: int) -> jax.Array:
+    """Joint targets about the default (T, N, A, 12), the same for every engine."""
+    return 0.5 * jax.random.normal(jax.random.PRNGKey(1), (STEPS, worlds, env.num_agents, 12))
+
+
+def record(task: str, worlds: int = 8) -> dict[str, np.ndarray]:
+    """What the C engine makes of standing worlds under those actions: their states at first, and qpos (T, N, nq)."""
+    env, states = settled(task, worlds)
+    physics = {f"data/{name}": np.asarray(getattr(states.data, name)) for name in STATE_FIELDS}
+    others = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(without_data(states)))}
+    return {**physics, **others, "qpos": np.asarray(rolled(env, states, actions_of(env, worlds))[1])}
+
+
+def without_data(states: State) -> dict[str, Any]:
+    """The fields of states that are not the physics engine's."""
+    return {field.name: getattr(states, field.name) for field in dataclasses.fields(State) if field.name != "data"}
+
+
+def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
+    """How far an engine's trajectory is from the recorded one of the C engine, from the same states and actions.
+
+    Returns:
+        robots and objects: largest difference of any position (m) or quaternion or joint angle (rad) after one step
+        and, as median and maximum over the worlds, after 20.
+    """
+    worlds = len(reference["data/qpos"])
+    env: Any = make(task, impl=engine, control="position", episode_length=1000.0, num_envs=worlds)
+    fresh = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
+    data = fresh.data.replace(**{name: jnp.asarray(reference[f"data/{name}"]) for name in STATE_FIELDS})
+    parts = without_data(fresh)
+    leaves = [jnp.asarray(reference[f"leaf/{i}"]) for i in range(len(jax.tree.leaves(parts)))]
+    states = dataclasses.replace(fresh, data=data, **jax.tree.unflatten(jax.tree.structure(parts), leaves))
+    apart = np.abs(np.asarray(rolled(env, states, actions_of(env, worlds))[1]) - reference["qpos"])
+    robots = np.concatenate([env.robot.base_qpos, env.robot.joint_qpos], axis=1).ravel()
+    rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
+    figures = {}
+    for name, columns in (("robots", robots), ("objects", rest)):
+        if len(columns):
+            worst = apart[..., columns].max(-1)
+            figures[f"{name}_1"] = float(worst[0].max())
+            figures[f"{name}_20"] = float(np.median(worst[-1]))
+            figures[f"{name}_20_max"] = float(worst[-1].max())
+    return figures
+
+
+def crowd(task: str, worlds: int = 4096, steps: int = 1000) -> dict[str, Any]:
+    """Random actions on Warp: steps with an overflow, diverged worlds, and whether all stayed finite."""
+    worlds_env = VectorEnv(make(task, impl="warp", num_envs=worlds), worlds)
+    env: Any = worlds_env.env
+
+    def advance(state: State, key: jax.Array) -> tuple[State, Any]:
+        action = jax.random.uniform(key, (worlds, env.num_agents, env.action_size), minval=-1.0)
+        state = worlds_env.step(state, action)
+        finite = jnp.all(jnp.isfinite(state.obs)) & jnp.all(jnp.isfinite(state.reward))
+        return state, (env.physics.overflow(state.data), jnp.sum(state.metrics["diverged"]), finite)
+
+    run = jax.jit(lambda s, k: jax.lax.scan(advance, s, k))
+    state = jax.jit(worlds_env.reset)(jax.random.PRNGKey(0))
+    overflow, diverged, finite = run(state, jax.random.split(jax.random.PRNGKey(1), steps))[1]
+    return {
+        "worlds": worlds, "steps": steps, "overflows": int(np.sum(np.asarray(overflow))),
+        "diverged": int(np.sum(np.asarray(diverged))), "finite": bool(np.all(np.asarray(finite))),
+    }  # fmt: skip
+
+
+def main(what: str, folder: str, engine: str, *tasks: str) -> None:
+    """Prints one JSON object a task. `record FOLDER c`, then `agree FOLDER ENGINE`; `crowd FOLDER warp`."""
+    for task in tasks or TASKS:
+        began, file = time.perf_counter(), pathlib.Path(folder) / f"{task}.npz"
+        figures: dict[str, Any] = {}
+        if what == "record":
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(file, **record(task))  # pyright: ignore[reportArgumentType]
+        elif what == "agree":
+            figures = disagreement(task, engine, np.load(file))
+        else:
+            figures = crowd(task)
+        seconds = round(time.perf_counter() - began)
+        print(json.dumps({"task": task, "engine": engine, **figures, "s": seconds}), flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
