@@ -30,21 +30,17 @@ def plan_sheep_hard(obs: jax.Array) -> jax.Array:
     near rather than far, and so brings them up to the others; the herd's own pull keeps it together.
     """
     position, yaw, gate, sheep = obs[:, 2:4], obs[:, 7], obs[0, 14:16], obs[0, 16:].reshape(9, 2)
-    way = sheep - gate - jnp.array([0.8, 0.0])
-    off = position[:, None] - sheep[None]
-    near = jnp.linalg.norm(off, axis=-1)
-    own_side = jnp.tanh(_SIDE[:, None] * (sheep[:, 1] - gate[1]))
     through = sheep[:, 0] > gate[0]
-    care = 5.0 * jnp.linalg.norm(way, axis=-1) - 1.5 * near + 3.5 * own_side + 2.0 * jnp.minimum(-off[..., 0], 0.0)
+    way = sheep - gate - jnp.array([0.8, 0.0])
+    apart = position[:, None] - sheep[None]
+    near = jnp.linalg.norm(apart, axis=-1)
+    own_side = _SIDE[:, None] * (sheep[:, 1] - gate[1])
+    care = 5.0 * jnp.linalg.norm(way, axis=-1) + 3.5 * own_side - 1.5 * near
     share = jax.nn.softmax(jnp.where(through, -1e3, care), axis=-1)
     back = share @ way
-    back = back / jnp.maximum(jnp.linalg.norm(back, axis=-1, keepdims=True), 1e-3)
+    back /= jnp.maximum(jnp.linalg.norm(back, axis=-1, keepdims=True), 1e-3)
     goal = share @ sheep + 0.8 * back + _SIDE[:, None] * jnp.array([0.0, 0.2])
-    goal = jnp.minimum(goal, jnp.stack([gate[0] - 0.45, 2.6]))
-    goal = jnp.maximum(goal, jnp.array([0.0, -2.6]))
-    # Around sheep, and not into one that has nowhere to go.
-    goal += jnp.sum(jnp.maximum(0.75 - near, 0.0)[..., None] * 0.8 * off / near[..., None], axis=1)
-    action = go_to(position, yaw, goal)
-    blocked = jnp.any((near < 0.55) & (off[..., 0] < 0.2), axis=-1)
-    action = jnp.where(blocked[:, None], action * jnp.array([0.15, 0.3, 1.0]), action)
-    return jnp.where(jnp.all(through), 0.0, action)
+    goal = jnp.clip(goal, jnp.array([0.0, -2.6]), jnp.stack([gate[0] - 0.45, 2.6]))
+    # Around sheep that are close.
+    goal += jnp.sum(0.8 * jnp.maximum(0.75 / near - 1.0, 0.0)[..., None] * apart, axis=1)
+    return jnp.where(jnp.all(through), 0.0, go_to(position, yaw, goal))
