@@ -9,6 +9,8 @@ EXTRAS ?= render,log,dev
 # The first Python that is new enough; override with `make PYTHON=/path/to/python3`.
 PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 python,\
   $(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
+# How many test files run side by side.
+TEST_JOBS ?= 2
 SOURCES := $(wildcard mqe_jax tests examples)
 
 .PHONY: help install demo test check fmt clean system
@@ -35,7 +37,7 @@ demo: $(STAMP) system ## Train Narrow Gate on the CPU, print before and after, l
 	JAX_PLATFORMS=cpu $(BIN)/mqe demo
 
 test: $(STAMP) ## Run the tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile
 
 check: $(STAMP) ## Lint, formatting, types
 	$(BIN)/ruff check $(SOURCES)
