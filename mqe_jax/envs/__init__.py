@@ -9,7 +9,8 @@ from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.envs.base import QuadrupedEnv, Randomization, State, TaskParams
 from mqe_jax.envs.bridge import Go1Bridge
 from mqe_jax.envs.door import Go1RevolvingDoor
-from mqe_jax.envs.football import Go1Football1vs1, Go1Football2vs2, Go1FootballDefender
+from mqe_jax.envs.football import Go1Football1vs1, Go1Football2vs2
+from mqe_jax.envs.football_defender import Go1FootballDefender
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.overrides import override
 from mqe_jax.envs.plane import Go1Plane

@@ -41,6 +41,7 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
         velocity: of the ball (2,), m/s.
     """
     position, yaw = own[:2], own[5]
+    near = jnp.linalg.norm(position - ball) < 0.35
     ball = ball + 0.3 * velocity
     facing = jnp.array([jnp.cos(yaw), jnp.sin(yaw)])
     offset = position - ball
@@ -56,11 +57,14 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
     way, left = ways[best], lefts[best]
     along, aside = offset @ way, offset @ left
     lined_up = (along < -0.2) & (jnp.abs(aside) < 0.1 + 0.3 * jnp.maximum(-along - 0.3, 0.0))
-    between_legs = (distance < 0.35) & (jnp.abs(aside) < 0.25) & (facing @ way > 0.5)
+    between_legs = near & (jnp.abs(aside) < 0.25) & (facing @ way > 0.5)
     push = position + 0.8 * way - 1.5 * aside * left
-    around = ball - 0.5 * way + jnp.where(along > -0.3, 0.45 * jnp.sign(aside), 0.0) * left
-    attack = jnp.where(lined_up | between_legs, push, around)
-    support = ball - 1.5 * way + 0.8 * jnp.sign(aside) * left
+    behind = ball - 0.5 * way
+    # From before the ball: first to the side, then back.
+    side = jnp.sign(aside) * left
+    around = jnp.where(jnp.abs(aside) < 0.3, position + 0.6 * side, behind + 0.45 * side)
+    attack = jnp.where(lined_up | between_legs, push, jnp.where(along > -0.3, around, behind))
+    support = ball - 1.5 * way + 0.8 * side
     nearer = distance < jnp.linalg.norm(mate[:2] - ball)
     heading = jnp.arctan2(way[1], way[0])
     return go_to(position[None], yaw[None], jnp.where(nearer, attack, support)[None], heading)[0]

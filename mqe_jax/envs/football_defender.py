@@ -1,0 +1,117 @@
+"""go1football-defender, the paper's Football (2 vs 1): two robots against one that defends its goal by a rule."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
+from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.npc import defend
+from mqe_jax.robot import RobotReadings
+from mqe_jax.walk_policy import command_index, default_commands
+
+
+@dataclasses.dataclass(frozen=True)
+class DefenderRewards:
+    """Weights of the reward terms.
+
+    Attributes:
+        goal: while the ball is in the goal.
+        nearness: times exp(-distance of the ball to the goal's middle / 3 m).
+    """
+
+    goal: float = 10.0
+    nearness: float = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class DefenderParams(FootballParams):
+    """Parameters of Football (2 vs 1).
+
+    Attributes:
+        defender_idle: the defender stands still.
+        rewards: weights.
+    """
+
+    contacts_per_env: int = 36
+    rows_per_env: int = 192
+    defender_idle: bool = False
+    rewards: DefenderRewards = DefenderRewards()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DefenderState:
+    """`scored`: whether the ball has been in the goal in this episode () bool."""
+
+    scored: jax.Array
+
+
+class Go1FootballDefender(Football):
+    """Football (2 vs 1).
+
+    - Scene: the field, a ball, and a third robot that defends the goal at x 12 (see `mqe_jax.npc.defend`).
+    - Observation: one-hot 2, own base info 6, mate's base info 6, ball position 3, ball velocity 3.
+    - Reward: see `DefenderRewards`; shared.
+    - End: a fall, or 20 s. Success: a goal, at any time in the episode.
+
+    Source: paper, section III and table of rewards.
+    """
+
+    name = "go1football-defender"
+    title = "Football (2 vs 1)"
+    Params: ClassVar[type[TaskParams]] = DefenderParams
+    kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi))
+    ball_spot = (5.0, -2.1)
+    colors = (0, 1, 2)
+
+    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array:
+        """Returns the defender's walk commands (1, 15)."""
+        commands = jnp.asarray(default_commands(self.params.gait))
+        if not self.params.defender_idle:
+            move = defend(
+                readings.position_w[2, :2], readings.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
+            )
+            commands = commands.at[np.array([command_index(name) for name in ("vx", "vy", "yaw_rate")])].set(move)
+        return commands[None]
+
+    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DefenderState:
+        """Returns the task's own fields of a fresh world."""
+        return DefenderState(jnp.zeros((), bool))
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout(
+            (
+                Block("one_hot", 2, ONE_HOT),
+                Block("base", 6, BASE_INFO),
+                Block("mate", 6, BASE_INFO),
+                *BALL_BLOCKS,
+            )
+        )
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width)."""
+        info = readings.base_info[:2]
+        return {
+            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "ball": for_all(self.ball(state.data), 2),
+            "ball_velocity": for_all(self.ball_velocity(state.data), 2),
+        }  # fmt: skip
+
+    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the reward terms and the task's fields after the step."""
+        goal = self.in_goal(state.data)[0]
+        terms = {"goal": goal, "nearness": jnp.exp(-self.goal_distance(state.data)[0] / 3.0)}
+        return terms, DefenderState(state.task.scored | goal)
+
+    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: a goal in this episode."""
+        return {"success": state.task.scored}
