@@ -44,6 +44,21 @@ TASKS: dict[str, type[QuadrupedEnv]] = {
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
 
+def register_task(task: type[QuadrupedEnv]) -> type[QuadrupedEnv]:
+    """Adds a task class under its `name`, so that `make` and the command line know it; use as a decorator.
+
+    Raises:
+        ValueError: if the class has no name, or another task has it.
+    """
+    if not task.name:
+        raise ValueError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
+    known = TASKS.get(task.name)
+    if known is not None and (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
+        raise ValueError(f"task {task.__name__}: the id {task.name!r} is taken by {known.__name__}")
+    TASKS[task.name] = task
+    return task
+
+
 def tasks() -> tuple[str, ...]:
     """Returns the ids of all tasks."""
     return tuple(TASKS)
@@ -74,5 +89,6 @@ def make(
 
 
 __all__ = [
-    "TASKS", "QuadrupedEnv", "Randomization", "State", "TaskParams", "VectorEnv", "make", "override", "tasks",
+    "TASKS", "QuadrupedEnv", "Randomization", "State", "TaskParams", "VectorEnv", "make", "override", "register_task",
+    "tasks",
 ]  # fmt: skip
