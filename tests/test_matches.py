@@ -231,16 +231,16 @@ def test_the_ring_carries_robots_and_its_platform_is_as_large_as_listed() -> Non
 def test_bridge_rewards_result_and_end() -> None:
     env = env_of("go1bridge")
     facing = [[0, 0, 0], [0, 0, PI]]
-    apart = placed(env, [[3.0, 0, 1.32], [7.0, 0, 1.32]], facing)
+    apart = placed(env, [[3.1, 0, 1.32], [6.9, 0, 1.32]], facing)
     np.testing.assert_allclose(terms_of(env, apart)[1], [0, 0])
     assert result(env, apart) == (0, 0) and not stepped(env, apart).terminated
-    across = placed(env, [[6.5, 0.3, 1.32], [7.5, 0, 1.32]], facing)
+    across = placed(env, [[7.1, 0.9, 1.32], [7.8, 0, 1.32]], facing)
     np.testing.assert_allclose(terms_of(env, across)[1], [1, -1])
     assert result(env, across) == (1, 0) and not stepped(env, across).terminated
-    swapped = placed(env, [[7.0, 0.3, 1.32], [3.0, 0, 1.32]], facing)
+    swapped = placed(env, [[7.1, 0.3, 1.32], [2.9, 0, 1.32]], facing)
     np.testing.assert_allclose(terms_of(env, swapped)[1], [0, 0])
     assert result(env, swapped) == (0, 0)
-    off = placed(env, [[6.5, 0.3, 1.32], [5.0, 0.6, 0.45]], facing)
+    off = placed(env, [[7.1, 0.3, 1.32], [5.0, 0.6, 0.45]], facing)
     np.testing.assert_allclose(terms_of(env, off)[1], [11, -11])
     assert result(env, off) == (1, 0) and stepped(env, off).terminated
     both = placed(env, [[5.0, -0.6, 0.4], [5.0, 0.6, 0.45]], facing)
@@ -250,6 +250,9 @@ def test_bridge_rewards_result_and_end() -> None:
 
 def test_the_bridge_carries_a_robot_and_its_side_does_not() -> None:
     env = env_of("go1bridge")
+    model = env.compiled.model
+    np.testing.assert_allclose(2 * model.geom(env.objects["platform0"].geom).size, [1.3, 2.5, 1.02])
+    np.testing.assert_allclose(2 * model.geom(env.objects["deck"].geom).size[:2], [4.0, 0.7])  # from 3.0 to 7.0
     state = placed(env, [[5.0, 0.0, 1.34], [5.6, 0.75, 1.34]])
     for _ in range(40):
         state = stepped(env, state)
@@ -269,7 +272,7 @@ def test_robots_start_as_listed(task: str, colors: tuple[int, int]) -> None:
         "go1tug": [[1.6, -2.5, 0.34, PI / 2], [1.6, 2.5, 0.34, -PI / 2]],
         "go1revolvingdoor": [[0.5, -1, 0.42, 0], [0.5, 1, 0.42, 0]],
         "go1wrestling": [[3.1, -1, 0.74, PI / 2], [3.1, 1, 0.74, -PI / 2]],
-        "go1bridge": [[2.0, 0, 1.4, 0], [7.5, 0, 1.4, PI]],
+        "go1bridge": [[2.5, 0, 1.4, 0], [7.5, 0, 1.4, PI]],
     }[task]
     spread = [1.0, 0, 0, 0] if task == "go1tug" else [0.1, 0.1, 0, 0]
     assert np.all(np.abs(spawn - mean) <= np.array(spread) + 1e-5)

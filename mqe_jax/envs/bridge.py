@@ -40,19 +40,20 @@ class BridgeParams(TaskParams):
         top: height of platforms and bridge, m.
         bridge_width: m.
         bridge_thickness: m.
-        spawn_x: of the robots, m.
+        spawn_x: of the robots, m. The released system starts the first at 2.0, with its hind feet on the platform's
+            edge; here both sides start alike.
         off_height: a trunk below is off the bridge, m.
         rewards: weights.
     """
 
     episode_length: float = 20.0
     spawn_height: float = 1.4
-    platform: tuple[float, float] = (2.5, 1.3)
+    platform: tuple[float, float] = (1.3, 2.5)
     platform_x: tuple[float, float] = (2.35, 7.65)
     top: float = 1.02
     bridge_width: float = 0.7
     bridge_thickness: float = 0.3
-    spawn_x: tuple[float, float] = (2.0, 7.5)
+    spawn_x: tuple[float, float] = (2.5, 7.5)
     off_height: float = 0.5
     rewards: BridgeRewards = BridgeRewards()
 
