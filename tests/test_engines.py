@@ -1,0 +1,22 @@
+"""The scenes with shapes of their own move alike on MuJoCo's C engine and on MJX; `python -m tests.engines` has all."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from mqe_jax.envs import TASKS
+from tests import engines
+
+# Boxes to stand on, a hinge, a slide with friction: what `tests/test_physics.py` has not. MQE_SOAK=1 takes all.
+CHOSEN = tuple(TASKS) if os.environ.get("MQE_SOAK") else ("go1bridge", "go1tug")
+
+
+@pytest.mark.parametrize("task", CHOSEN)
+def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
+    """Four worlds of standing robots under random joint targets: contacts make small differences grow."""
+    figures = engines.disagreement(task, "jax", engines.record(task, worlds=4))
+    assert figures["robots_1"] < 1e-3, figures
+    assert figures["robots_20"] < 0.02 and figures["robots_20_max"] < 0.1, figures
+    assert figures.get("objects_20_max", 0.0) < 0.02, figures
