@@ -40,7 +40,8 @@ class Pillar(TerrainBlock):
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         """Lays the block out from x = `start`."""
-        length = self.length if isinstance(self.length, float) else self.length[0]
+        assert not isinstance(self.length, tuple)  # the track has fixed what was given as (easy, hard)
+        length = self.length
         center = (start + length / 2, 0.0, track.wall_height / 2)
         return Layout(walls=(Wall(f"pillar{number}", center, (self.side, self.side, track.wall_height)),))
 

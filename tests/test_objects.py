@@ -202,3 +202,12 @@ def test_objects_are_indexed_by_name() -> None:
     assert scene.objects["box"].qpos.shape == (7,) and scene.objects["box"].qvel.shape == (6,)
     assert scene.objects["dolly"].qpos.shape == (2,)
     assert scene.model.body(scene.objects["dolly"].body).name == "object/dolly"
+
+
+def test_two_robots_push_the_box_clearly_faster_than_one() -> None:
+    import runpy
+    from pathlib import Path
+
+    pushed = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "push_box_alone.py"))["pushed"]
+    alone, together = pushed(1, worlds=8), pushed(2, worlds=8)
+    assert 0.1 < alone < 0.7 * together

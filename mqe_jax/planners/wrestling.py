@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from mqe_jax.planners.steering import go_to
 
 _MIDDLE = jnp.array([3.1, 0.0])  # m, of the ring
-_AHEAD = 0.12  # m, by which the trunk's middle is ahead of the line to the opponent: the hips push
+_AHEAD = 0.1  # m, by which the trunk's middle is ahead of the line to the opponent: the hips push
 _STAND_OFF = 0.65  # m, from the opponent until one stands side on
-_EDGE = (1.52, 1.66)  # m, from the middle, where one turns back: the farther out the opponent is, the later
+_EDGE = (1.5, 1.64)  # m, from the middle, where one turns back: the farther out the opponent is, the later
 
 
 def plan_wrestling(obs: jax.Array) -> jax.Array:
@@ -29,5 +29,5 @@ def plan_wrestling(obs: jax.Array) -> jax.Array:
     reach = jnp.where(shoving, 0.6, -_STAND_OFF)
     goal = opponent + reach[:, None] * outward + aside[:, None] * left
     back = go_to(position, yaw, jnp.broadcast_to(_MIDDLE, position.shape), yaw)
-    at_edge = jnp.linalg.norm(position - _MIDDLE, axis=-1) > jnp.clip(far - 0.05, *_EDGE)
+    at_edge = jnp.linalg.norm(position - _MIDDLE, axis=-1) > jnp.clip(far - 0.08, *_EDGE)
     return jnp.where(at_edge[:, None], back, go_to(position, yaw, goal, heading))
