@@ -66,6 +66,7 @@ class FakeEnv:
 
     name = "fake"
     num_agents, observation_size, privileged_observation_size, action_size = 2, 1, 2, 3
+    teams = ((0, 1),)
     dt = 0.02
 
     def __init__(self) -> None:
