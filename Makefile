@@ -37,7 +37,7 @@ demo: $(STAMP) system ## Train Narrow Gate on the CPU, print before and after, l
 	JAX_PLATFORMS=cpu $(BIN)/mqe demo
 
 test: $(STAMP) ## Run the tests
-	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile
+	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
 
 check: $(STAMP) ## Lint, formatting, types
 	$(BIN)/ruff check $(SOURCES)
