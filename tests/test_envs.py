@@ -177,7 +177,7 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     assert not gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched), still).terminated
     assert gate_step(moved(gate, state, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]]), still).terminated
     fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
-    assert bool(fallen)
+    assert fallen.tolist() == [True, False]
     bumped = gate_step(moved(gate, state, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]]), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
 
