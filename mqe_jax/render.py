@@ -6,11 +6,9 @@ picture.
 """
 
 import copy
-import itertools
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -23,14 +21,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mqe_jax.clips import check_output, write_clip
+
 Act = Callable[[Any, Any, Any], tuple[Any, Any]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, action_size), memory)`."""
 
-SUFFIXES = (".mp4", ".gif", ".png")
 COLLISION_GROUP = 3
 GL_PACKAGES = "libegl1 libgl1-mesa-dri (Debian, Ubuntu)"
-COLOURS = ("#2f7fd6", "#3fae49", "#d8402f", "#f08c1e")
-"""Blue, green, red, orange: the robots' colours, in order."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +128,13 @@ def robot_bases(model: mujoco.MjModel) -> list[int]:
         if np.count_nonzero(hinges & inside) >= 12:
             bases.append(body)
     return bases
+
+
+def _paint(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
+    """Colour (red, green, blue, alpha) of a robot: of the first shape on its trunk that is looked at."""
+    geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])
+    seen = [geom for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
+    return tuple(map(float, model.geom_rgba[seen[0]]))
 
 
 def _pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: int) -> None:
@@ -351,17 +355,12 @@ def _draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) ->
     scenery, robots = [], []
     for geom in _scenery(model):
         moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
-        patch = Polygon(
-            np.zeros((3, 2)),
-            facecolor="#c9ced6" if moves else "#3a3d45",
-            edgecolor="#23252b",
-            lw=0.6,
-            zorder=2,
-        )
+        face = "#c9ced6" if moves else "#3a3d45"
+        patch = Polygon(np.zeros((3, 2)), facecolor=face, edgecolor="#23252b", lw=0.6, zorder=2)
         scenery.append((geom, axes.add_patch(patch)))
     body_shape = np.array([[-0.25, -0.13], [0.2, -0.13], [0.33, 0.0], [0.2, 0.13], [-0.25, 0.13]])
-    for number, body in enumerate(bases):
-        colour = COLOURS[number % len(COLOURS)]
+    for body in bases:
+        colour = _paint(model, body)
         (trail,) = axes.plot([], [], color=colour, lw=1.5, alpha=0.5, zorder=3)
         patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
         robots.append((body, patch, trail, []))
@@ -382,7 +381,7 @@ def _draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) ->
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-# ---------------------------------------------------------------- drawing and writing
+# ---------------------------------------------------------------- an episode's picture
 
 
 def render_frames(
@@ -402,88 +401,6 @@ def render_frames(
     if backend is None:
         return _draw_top(model, episode, size)
     return _draw_gl(model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend)
-
-
-def check_output(path: Path) -> Path:
-    """Refuse what cannot be written, before any work; ValueError names the path and what is allowed."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
-    if path.is_dir():
-        raise ValueError(f"output {str(path)!r} is a folder, it must be a file")
-    parent = path.resolve().parent
-    while not parent.exists():
-        parent = parent.parent
-    try:
-        with tempfile.TemporaryFile(dir=parent):
-            pass
-    except OSError as error:
-        reason = error.strerror or error
-        raise ValueError(f"output {str(path)!r}: {str(parent)!r} cannot be written ({reason})") from None
-    if path.suffix.lower() == ".mp4":
-        try:
-            import_module("imageio_ffmpeg")
-        except ImportError:
-            raise ValueError(
-                f"output {str(path)!r}: .mp4 needs imageio-ffmpeg "
-                "(pip install 'mqe-jax[render]'); allowed without them: .gif, .png"
-            ) from None
-    return path
-
-
-def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    """Write frames (H, W, 3) uint8 as .mp4, .gif or .png (the last frame), whole or not at all."""
-    path = check_output(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    suffix = path.suffix.lower()
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
-    try:
-        if suffix == ".mp4":
-            _write_mp4(temporary, frames, fps)
-        elif suffix == ".gif":
-            _write_gif(temporary, list(frames), fps)
-        else:
-            from PIL import Image
-
-            *_, frame = frames
-            Image.fromarray(frame).save(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    """H.264, yuv420p: what browsers and players take."""
-    # ffmpeg is started without a fork of this process, in which JAX's threads might hold locks.
-    program = import_module("imageio_ffmpeg").get_ffmpeg_exe()
-    first = next(frames)
-    height, width = (n // 2 * 2 for n in first.shape[:2])
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
-    encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
-    command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stderr is not None
-        try:
-            for frame in itertools.chain([first], frames):
-                process.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
-        except BrokenPipeError:
-            pass  # ffmpeg says below what was wrong
-        except BaseException:
-            process.kill()
-            raise
-        process.stdin.close()
-        said = process.stderr.read().decode(errors="replace")
-    if process.returncode:
-        raise ValueError(f"output: ffmpeg could not write the clip ({' '.join(said.split())})")
-
-
-def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
-    """One palette for the whole clip and no dithering, which keeps a gif small and still."""
-    from PIL import Image
-
-    sample = np.concatenate(frames[:: max(1, len(frames) // 6)][:8])
-    palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
-    images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)
 
 
 def render_episode(

@@ -17,19 +17,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mqe_jax import robot_look as look
+from mqe_jax.rotation import quaternion_to_euler, rotate_inverse
+
 LEGS = ("FL", "FR", "RL", "RR")
 JOINTS = ("hip", "thigh", "calf")
 NUM_LEGS = len(LEGS)
 NUM_JOINTS = NUM_LEGS * len(JOINTS)
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
-
-# Robot colours by agent (red, green, blue, alpha): 1 blue, 2 green, 3 red, 4 orange.
-COLORS = (
-    (0.13, 0.59, 0.95, 1.0),
-    (0.36, 0.80, 0.26, 1.0),
-    (0.93, 0.28, 0.20, 1.0),
-    (0.98, 0.60, 0.12, 1.0),
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,9 +168,9 @@ def build_robot(
         visual: whether to add the geoms that are only looked at.
         friction: sliding friction of its shapes, which takes precedence over the other shape's.
         torque_control: actuators take torques (N m) instead of PD joint targets (rad).
-        color: index of its colour in `COLORS`; `robot` if None.
+        color: index of its colour in `robot_look.COLORS`; `robot` if None.
     """
-    paint = COLORS[(robot if color is None else color) % len(COLORS)]
+    paint = look.COLORS[(robot if color is None else color) % len(look.COLORS)]
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, STAND_HEIGHT))
@@ -217,28 +212,14 @@ def build_robot(
                 range=(JOINT_LOWER[index], JOINT_UPPER[index]),
             )  # fmt: skip
         capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-        collide(
-            thigh,
-            "thigh",
-            f"{leg}_thigh",
-            type=capsule,
-            size=(0.017, 0, 0),
-            fromto=(0, 0, -0.02, 0, 0, -0.19),
-        )
+        collide(thigh, "thigh", f"{leg}_thigh", type=capsule, size=(0.017, 0, 0), fromto=(0, 0, -0.02, 0, 0, -0.19))
         collide(calf, "calf", f"{leg}_calf", type=capsule, size=(0.01, 0, 0), fromto=(0, 0, -0.03, 0, 0, -0.18))
-        foot_size = (FOOT_RADIUS, 0, 0)
-        collide(
-            calf,
-            "foot",
-            f"{leg}_foot",
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=foot_size,
-            pos=(0, 0, -CALF_LENGTH),
-        )
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        collide(calf, "foot", f"{leg}_foot", type=sphere, size=(FOOT_RADIUS, 0, 0), pos=(0, 0, -CALF_LENGTH))
         if visual:
-            _add_leg_look(hip, thigh, calf, front, left, paint)
+            look.add_leg(hip, thigh, calf, left, paint)
     if visual:
-        _add_trunk_look(trunk, paint)
+        look.add_trunk(trunk, paint)
     for index, name in enumerate(JOINT_NAMES):
         gain, bias = (1.0, (0.0, 0.0, 0.0)) if torque_control else (KP, (0.0, -KP, -KD))
         actuator = spec.add_actuator(
@@ -249,48 +230,6 @@ def build_robot(
         actuator.gainprm[0] = gain
         actuator.biasprm[:3] = bias
     return spec
-
-
-_DARK = (0.13, 0.14, 0.16, 1.0)
-_GREY = (0.32, 0.34, 0.37, 1.0)
-
-
-def _look(body: Any, kind: Any, rgba: tuple[float, ...], **shape: Any) -> None:
-    body.add_geom(type=kind, rgba=rgba, contype=0, conaffinity=0, group=2, mass=0.0, **shape)
-
-
-def _add_trunk_look(trunk: Any, color: tuple[float, ...]) -> None:
-    box, capsule = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
-    ellipsoid, sphere = mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_SPHERE
-    _look(trunk, box, color, size=(0.155, 0.052, 0.048), pos=(0.0, 0, 0.012))
-    _look(trunk, ellipsoid, color, size=(0.2, 0.056, 0.05), pos=(0.0, 0, 0.024))
-    _look(trunk, box, _DARK, size=(0.145, 0.045, 0.03), pos=(0, 0, -0.03))
-    for end in (-1, 1):  # the hip motors' housings
-        _look(trunk, box, _DARK, size=(0.035, 0.075, 0.042), pos=(end * 0.188, 0, 0))
-    _look(trunk, capsule, _DARK, size=(0.03, 0, 0), fromto=(0.2, 0, 0.02, 0.255, 0, 0.028))
-    _look(trunk, box, color, size=(0.03, 0.046, 0.032), pos=(0.275, 0, 0.034))
-    _look(trunk, box, _DARK, size=(0.006, 0.04, 0.024), pos=(0.304, 0, 0.034))
-    for side in (-1, 1):
-        _look(trunk, sphere, (0.9, 0.95, 1.0, 1.0), size=(0.009, 0, 0), pos=(0.309, side * 0.022, 0.04))
-        _look(
-            trunk,
-            capsule,
-            _DARK,
-            size=(0.008, 0, 0),
-            fromto=(-0.13, side * 0.035, 0.068, 0.13, side * 0.035, 0.068),
-        )
-
-
-def _add_leg_look(hip: Any, thigh: Any, calf: Any, front: int, left: int, color: tuple[float, ...]) -> None:
-    cylinder, capsule = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
-    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-    _look(hip, cylinder, _GREY, size=(0.043, 0, 0), fromto=(0, left * 0.03, 0, 0, left * 0.075, 0))
-    _look(thigh, cylinder, color, size=(0.04, 0, 0), fromto=(0, -left * 0.022, 0, 0, left * 0.02, 0))
-    _look(thigh, capsule, _DARK, size=(0.022, 0, 0), fromto=(0, 0, -0.02, -0.012, 0, -0.11))
-    _look(thigh, capsule, _DARK, size=(0.017, 0, 0), fromto=(-0.012, 0, -0.11, 0, 0, -THIGH_LENGTH))
-    _look(calf, capsule, _GREY, size=(0.013, 0, 0), fromto=(0, 0, 0, 0.008, 0, -0.1))
-    _look(calf, capsule, _GREY, size=(0.01, 0, 0), fromto=(0.008, 0, -0.1, 0, 0, -CALF_LENGTH))
-    _look(calf, sphere, _DARK, size=(FOOT_RADIUS, 0, 0), pos=(0, 0, -CALF_LENGTH))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -468,42 +407,6 @@ def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata:
         trunk_force=jnp.linalg.norm(sensordata[index.trunk_force], axis=-1),
         touching=touching,
     )
-
-
-def quaternion_to_euler(quaternion: jax.Array) -> jax.Array:
-    """Converts wxyz quaternions (..., 4) to roll, pitch, yaw (..., 3), rad, applied in the order z, y, x."""
-    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
-    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return jnp.stack([roll, pitch, yaw], axis=-1)
-
-
-def euler_to_quaternion(euler: jax.Array) -> jax.Array:
-    """Converts roll, pitch, yaw (..., 3), rad, to wxyz quaternions (..., 4)."""
-    (cr, cp, cy), (sr, sp, sy) = (jnp.moveaxis(f(euler / 2), -1, 0) for f in (jnp.cos, jnp.sin))
-    return jnp.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ],
-        axis=-1,
-    )
-
-
-def rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Turns body vectors (..., 3) into the world by wxyz quaternions (..., 4)."""
-    w, imaginary = quaternion[..., :1], quaternion[..., 1:]
-    vector = jnp.broadcast_to(vector, imaginary.shape)
-    cross = 2 * jnp.cross(imaginary, vector)
-    return vector + w * cross + jnp.cross(imaginary, cross)
-
-
-def rotate_inverse(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Turns world vectors (..., 3) into the body frame of wxyz quaternions (..., 4)."""
-    return rotate(quaternion * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
 
 
 def foot_positions(joint_position: jax.Array) -> jax.Array:

@@ -25,7 +25,7 @@ class Scene:
         num_robots: A.
         contacts: which parts of the robots touch what.
         objects: everything else that is in it, added after the robots.
-        colors: of the robots, as indices of `mqe_jax.robot.COLORS`; one after the other if empty.
+        colors: of the robots, as indices of `mqe_jax.robot_look.COLORS`; one after the other if empty.
         friction: sliding friction of the robots' shapes and the ground.
         torque_control: the actuators take torques (N m) instead of PD joint targets (rad).
         foot_sensors: whether the feet's contact forces are measured too.

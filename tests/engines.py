@@ -18,8 +18,9 @@ import numpy as np
 
 from mqe_jax.envs import TASKS, State, VectorEnv, make
 from mqe_jax.physics import STATE_FIELDS
+from mqe_jax.planners import PLANNERS
 
-SETTLE, STEPS = 40, 20  # environment steps: until the robots stand, and compared
+SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
 
 def settled(task: str, worlds: int) -> tuple[Any, State]:
@@ -45,12 +46,51 @@ def actions_of(env: Any, worlds: int) -> jax.Array:
     return 0.5 * jax.random.normal(jax.random.PRNGKey(1), (STEPS, worlds, env.num_agents, 12))
 
 
+def played(task: str, worlds: int) -> dict[str, np.ndarray]:
+    """Physics states of worlds in play, on the C engine: the task's planner acts, for all robots in a match.
+
+    Of each world's first `PLAY` steps the one is taken in which objects move fastest and robots touch most.
+    """
+    env: Any = make(task, impl="c", num_envs=worlds)
+    worlds_env, plan = VectorEnv(env, worlds), jax.vmap(PLANNERS.get(task, ahead))
+    robots = np.concatenate([env.robot.base_qvel, env.robot.joint_qvel], axis=1).ravel()
+    rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
+
+    def advance(states: State, _: None) -> tuple[State, Any]:
+        states = worlds_env.step(states, plan(states.obs))
+        readings = jax.vmap(env.read)(states.data)
+        touching = jnp.any(readings.touching, axis=(1, 2)) | jnp.any(readings.trunk_force > 1.0, axis=1)
+        busy = jnp.minimum(jnp.linalg.norm(states.data.qvel[:, rest], axis=-1), 1.0) + 2.0 * touching
+        return states, (busy, {name: getattr(states.data, name) for name in STATE_FIELDS})
+
+    states = jax.jit(worlds_env.reset)(jax.random.PRNGKey(2))
+    busy, fields = jax.jit(lambda s: jax.lax.scan(advance, s, None, PLAY))(states)[1]
+    best = np.argmax(np.asarray(busy), axis=0)
+    return {name: np.asarray(field)[best, np.arange(worlds)] for name, field in fields.items()}
+
+
+def ahead(obs: jax.Array) -> jax.Array:
+    """Walks ahead."""
+    return jnp.zeros((len(obs), 3)).at[:, 0].set(0.5)
+
+
 def record(task: str, worlds: int = 8) -> dict[str, np.ndarray]:
-    """What the C engine makes of standing worlds under those actions: their states at first, and qpos (T, N, nq)."""
+    """What the C engine makes of worlds under those actions: their states at first, and qpos (T, 2 N, nq).
+
+    The first half of the worlds are of standing robots, the others in play.
+    """
     env, states = settled(task, worlds)
-    physics = {f"data/{name}": np.asarray(getattr(states.data, name)) for name in STATE_FIELDS}
-    others = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(without_data(states)))}
-    return {**physics, **others, "qpos": np.asarray(rolled(env, states, actions_of(env, worlds))[1])}
+    twice = lambda x, y: jnp.concatenate([jnp.asarray(x), jnp.asarray(y, x.dtype)])  # noqa: E731
+    first = {name: getattr(states.data, name) for name in STATE_FIELDS}
+    data = {name: twice(first[name], field) for name, field in played(task, worlds).items()}
+    others = jax.tree.map(lambda x: twice(x, x), without_data(states))
+    base = jax.tree.map(lambda x: twice(x, x), states.data)
+    states = State(data=base.replace(**data), **others)
+    return {
+        **{f"data/{name}": np.asarray(field) for name, field in data.items()},
+        **{f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(others))},
+        "qpos": np.asarray(rolled(env, states, actions_of(env, 2 * worlds))[1]),
+    }
 
 
 def without_data(states: State) -> dict[str, Any]:
@@ -62,8 +102,9 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     """How far an engine's trajectory is from the recorded one of the C engine, from the same states and actions.
 
     Returns:
-        robots and objects: largest difference of any position (m) or quaternion or joint angle (rad) after one step
-        and, as median and maximum over the worlds, after 20.
+        `standing/robots_1` and the like: of the worlds of standing robots and of those in play, the largest difference
+        of any position (m), quaternion or joint angle (rad) of robots and of objects after one step, and, as median
+        and maximum over the worlds, after 20.
     """
     worlds = len(reference["data/qpos"])
     env: Any = make(task, impl=engine, control="position", episode_length=1000.0, num_envs=worlds)
@@ -76,12 +117,13 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     robots = np.concatenate([env.robot.base_qpos, env.robot.joint_qpos], axis=1).ravel()
     rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
     figures = {}
-    for name, columns in (("robots", robots), ("objects", rest)):
-        if len(columns):
-            worst = apart[..., columns].max(-1)
-            figures[f"{name}_1"] = float(worst[0].max())
-            figures[f"{name}_20"] = float(np.median(worst[-1]))
-            figures[f"{name}_20_max"] = float(worst[-1].max())
+    for number, kind in enumerate(("standing", "play")):
+        for name, columns in (("robots", robots), ("objects", rest)):
+            if len(columns):
+                worst = apart[:, np.arange(worlds) // (worlds // 2) == number][..., columns].max(-1)
+                figures[f"{kind}/{name}_1"] = float(worst[0].max())
+                figures[f"{kind}/{name}_20"] = float(np.median(worst[-1]))
+                figures[f"{kind}/{name}_20_max"] = float(worst[-1].max())
     return figures
 
 

@@ -15,8 +15,10 @@ CHOSEN = tuple(TASKS) if os.environ.get("MQE_SOAK") else ("go1bridge",)
 
 @pytest.mark.parametrize("task", CHOSEN)
 def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
-    """Four worlds of standing robots under random joint targets: contacts make small differences grow."""
+    """Standing robots and worlds in play under random joint targets: contacts make small differences grow."""
     figures = engines.disagreement(task, "jax", engines.record(task, worlds=4))
-    assert figures["robots_1"] < 1e-3, figures
-    assert figures["robots_20"] < 0.02 and figures["robots_20_max"] < 0.1, figures
-    assert figures.get("objects_20_max", 0.0) < 0.02, figures
+    assert figures["standing/robots_1"] < 1e-3, figures
+    assert figures["standing/robots_20"] < 0.02 and figures["standing/robots_20_max"] < 0.1, figures
+    assert figures.get("standing/objects_20_max", 0.0) < 0.02, figures
+    assert figures["play/robots_1"] < 5e-3 and figures["play/robots_20"] < 0.05, figures
+    assert figures.get("play/objects_20", 0.0) < 0.05, figures

@@ -17,6 +17,7 @@ import mqe_jax
 from mqe_jax import robot as go1
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.robot import RobotReadings
+from mqe_jax.rotation import euler_to_quaternion
 
 Array = jax.Array
 
@@ -34,7 +35,7 @@ def gate_step(gate: QuadrupedEnv) -> Any:
 def readings(position: Any, yaw: Any = (0.0, 0.0), roll: Any = (0.0, 0.0), force: Any = (0.0, 0.0)) -> RobotReadings:
     """Two robots, standing still with the default joints."""
     zeros = jnp.zeros(2)
-    turn = go1.euler_to_quaternion(jnp.stack([jnp.asarray(roll), zeros, jnp.asarray(yaw)], axis=-1))
+    turn = euler_to_quaternion(jnp.stack([jnp.asarray(roll), zeros, jnp.asarray(yaw)], axis=-1))
     joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
     return RobotReadings(
         jnp.asarray(position), turn, jnp.zeros((2, 3)), jnp.zeros((2, 3)), joints, jnp.zeros((2, 12)),
@@ -98,7 +99,6 @@ def test_contract(task: str) -> None:
     assert env.observation_space.shape == state.obs.shape[1:]
     assert env.action_space.shape == (env.num_agents, env.action_size)
     assert state.reward.shape == (count, env.num_agents)
-    assert env.privileged_layout().size == env.privileged_observation_size
 
     # Every other world is at its time limit: it starts over, and its last observation is kept.
     late = jnp.where(jnp.arange(count) % 2 == 0, env.max_steps - 1, state.step)
@@ -171,9 +171,9 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     assert not after.terminated and not after.truncated
     late = gate_step(dataclasses.replace(stand, step=jnp.int32(gate.max_steps - 1)), still)
     assert late.truncated and not late.terminated
-    rolled = go1.euler_to_quaternion(jnp.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    rolled = euler_to_quaternion(jnp.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], rolled), still).terminated
-    pitched = go1.euler_to_quaternion(jnp.array([[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]))
+    pitched = euler_to_quaternion(jnp.array([[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]))
     assert not gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched), still).terminated
     assert gate_step(moved(gate, state, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]]), still).terminated
     fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))

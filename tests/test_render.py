@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from fake_env import FakeEnv
 
-from mqe_jax import render
-from mqe_jax.commands import planner
+from mqe_jax import clips, render
+from mqe_jax.actors import planner
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_a_broken_drawing_leaves_nothing_behind(tmp_path: Path) -> None:
         raise RuntimeError("out of frames")
 
     with pytest.raises(RuntimeError):
-        render.write_clip(tmp_path / "clip.gif", frames(), 10.0)
+        clips.write_clip(tmp_path / "clip.gif", frames(), 10.0)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -108,7 +108,7 @@ def test_bad_outputs_are_refused(tmp_path: Path, name: str, said: str) -> None:
     if name.startswith("/proc") and not os.path.isdir("/proc"):
         pytest.skip("no folder here that nobody may write")
     with pytest.raises(ValueError, match=said):
-        render.check_output(tmp_path / name)
+        clips.check_output(tmp_path / name)
 
 
 def test_the_models_own_settings_are_left_alone(env: FakeEnv, episode: render.Episode) -> None:

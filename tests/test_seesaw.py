@@ -18,6 +18,7 @@ from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robot import RobotReadings
+from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Init, Plane, Track
 
@@ -42,7 +43,7 @@ def fresh(env: Any) -> State:
 
 def readings(position: Any, roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0)) -> RobotReadings:
     """Two robots, standing still with the default joints."""
-    turn = go1.euler_to_quaternion(jnp.stack([jnp.asarray(angle) for angle in (roll, pitch, yaw)], axis=-1))
+    turn = euler_to_quaternion(jnp.stack([jnp.asarray(angle) for angle in (roll, pitch, yaw)], axis=-1))
     joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
     none = jnp.zeros((2, 3))
     return RobotReadings(
@@ -53,7 +54,7 @@ def readings(position: Any, roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw
 def placed(env: Any, state: State, position: Any, roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0)) -> State:
     """The state with both robots somewhere else, standing still with the default joints."""
     at, qpos = env.robot, state.data.qpos
-    turn = go1.euler_to_quaternion(jnp.stack([jnp.asarray(roll), jnp.asarray(pitch), jnp.zeros(2)], axis=-1))
+    turn = euler_to_quaternion(jnp.stack([jnp.asarray(roll), jnp.asarray(pitch), jnp.zeros(2)], axis=-1))
     qpos = qpos.at[at.base_qpos].set(jnp.concatenate([jnp.asarray(position), turn], axis=-1))
     qpos = qpos.at[at.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))

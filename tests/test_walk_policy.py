@@ -15,7 +15,8 @@ import pytest
 
 from mqe_jax import control, walk_policy
 from mqe_jax import robot as go1
-from mqe_jax.envs.walk import WalkEnv, WalkTask, desired_contact, gravity_w
+from mqe_jax.envs.walk import WalkEnv, WalkTask, gravity_w
+from mqe_jax.envs.walk_rewards import desired_contact
 from mqe_jax.train.walk import windows
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
 

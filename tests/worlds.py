@@ -12,6 +12,7 @@ import numpy as np
 
 from mqe_jax import robot as go1
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.rotation import euler_to_quaternion
 
 
 def placed(
@@ -24,7 +25,7 @@ def placed(
     """
     state = env.reset(jax.random.PRNGKey(0)) if state is None else state
     index, position = env.robot, jnp.asarray(position, jnp.float32)
-    turn = go1.euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
+    turn = euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
     qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))
     qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
     for name, coordinates in (objects or {}).items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -21,126 +22,16 @@ from mujoco import mjx
 
 from mqe_jax import robot as go1
 from mqe_jax import walk_policy
-from mqe_jax.control import Controller, ControlState, check_commands, check_mode, load_actuator_network
-from mqe_jax.envs.observation import Block, ObservationLayout
-from mqe_jax.envs.overrides import Range
+from mqe_jax.control import Controller, ControlState, check_mode, load_actuator_network
+from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.privileged import PrivilegedObservation
+from mqe_jax.envs.randomization import Randomizer, World
 from mqe_jax.envs.reward import weigh
 from mqe_jax.physics import Physics
 from mqe_jax.robot import RobotReadings
+from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, build_model, compile_scene
-
-
-@dataclasses.dataclass(frozen=True)
-class Randomization:
-    """Domain randomisation; every range is drawn uniformly at reset, for each robot by itself. None or 0 is off.
-
-    Attributes:
-        friction: sliding friction of the robots' shapes (lowest, highest).
-        payload: extra mass of the trunk, kg.
-        center_of_mass: shift of the trunk's centre of mass along each axis, m.
-        motor_strength: factor on all torques.
-        action_lag: greatest delay of the actuator targets, environment steps; drawn once a world.
-        push: greatest sudden change of a trunk's horizontal velocity, m/s.
-        push_period: mean time between pushes, s.
-        observation_noise: standard deviation of the noise on every observed number.
-    """
-
-    friction: Range | None = None
-    payload: Range | None = None
-    center_of_mass: Range | None = None
-    motor_strength: Range | None = None
-    action_lag: int = 0
-    push: float = 0.0
-    push_period: float = 5.0
-    observation_noise: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("friction", "payload", "center_of_mass", "motor_strength"):
-            value = getattr(self, name)
-            if value is not None and (len(value) != 2 or value[0] > value[1]):
-                raise ValueError(f"randomization.{name}: {value} must be (lowest, highest) or none")
-        if self.action_lag < 0 or self.push < 0 or self.observation_noise < 0 or self.push_period <= 0:
-            raise ValueError("randomization: action_lag, push, observation_noise must be >= 0 and push_period > 0")
-
-
-@dataclasses.dataclass(frozen=True)
-class TaskParams:
-    """Parameters that all tasks have; a task adds its own.
-
-    Attributes:
-        num_agents: robots that are told what to do.
-        episode_length: time limit, s.
-        spawn_height: of the trunks, m.
-        spawn_noise: half-width of the uniform noise on the spawn position in x and y, m.
-        spawn_joint_scale: the joints start at their default angles times a factor from this range.
-        spawn_velocity: half-width of the uniform noise on all six base velocities, m/s and rad/s.
-        max_roll: an episode ends when any |roll| is greater, rad.
-        max_pitch: likewise |pitch|, rad.
-        min_height: an episode ends when any trunk is lower, m.
-        max_height: likewise higher, m.
-        end_on_collision: an episode ends when any trunk touches anything with more than `collision_force`.
-        collision_force: N.
-        gait: of the walk policy: trot, pronk, bound or pace.
-        commands: the walk commands that the action sets, in order.
-        walk_policy: weights file of the walk policy; the package's own if None.
-        actuator_network: weights file of an actuator network in place of PD; none if None.
-        friction: sliding friction of robots and ground.
-        solver_iterations: at most so many solver iterations per physics step.
-        contacts_per_env: contacts that a world may have on average, for Warp's buffer.
-        rows_per_env: constraint rows that a world may have, for Warp's buffer.
-        randomization: domain randomisation.
-        hold_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
-            for up to hold_time x aid, s, so that agents first learn one at a time what they must do in turn.
-    """
-
-    num_agents: int = 2
-    episode_length: float = 10.0
-    spawn_height: float = 0.42
-    spawn_noise: float = 0.1
-    spawn_joint_scale: Range = (0.7, 1.3)
-    spawn_velocity: float = 0.5
-    max_roll: float = 0.8
-    max_pitch: float = 1.6
-    min_height: float = -1.0
-    max_height: float = 100.0
-    end_on_collision: bool = False
-    collision_force: float = 1.0
-    gait: str = "trot"
-    commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
-    walk_policy: str | None = None
-    actuator_network: str | None = None
-    friction: float = 1.0
-    solver_iterations: int = 4
-    contacts_per_env: int = 24
-    rows_per_env: int = 128
-    randomization: Randomization = Randomization()
-    hold_time: float = 4.0
-
-    def __post_init__(self) -> None:
-        for name in ("episode_length", "collision_force", "friction", "solver_iterations"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: {getattr(self, name)} must be positive")
-        check_commands(self.commands)
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class World:
-    """How one world differs from the model: its randomised physics (R robots).
-
-    Attributes:
-        friction: (R,).
-        payload: (R,), kg.
-        center_of_mass: (R, 3), m.
-        motor_strength: (R,).
-        action_lag: () int32, environment steps.
-    """
-
-    friction: jax.Array
-    payload: jax.Array
-    center_of_mass: jax.Array
-    motor_strength: jax.Array
-    action_lag: jax.Array
 
 
 @jax.tree_util.register_dataclass
@@ -202,6 +93,7 @@ class QuadrupedEnv:
     name: ClassVar[str] = ""
     title: ClassVar[str] = ""
     Params: ClassVar[type[TaskParams]] = TaskParams
+    any_number: ClassVar[bool] = False  # whether `num_agents` may be another than the task's own
     dt = walk_policy.STEP
 
     def __init__(
@@ -213,6 +105,9 @@ class QuadrupedEnv:
         num_envs: int = 4096,
     ) -> None:
         self.params: Any = self.Params() if params is None else params
+        own = self.Params().num_agents
+        if self.params.num_agents != own and not self.any_number:
+            raise ValueError(f"num_agents: {self.params.num_agents}; {self.name} is for {own} robots")
         self.control = check_mode(control)
         if num_envs < 1:
             raise ValueError(f"num_envs: {num_envs} must be at least 1")
@@ -228,6 +123,8 @@ class QuadrupedEnv:
             rows_per_env=self.params.rows_per_env,
         )  # fmt: skip
         self.impl = self.physics.impl
+        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.robot, self.params.friction)
+        self.privileged = PrivilegedObservation(self.compiled.model, self.robot, len(self.compiled.layout.anchors))
         network = self.params.actuator_network if control != "torque" else None
         walks = control == "command" or self._scene.num_robots > self.num_agents
         self.controller = Controller(
@@ -243,10 +140,14 @@ class QuadrupedEnv:
         """Says what is in the world."""
         raise TypeError(f"{type(self).__name__}: scene() is not defined")
 
+    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+        """Says where the robots start, x, y, yaw of each, m and rad; where the track's blocks say if not here."""
+        return self.compiled.layout.spawn
+
     def spawn(self, key: jax.Array) -> jax.Array:
         """Draws poses x, y, z, yaw (R, 4), m and rad, of all robots."""
         params = self.params
-        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.compiled.layout.spawn], np.float32)
+        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_places()], np.float32)
         noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
         return jnp.asarray(pose).at[:, :2].add(noise)
 
@@ -320,10 +221,15 @@ class QuadrupedEnv:
         """Length of an agent's observation."""
         return self.observation_layout.size
 
-    @functools.cached_property
+    @property
+    def privileged_layout(self) -> ObservationLayout:
+        """The blocks of the privileged observation, in order; raw units."""
+        return self.privileged.layout
+
+    @property
     def privileged_observation_size(self) -> int:
         """Length of the privileged observation."""
-        return jax.eval_shape(self.reset, jax.random.PRNGKey(0)).privileged_obs.shape[0]
+        return self.privileged_layout.size
 
     @property
     def action_space(self) -> gymnasium.spaces.Box:
@@ -373,7 +279,7 @@ class QuadrupedEnv:
             data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
             reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
             step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
-            world=self._draw_world(world_key), task=self.reset_task(task_key, readings, data, gates), aid=aid,
+            world=self.randomizer.draw(world_key), task=self.reset_task(task_key, readings, data, gates), aid=aid,
             hold=self._draw_hold(aid_key, aid), key=next_key,
         )  # fmt: skip
         terms, _ = self.rewards(state, readings, no)
@@ -404,13 +310,13 @@ class QuadrupedEnv:
             state.control, action, before.projected_gravity, before.joint_position, before.joint_velocity,
             self.npc_commands(state, before),
         )  # fmt: skip
-        data = self.drive(self._pushed(state.data, push_key), before, drive_key)
+        data = self.drive(self.randomizer.push(state.data, push_key, self.dt), before, drive_key)
         data, control = self.controller.apply(
             control,
             data,
             target,
             state.world.action_lag,
-            self._fields(state.world),
+            self.randomizer.fields(state.world),
             self.external_forces(state),
         )
         readings = self.read(data)
@@ -453,20 +359,6 @@ class QuadrupedEnv:
         """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
         return None
 
-    def privileged_layout(self) -> ObservationLayout:
-        """The blocks of the privileged observation, in order; raw units."""
-        robots, model = self.robot.num_robots, self.compiled.model
-        base = (
-            Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),
-            Block("angular_velocity", 3, "rad/s, body"), Block("joint_position", 12, "rad, minus default"),
-            Block("joint_velocity", 12, "rad/s"),
-        )  # fmt: skip
-        blocks = [Block(f"robot{i}/{block.name}", block.width, block.meaning) for i in range(robots) for block in base]
-        blocks.append(Block("objects/qpos", model.nq - 19 * robots, "positions of everything that is no robot"))
-        blocks.append(Block("objects/qvel", model.nv - 18 * robots, "velocities of everything that is no robot"))
-        blocks.append(Block("gates", 2 * len(self.compiled.layout.anchors), "centres, m"))
-        return ObservationLayout(tuple(block for block in blocks if block.width))
-
     # -- the common parts of reset and step ---------------------------------------------------------------------
 
     def _draw_gates(self, key: jax.Array) -> jax.Array:
@@ -489,7 +381,7 @@ class QuadrupedEnv:
         speed = params.spawn_velocity
         velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
         level = jnp.zeros(len(pose))
-        turn = go1.euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
+        turn = euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
         qpos = jnp.asarray(model.qpos0, jnp.float32).at[index.joint_qpos].set(joints)
         qpos = qpos.at[index.base_qpos].set(jnp.concatenate([pose[:, :3], turn], axis=-1))
         return qpos, jnp.zeros(model.nv).at[index.base_qvel].set(velocity)
@@ -499,49 +391,6 @@ class QuadrupedEnv:
         steps = aid * self.params.hold_time / self.dt * jax.random.uniform(time_key, ())
         who = jax.random.randint(who_key, (), 0, self.num_agents)
         return jnp.where(jnp.arange(self.num_agents) == who, steps, 0.0).astype(jnp.int32)
-
-    def _draw_world(self, key: jax.Array) -> World:
-        random, robots = self.params.randomization, self.robot.num_robots
-        keys = jax.random.split(key, 5)
-
-        def draw(key: jax.Array, span: Range | None, shape: tuple[int, ...], usual: float) -> jax.Array:
-            if span is None:
-                return jnp.full(shape, usual)
-            return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
-
-        return World(
-            friction=draw(keys[0], random.friction, (robots,), self.params.friction),
-            payload=draw(keys[1], random.payload, (robots,), 0.0),
-            center_of_mass=draw(keys[2], random.center_of_mass, (robots, 3), 0.0),
-            motor_strength=draw(keys[3], random.motor_strength, (robots,), 1.0),
-            action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
-        )
-
-    def _fields(self, world: World) -> dict[str, jax.Array]:
-        """Returns the model fields that this world has otherwise than the model."""
-        random, model, index = self.params.randomization, self.compiled.model, self.robot
-        fields = {}
-        as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-        if random.friction is not None:
-            fields["geom_friction"] = as_float(model.geom_friction).at[index.geoms, 0].set(world.friction[:, None])
-        if random.payload is not None:
-            fields["body_mass"] = as_float(model.body_mass).at[index.trunk_body].add(world.payload)
-        if random.center_of_mass is not None:
-            fields["body_ipos"] = as_float(model.body_ipos).at[index.trunk_body].add(world.center_of_mass)
-        if random.motor_strength is not None:
-            strength = jnp.ones(model.nu).at[index.actuator].set(world.motor_strength[:, None])[:, None]
-            fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
-            fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
-        return fields
-
-    def _pushed(self, data: mjx.Data, key: jax.Array) -> mjx.Data:
-        random, index = self.params.randomization, self.robot
-        if not random.push:
-            return data
-        when_key, size_key = jax.random.split(key)
-        now = jax.random.bernoulli(when_key, self.dt / random.push_period, (index.num_robots, 1))
-        change = jax.random.uniform(size_key, (index.num_robots, 2), minval=-random.push, maxval=random.push)
-        return data.replace(qvel=data.qvel.at[index.base_qvel[:, :2]].add(jnp.where(now, change, 0.0)))
 
     def _checked(self, action: jax.Array) -> jax.Array:
         action = jnp.asarray(action)
@@ -564,23 +413,7 @@ class QuadrupedEnv:
         noise = self.params.randomization.observation_noise
         if noise:
             obs = obs + noise * jax.random.normal(key, obs.shape)
-        robots = readings.joint_position.shape[0]
-        per_robot = jnp.concatenate(
-            [
-                readings.position_w, readings.quaternion, readings.linear_velocity_w, readings.angular_velocity_b,
-                readings.joint_position - go1.DEFAULT_JOINTS, readings.joint_velocity,
-            ],
-            axis=-1,
-        )  # fmt: skip
-        assert robots == self.robot.num_robots
-        index, model = self.robot, self.compiled.model
-        used_qpos = np.concatenate([index.base_qpos.ravel(), index.joint_qpos.ravel()])
-        used_qvel = np.concatenate([index.base_qvel.ravel(), index.joint_qvel.ravel()])
-        rest_qpos = np.setdiff1d(np.arange(model.nq), used_qpos)
-        rest_qvel = np.setdiff1d(np.arange(model.nv), used_qvel)
-        privileged = jnp.concatenate(
-            [per_robot.ravel(), state.data.qpos[rest_qpos], state.data.qvel[rest_qvel], state.gates.ravel()]
-        )
+        privileged = self.privileged.observe(readings, state.data, state.gates)
         obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
         return dataclasses.replace(
             state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged

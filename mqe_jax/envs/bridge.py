@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.envs.base import State, TaskParams
-from mqe_jax.envs.match import Match
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.match import Duel
 from mqe_jax.npc import Platform
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -58,7 +59,7 @@ class BridgeParams(TaskParams):
     rewards: BridgeRewards = BridgeRewards()
 
 
-class Go1Bridge(Match):
+class Go1Bridge(Duel):
     """Traverse Bridge.
 
     - Scene: two platforms, 1 m high, and between them a bridge 0.7 m wide; the robots start on one each.
@@ -91,22 +92,10 @@ class Go1Bridge(Match):
         contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(*blocks, deck), colors=(0, 2))
 
-    def spawn(self, key: jax.Array) -> jax.Array:
-        """Draws poses x, y, z, yaw (2, 4), m and rad: one on each platform, facing the bridge."""
-        params = self.params
-        noise = jax.random.uniform(key, (2, 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
-        place = jnp.array([[params.spawn_x[0], 0.0], [params.spawn_x[1], 0.0]]) + noise
-        rest = jnp.array([[params.spawn_height, 0.0], [params.spawn_height, jnp.pi]])
-        return jnp.concatenate([place, rest], axis=-1)
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
-        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
-
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
-        return self.duel(readings)
+    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+        """Says where the robots start, x, y, yaw of each, m and rad: one on each platform, facing the bridge."""
+        first, second = self.params.spawn_x
+        return (first, 0.0, 0.0), (second, 0.0, np.pi)
 
     def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -10,8 +11,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mqe_jax.envs.base import State, TaskParams
-from mqe_jax.envs.match import Match
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.match import Duel
 from mqe_jax.npc import Door
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -69,7 +69,7 @@ class DoorState:
     distance: jax.Array
 
 
-class Go1RevolvingDoor(Match):
+class Go1RevolvingDoor(Duel):
     """Revolving Door.
 
     - Scene: a wall with a gap of 2 m in which a door turns about its middle; both robots on the same side.
@@ -100,12 +100,10 @@ class Go1RevolvingDoor(Match):
             objects=(door,), colors=(0, 2),
         )  # fmt: skip
 
-    def spawn(self, key: jax.Array) -> jax.Array:
-        """Draws poses x, y, z, yaw (2, 4), m and rad: side by side before the door."""
-        params = self.params
-        noise = jax.random.uniform(key, (2, 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
-        place = jnp.array([[params.spawn_x, -params.spawn_y], [params.spawn_x, params.spawn_y]]) + noise
-        return jnp.concatenate([place, jnp.tile(jnp.array([params.spawn_height, 0.0]), (2, 1))], axis=-1)
+    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+        """Says where the robots start, x, y, yaw of each, m and rad: side by side before the door."""
+        x, y = self.params.spawn_x, self.params.spawn_y
+        return (x, -y, 0.0), (x, y, 0.0)
 
     def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DoorState:
         """Returns the task's own fields of a fresh world."""
@@ -114,15 +112,6 @@ class Go1RevolvingDoor(Match):
     def distance(self, readings: RobotReadings) -> jax.Array:
         """Returns each robot's horizontal distance to the middle of the line (2,), m."""
         return jnp.linalg.norm(readings.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1)
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
-        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
-
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
-        return self.duel(readings)
 
     def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""

@@ -6,6 +6,7 @@ The field lies between x 2 and 12; its goals are the gaps in the thick walls beh
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -61,12 +62,6 @@ class Football(QuadrupedEnv):
     kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()
     ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)
     colors: ClassVar[tuple[int, ...]] = ()
-    agents: ClassVar[int] = 2
-
-    def __init__(self, params: TaskParams | None = None, **engine: Any) -> None:
-        if params is not None and params.num_agents != self.agents:
-            raise ValueError(f"num_agents: {params.num_agents}; {self.name} is for {self.agents} robots")
-        super().__init__(params, **engine)
 
     def scene(self) -> Scene:
         """Says what is in the world."""
@@ -82,13 +77,9 @@ class Football(QuadrupedEnv):
         robots = len(self.kick_off)
         return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
 
-    def spawn(self, key: jax.Array) -> jax.Array:
-        """Draws poses x, y, z, yaw (R, 4), m and rad, of all robots."""
-        params = self.params
-        x, y, yaw = jnp.array(self.kick_off).T
-        pose = jnp.stack([x, y, jnp.full(len(x), params.spawn_height), yaw], axis=-1)
-        noise = jax.random.uniform(key, (len(x), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
-        return pose.at[:, :2].add(noise)
+    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+        """Says where the robots start, x, y, yaw of each, m and rad."""
+        return self.kick_off
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Puts the ball on its spot."""
@@ -262,4 +253,3 @@ class Go1Football2vs2(FootballMatch):
     # The second half is the first turned about the middle: both sides see the same kick-off.
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 2.0, np.pi), (10.0, -2.0, np.pi))
     colors = (0, 1, 2, 3)
-    agents = 4

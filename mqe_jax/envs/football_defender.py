@@ -12,7 +12,7 @@ from mujoco import mjx
 
 from mqe_jax.envs.base import State, TaskParams
 from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
-from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.npc import defend
 from mqe_jax.robot import RobotReadings
 from mqe_jax.walk_policy import command_index, default_commands
@@ -89,20 +89,12 @@ class Go1FootballDefender(Football):
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        return ObservationLayout(
-            (
-                Block("one_hot", 2, ONE_HOT),
-                Block("base", 6, BASE_INFO),
-                Block("mate", 6, BASE_INFO),
-                *BALL_BLOCKS,
-            )
-        )
+        return ObservationLayout((*PAIR, *BALL_BLOCKS))
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        info = readings.base_info[:2]
         return {
-            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "ball": for_all(self.ball(state.data), 2),
+            **pair(readings.base_info[:2]), "ball": for_all(self.ball(state.data), 2),
             "ball_velocity": for_all(self.ball_velocity(state.data), 2),
         }  # fmt: skip
 

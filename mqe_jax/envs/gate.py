@@ -12,7 +12,7 @@ from mujoco import mjx
 
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
-from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
@@ -88,11 +88,6 @@ class Go1Gate(QuadrupedEnv):
     title = "Narrow Gate"
     Params: ClassVar[type[TaskParams]] = GateParams
 
-    def __init__(self, params: TaskParams | None = None, **engine: Any) -> None:
-        if params is not None and params.num_agents != 2:
-            raise ValueError(f"num_agents: {params.num_agents}; go1gate is for 2 robots")
-        super().__init__(params, **engine)
-
     def scene(self) -> Scene:
         """Says what is in the world."""
         params = self.params
@@ -108,19 +103,11 @@ class Go1Gate(QuadrupedEnv):
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        return ObservationLayout(
-            (
-                Block("one_hot", 2, ONE_HOT),
-                Block("base", 6, BASE_INFO),
-                Block("mate", 6, BASE_INFO),
-                Block("gate", 2, "centre of the gap, m"),
-            )
-        )
+        return ObservationLayout((*PAIR, GATE))
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        info = readings.base_info
-        return {"one_hot": jnp.eye(2), "base": info, "mate": others(info), "gate": for_all(state.gates, 2)}
+        return {**pair(readings.base_info), "gate": for_all(state.gates, 2)}
 
     def target_distance(self, readings: RobotReadings) -> jax.Array:
         """Returns each robot's horizontal distance to its target (2,), m."""

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.robot import NUM_JOINTS, RobotReadings
 
 # How a command changes where left and right are swapped.
@@ -73,11 +74,6 @@ class Match(QuadrupedEnv):
         other = jnp.array([-1.0, -1.0, 1.0] if self.symmetry == "turn" else [1.0, -1.0, 1.0])
         return jnp.stack([vectors, vectors * other])
 
-    def duel(self, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the blocks `base` and `opponent` (2, 6) of one robot against one, each in its own frame."""
-        views = self.views(readings.base_info)
-        return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}
-
     def to_world(self, action: jax.Array) -> jax.Array:
         """Mirrors the actions (A, action_size) of team 1 where it sees left and right swapped."""
         if self.symmetry == "turn":
@@ -106,3 +102,17 @@ class Match(QuadrupedEnv):
             result[f"team{team}/draw"] = ~jnp.any(decided)
             result[f"team{team}/loss"] = decided[1 - team]
         return {"success": decided[0], **result}
+
+
+class Duel(Match):
+    """Base of the matches of one robot against one: each observes itself and the other, in its own frame."""
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
+
+    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
+        views = self.views(readings.base_info)
+        return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}

@@ -67,6 +67,14 @@ class ObservationLayout:
 
 ONE_HOT = "agent's id"
 BASE_INFO = "position, m, and roll, pitch, yaw, rad; environment frame"
+# The first blocks of two robots that work together; `pair` fills them.
+PAIR = (Block("one_hot", 2, ONE_HOT), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO))
+GATE = Block("gate", 2, "centre of the gap, m")
+
+
+def pair(info: jax.Array) -> dict[str, jax.Array]:
+    """Returns the blocks of `PAIR` from the base information (2, 6) of both robots."""
+    return {"one_hot": jnp.eye(2), "base": info, "mate": others(info)}
 
 
 def others(values: jax.Array) -> jax.Array:

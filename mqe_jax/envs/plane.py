@@ -56,6 +56,7 @@ class Go1Plane(QuadrupedEnv):
     name = "go1plane"
     title = "Plane"
     Params: ClassVar[type[TaskParams]] = PlaneParams
+    any_number = True
 
     def scene(self) -> Scene:
         """Says what is in the world."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
-from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.npc import Box
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -107,23 +107,14 @@ class Go1PushBox(QuadrupedEnv):
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        return ObservationLayout(
-            (
-                Block("one_hot", 2, ONE_HOT),
-                Block("base", 6, BASE_INFO),
-                Block("mate", 6, BASE_INFO),
-                Block("gate", 2, "centre of the gap, m"),
-                Block("box", 2, "centre x, y, m"),
-                Block("box_quaternion", 4, "wxyz"),
-            )
-        )
+        return ObservationLayout((*PAIR, GATE, Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")))
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        info, pose = readings.base_info, self.object_pose(state.data, "box")
+        pose = self.object_pose(state.data, "box")
         return {
-            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "gate": for_all(state.gates, 2),
-            "box": for_all(pose[:2], 2), "box_quaternion": for_all(pose[3:], 2),
+            **pair(readings.base_info), "gate": for_all(state.gates, 2), "box": for_all(pose[:2], 2),
+            "box_quaternion": for_all(pose[3:], 2),
         }  # fmt: skip
 
     def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:

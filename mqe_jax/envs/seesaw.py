@@ -11,7 +11,7 @@ from mujoco import mjx
 
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
-from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, others
+from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.npc import Platform, Seesaw
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -136,14 +136,11 @@ class Go1Seesaw(QuadrupedEnv):
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        return ObservationLayout(
-            (Block("one_hot", 2, ONE_HOT), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO))
-        )
+        return ObservationLayout(PAIR)
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        info = readings.base_info
-        return {"one_hot": jnp.eye(2), "base": info, "mate": others(info)}
+        return pair(readings.base_info)
 
     def on_platform(self, readings: RobotReadings) -> jax.Array:
         """Which robots are on the platform (2,) bool."""

@@ -11,7 +11,7 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
-from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, for_all, others
+from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.npc import Sheep, flock
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -162,23 +162,12 @@ class Go1SheepEasy(QuadrupedEnv):
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        return ObservationLayout(
-            (
-                Block("one_hot", 2, ONE_HOT),
-                Block("base", 6, BASE_INFO),
-                Block("mate", 6, BASE_INFO),
-                Block("gate", 2, "centre of the gap, m"),
-                Block("sheep", 2 * self.num_sheep, "x, y of each, m"),
-            )
-        )
+        return ObservationLayout((*PAIR, GATE, Block("sheep", 2 * self.num_sheep, "x, y of each, m")))
 
     def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        info = readings.base_info
-        return {
-            "one_hot": jnp.eye(2), "base": info, "mate": others(info), "gate": for_all(state.gates, 2),
-            "sheep": for_all(self.sheep(state.data), 2),
-        }  # fmt: skip
+        sheep = for_all(self.sheep(state.data), 2)
+        return {**pair(readings.base_info), "gate": for_all(state.gates, 2), "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
         """Which sheep are past the gate (S,) bool."""

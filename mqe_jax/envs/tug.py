@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mqe_jax.envs.base import State, TaskParams
-from mqe_jax.envs.match import Match
+from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.npc import Cylinder
 from mqe_jax.robot import Contacts, RobotReadings
@@ -74,7 +74,7 @@ class TugState:
     distance: jax.Array
 
 
-class Go1Tug(Match):
+class Go1Tug(Duel):
     """Push Cylinder.
 
     - Scene: a closed arena with a cylinder of 3 kg that slides along y; a robot on each side of it.
@@ -142,7 +142,7 @@ class Go1Tug(Match):
         speed = state.data.qvel[self.objects["cylinder"].qvel[0]]
         side = jnp.array([1.0, -1.0])
         return {
-            "base": self.duel(readings)["base"],
+            "base": super().observe(state, readings)["base"],
             "cylinder": jnp.stack([side * self.cylinder_y(state.data), side * speed], axis=-1),
             "distance": self.distance(readings, self.cylinder_y(state.data))[:, None],
             "last_cylinder": (side * state.task.previous_y)[:, None],

@@ -13,6 +13,7 @@ import numpy as np
 from mqe_jax import robot as go1
 from mqe_jax import walk_policy
 from mqe_jax.envs.walk import Condition, WalkEnv, WalkTask
+from mqe_jax.rotation import rotate, rotate_inverse
 from mqe_jax.terrain import nearest
 
 WARM_UP = 1.0  # s at the start of an episode that no error counts
@@ -106,9 +107,9 @@ def measure(
             readings = env.read(state.data)
             quaternion = readings.quaternion[0]
             feet = go1.foot_positions(readings.joint_position[0])
-            height = go1.rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
+            height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
             squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
-            speed = go1.rotate_inverse(quaternion, readings.linear_velocity_w[0])[0]
+            speed = rotate_inverse(quaternion, readings.linear_velocity_w[0])[0]
             return state, memory, (squares, speed, readings.position_w[0, :2], height, state.terminated)
 
         state, memory, record = jax.vmap(one)(state, memory)

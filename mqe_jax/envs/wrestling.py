@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -10,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs.base import State, TaskParams
-from mqe_jax.envs.match import Match
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.match import Duel
 from mqe_jax.npc import Platform, Ring
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -51,7 +51,7 @@ class WrestlingParams(TaskParams):
     rewards: WrestlingRewards = WrestlingRewards()
 
 
-class Go1Wrestling(Match):
+class Go1Wrestling(Duel):
     """Sumo Wrestling.
 
     - Scene: a platform with a ring of 3.4 m marked on it; the robots face each other, 2 m apart.
@@ -78,22 +78,10 @@ class Go1Wrestling(Match):
         contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(platform, ring), colors=(0, 2))
 
-    def spawn(self, key: jax.Array) -> jax.Array:
-        """Draws poses x, y, z, yaw (2, 4), m and rad: facing each other across the ring."""
-        params = self.params
-        noise = jax.random.uniform(key, (2, 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
-        place = jnp.array(self.center) + jnp.array([[0.0, -params.spawn_y], [0.0, params.spawn_y]]) + noise
-        rest = jnp.array([[params.spawn_height, 0.5 * jnp.pi], [params.spawn_height, -0.5 * jnp.pi]])
-        return jnp.concatenate([place, rest], axis=-1)
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
-        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
-
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
-        return self.duel(readings)
+    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+        """Says where the robots start, x, y, yaw of each, m and rad: facing each other across the ring."""
+        (x, y), apart = self.center, self.params.spawn_y
+        return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
     def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""

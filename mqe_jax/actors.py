@@ -1,0 +1,93 @@
+"""Who acts in an evaluation or a clip: a trained policy, a planner or something simpler, and the opponent."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.planners import PLANNERS
+from mqe_jax.train import policy_api
+
+PLANNER_NAMES = ("scripted", "random", "idle", "forward")
+
+Act = Callable[[jax.Array, Any, jax.Array], tuple[jax.Array, Any]]
+
+
+def against(act: Act, opponent: Act, env: Any) -> Act:
+    """Lets `act` play team 0 and `opponent`, which remembers nothing, team 1."""
+    second = jnp.asarray([agent in env.teams[1] for agent in range(env.num_agents)])[:, None]
+
+    def both(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        own_key, other_key = jax.random.split(key)
+        action, memory = act(obs, memory, own_key)
+        return jnp.where(second, opponent(obs, (), other_key)[0], action), memory
+
+    return both
+
+
+def planner(name: str, env: Any) -> Act:
+    """What acts without training; `act` as in `evaluate`. ValueError where the task has no scripted planner."""
+    shape = (env.num_agents, env.action_size)
+    plan = _scripted(env) if name == "scripted" else None
+
+    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        if plan is not None:
+            return plan(obs), memory
+        if name == "random":
+            return jax.random.uniform(key, (len(obs), *shape), minval=-1.0, maxval=1.0), memory
+        action = jnp.zeros((len(obs), *shape))
+        return (action.at[..., 0].set(0.25) if name == "forward" else action), memory
+
+    return act
+
+
+def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
+    """The task's planner for a batch of worlds: observations (N, A, O) to actions (N, A, 3)."""
+    if env.name not in PLANNERS:
+        raise ValueError(f"planner: {env.name} has none that is scripted; allowed for: {', '.join(PLANNERS)}")
+    if env.control != "command":
+        raise ValueError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
+    return jax.vmap(PLANNERS[env.name])
+
+
+@dataclasses.dataclass(frozen=True)
+class Actor:
+    """Who acts on what: a task with its parameters, and a trained policy or a planner's name."""
+
+    task: str
+    overrides: dict[str, Any]
+    policy: policy_api.Policy | str
+    opponent: str | None = None
+
+    def act(self, env: Any, deterministic: bool) -> Act:
+        """The batched `act`, against the opponent in a match; ValueError where it does not fit the task."""
+        act = self._own_act(env, deterministic)
+        if self.opponent is not None and len(env.teams) < 2:
+            raise ValueError(f"opponent: {self.task} is no match; leave --opponent out")
+        if len(env.teams) < 2 or self.opponent == "self":
+            return act
+        return against(act, planner(self.opponent or "idle", env), env)
+
+    def _own_act(self, env: Any, deterministic: bool) -> Act:
+        if isinstance(self.policy, str):
+            return planner(self.policy, env)
+        policy = self.policy
+        sizes = (env.num_agents, env.observation_size, env.action_size)
+        trained = (policy.sizes.agents, policy.sizes.observation, policy.sizes.action)
+        if sizes != trained:
+            raise ValueError(
+                f"policy: trained for (agents, observation, action) {trained}, but {self.task} has {sizes}"
+            )
+
+        def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+            return policy.act(obs, memory, key, deterministic=deterministic)
+
+        return act
+
+    def memory(self, num_envs: int) -> Any:
+        """What the policy remembers at an episode's start."""
+        return () if isinstance(self.policy, str) else self.policy.initial_memory(num_envs)

@@ -1,0 +1,97 @@
+"""Files of clips and pictures, written whole: .mp4, .gif and .png."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+SUFFIXES = (".mp4", ".gif", ".png")
+
+
+def check_output(path: Path) -> Path:
+    """Refuse what cannot be written, before any work; ValueError names the path and what is allowed."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
+    if path.is_dir():
+        raise ValueError(f"output {str(path)!r} is a folder, it must be a file")
+    parent = path.resolve().parent
+    while not parent.exists():
+        parent = parent.parent
+    try:
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"output {str(path)!r}: {str(parent)!r} cannot be written ({reason})") from None
+    if path.suffix.lower() == ".mp4":
+        try:
+            import_module("imageio_ffmpeg")
+        except ImportError:
+            raise ValueError(
+                f"output {str(path)!r}: .mp4 needs imageio-ffmpeg "
+                "(pip install 'mqe-jax[render]'); allowed without them: .gif, .png"
+            ) from None
+    return path
+
+
+def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    """Write frames (H, W, 3) uint8 as .mp4, .gif or .png (the last frame), whole or not at all."""
+    path = check_output(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix.lower()
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
+    try:
+        if suffix == ".mp4":
+            _write_mp4(temporary, frames, fps)
+        elif suffix == ".gif":
+            _write_gif(temporary, list(frames), fps)
+        else:
+            from PIL import Image
+
+            *_, frame = frames
+            Image.fromarray(frame).save(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    """H.264, yuv420p: what browsers and players take."""
+    # ffmpeg is started without a fork of this process, in which JAX's threads might hold locks.
+    program = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    first = next(frames)
+    height, width = (n // 2 * 2 for n in first.shape[:2])
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        try:
+            for frame in itertools.chain([first], frames):
+                process.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
+        except BrokenPipeError:
+            pass  # ffmpeg says below what was wrong
+        except BaseException:
+            process.kill()
+            raise
+        process.stdin.close()
+        said = process.stderr.read().decode(errors="replace")
+    if process.returncode:
+        raise ValueError(f"output: ffmpeg could not write the clip ({' '.join(said.split())})")
+
+
+def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
+    """One palette for the whole clip and no dithering, which keeps a gif small and still."""
+    from PIL import Image
+
+    sample = np.concatenate(frames[:: max(1, len(frames) // 6)][:8])
+    palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
+    images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)

@@ -1,0 +1,42 @@
+"""Rotations: quaternions wxyz, and roll, pitch, yaw in rad."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def quaternion_to_euler(quaternion: jax.Array) -> jax.Array:
+    """Converts wxyz quaternions (..., 4) to roll, pitch, yaw (..., 3), rad, applied in the order z, y, x."""
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return jnp.stack([roll, pitch, yaw], axis=-1)
+
+
+def euler_to_quaternion(euler: jax.Array) -> jax.Array:
+    """Converts roll, pitch, yaw (..., 3), rad, to wxyz quaternions (..., 4)."""
+    (cr, cp, cy), (sr, sp, sy) = (jnp.moveaxis(f(euler / 2), -1, 0) for f in (jnp.cos, jnp.sin))
+    return jnp.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
+    )
+
+
+def rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
+    """Turns body vectors (..., 3) into the world by wxyz quaternions (..., 4)."""
+    w, imaginary = quaternion[..., :1], quaternion[..., 1:]
+    vector = jnp.broadcast_to(vector, imaginary.shape)
+    cross = 2 * jnp.cross(imaginary, vector)
+    return vector + w * cross + jnp.cross(imaginary, cross)
+
+
+def rotate_inverse(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
+    """Turns world vectors (..., 3) into the body frame of wxyz quaternions (..., 4)."""
+    return rotate(quaternion * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
