@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.envs import TaskParams
 from mqe_jax.planners import PLANNERS
 from mqe_jax.train import policy_api
 
@@ -51,6 +52,8 @@ def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
         raise ValueError(f"planner: {env.name} has none that is scripted; allowed for: {', '.join(PLANNERS)}")
     if env.control != "command":
         raise ValueError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
+    if tuple(env.params.commands) != TaskParams.commands:
+        raise ValueError(f"commands: {env.params.commands}; planner 'scripted' gives {TaskParams.commands}")
     return jax.vmap(PLANNERS[env.name])
 
 

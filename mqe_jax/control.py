@@ -142,6 +142,7 @@ class Controller:
         mode: one of `MODES`.
         physics: steps the world.
         index: the robots in it.
+        num_agents: A, the first robots of the world.
         walk_params: weights of the walk policy, or None where it is not used.
         actuator_params: weights of the actuator network, or None for PD.
         commands: the opened commands.
@@ -152,6 +153,7 @@ class Controller:
     mode: str
     physics: Physics
     index: RobotIndex
+    num_agents: int
     walk_params: walk_policy.Params | None
     actuator_params: ActuatorParams | None
     commands: tuple[str, ...]
@@ -166,8 +168,10 @@ class Controller:
     @property
     def neutral(self) -> np.ndarray:
         """Actuator targets (R, 12) of a robot that is told nothing."""
-        rest = np.zeros(go1.NUM_JOINTS) if self.mode == "torque" else go1.DEFAULT_JOINTS
-        return np.tile(rest, (self.index.num_robots, 1)).astype(np.float32)
+        rest = np.tile(go1.DEFAULT_JOINTS, (self.index.num_robots, 1)).astype(np.float32)
+        if self.mode == "torque":
+            rest[: self.num_agents] = 0.0
+        return rest
 
     def reset(self) -> ControlState:
         """Returns the control state of a fresh world."""
@@ -192,7 +196,7 @@ class Controller:
             joint_velocity: (R, 12), rad/s.
             npc_commands: walk commands of the other robots (R - A, 15), if there are any.
         """
-        agents = action.shape[0]
+        agents = self.num_agents
         target = jnp.asarray(self.neutral)
         commands = jnp.zeros((agents, 15)) + self.default_commands
         if self.mode == "command":

@@ -94,13 +94,7 @@ class Box(Object):
         body = self._body(spec, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
         self._joint(body, "free", _JOINT.mjJNT_FREE)
         half = np.array(self.size) / 2
-        self._solid(body, _GEOM.mjGEOM_BOX, (0.80, 0.62, 0.38, 1.0), self.friction, size=half, **_FREE)
-        if visual:  # bands, so that one sees it turn
-            for side in (-1, 1):
-                _look(
-                    body, _GEOM.mjGEOM_BOX, (0.55, 0.40, 0.22, 1.0), pos=(0, 0, side * 0.35 * self.size[2]),
-                    size=(half[0] * 1.003, half[1] * 1.003, 0.04 * self.size[2]),
-                )  # fmt: skip
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.93, 0.93, 0.93, 1.0), self.friction, size=half, **_FREE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,7 +244,7 @@ class Platform(Object):
     Attributes:
         center: of its top face (x, y, z), m.
         size: full extents, m.
-        column: radius of the column that carries it to look at, m; none if 0.
+        column: radius of the column that carries it, m; none if 0.
     """
 
     center: Vector = (0.0, 0.0, 1.0)
@@ -262,8 +256,15 @@ class Platform(Object):
         x, y, top = self.center
         body = spec.worldbody.add_body(name=f"object/{self.name}", pos=(x, y, top - self.size[2] / 2))
         self._solid(body, _GEOM.mjGEOM_BOX, (0.95, 0.95, 0.95, 1.0), size=np.array(self.size) / 2, **_FLOOR)
-        if visual and self.column:
-            foot = top - self.size[2]
+        if not self.column:
+            return
+        foot = top - self.size[2]
+        body.add_geom(
+            name=f"object/{self.name}/column", type=_GEOM.mjGEOM_CAPSULE, group=3, mass=0.0, condim=3, priority=1,
+            contype=WALL_BIT, conaffinity=0, size=(self.column, 0, 0),
+            fromto=(0, 0, -top + self.size[2] / 2, 0, 0, -self.size[2] / 2 - self.column),
+        )  # fmt: skip
+        if visual:
             _look(
                 spec.worldbody, _GEOM.mjGEOM_CYLINDER, (0.75, 0.75, 0.78, 1.0), size=(self.column, foot / 2, 0),
                 pos=(x, y, foot / 2),

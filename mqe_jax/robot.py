@@ -183,7 +183,7 @@ def build_robot(
             return
         contype, conaffinity = _collision_bits(part, robot, num_robots, contacts)
         body.add_geom(
-            name=name, contype=contype, conaffinity=conaffinity, group=3, mass=0.0, condim=3, priority=1,
+            name=name, contype=contype, conaffinity=conaffinity, group=3, mass=0.0, condim=3, priority=2,
             friction=(friction, 0.005, 0.0001), rgba=(0.9, 0.3, 0.3, 0.4), **shape,
         )  # fmt: skip
 

@@ -22,12 +22,12 @@ class Scene:
 
     Attributes:
         track: ground, walls and spawn poses.
-        num_robots: A.
+        num_robots: R.
         contacts: which parts of the robots touch what.
         objects: everything else that is in it, added after the robots.
         colors: of the robots, as indices of `mqe_jax.robot_look.COLORS`; one after the other if empty.
         friction: sliding friction of the robots' shapes and the ground.
-        torque_control: the actuators take torques (N m) instead of PD joint targets (rad).
+        torque_robots: the actuators of the first so many robots take torques (N m), not PD joint targets (rad).
         foot_sensors: whether the feet's contact forces are measured too.
         timestep: physics step, s.
         solver_iterations: at most so many Newton iterations per physics step.
@@ -40,7 +40,7 @@ class Scene:
     objects: tuple[Object, ...] = ()
     colors: tuple[int, ...] = ()
     friction: float = 1.0
-    torque_control: bool = False
+    torque_robots: int = 0
     foot_sensors: bool = False
     timestep: float = 0.005
     solver_iterations: int = 4
@@ -106,7 +106,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
     for robot in range(scene.num_robots):
         body = robots.build_robot(
             robot, scene.num_robots, scene.contacts, visual=visual, friction=scene.friction,
-            torque_control=scene.torque_control, color=scene.colors[robot] if scene.colors else robot,
+            torque_control=robot < scene.torque_robots, color=scene.colors[robot] if scene.colors else robot,
         )  # fmt: skip
         spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
     for item in scene.objects:

@@ -12,6 +12,12 @@ import pytest
 from mqe_jax import robot as go1
 from mqe_jax.envs import TASKS, make
 
+# What a crowd stands around or upon, and how far from its middle, m.
+REACH = {
+    "box": 0.7, "ball": 0.3, "sheep4": 0.3, "sheep0": 0.3, "cylinder": 1.35, "door": 0.35, "seesaw": 0.3,
+    "platform0": 0.3, "platform": 0.3,
+}  # fmt: skip
+
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_a_crowd_fits_into_the_buffers(task: str) -> None:
@@ -24,31 +30,29 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     data.qpos[:] = start.data.qpos
     if model.nmocap:
         data.mocap_pos[:] = start.data.mocap_pos
-    robots = index.num_robots
-    middle = data.qpos[index.base_qpos[:, :2]].mean(0)
-    for name in ("box", "ball", "sheep4", "sheep0", "cylinder", "door"):
-        if name in env.objects:
-            middle = (
-                data.xpos[env.objects[name].body][:2] if name in ("cylinder", "door") else start_of(env, data, name)
-            )
-            break
-    angle = 2 * np.pi * np.arange(robots) / robots
-    reach = {"cylinder": 1.45, "door": 0.35, "box": 0.85}.get(name, 0.3) if name in env.objects else 0.3
-    data.qpos[index.base_qpos[:, 0]] = middle[0] + reach * np.cos(angle)
-    data.qpos[index.base_qpos[:, 1]] = middle[1] + reach * np.sin(angle)
     mujoco.mj_forward(model, data)
-    contacts, rows = [], []
+    robots = index.num_robots
+    place = data.qpos[index.base_qpos[:, :3]].mean(0)
+    name = next((name for name in REACH if name in env.objects), "")
+    if name:
+        place[:2] = data.xpos[env.objects[name].body][:2]
+    if name == "platform0":  # onto the first platform's edge, where the bridge begins
+        place[0] += 0.6
+    if name == "seesaw":  # onto its near end
+        place += [-1.6, 0.0, 0.15]
+    angle = 2 * np.pi * np.arange(robots) / robots
+    data.qpos[index.base_qpos[:, 0]] = place[0] + REACH.get(name, 0.3) * np.cos(angle)
+    data.qpos[index.base_qpos[:, 1]] = place[1] + REACH.get(name, 0.3) * np.sin(angle)
+    data.qpos[index.base_qpos[:, 2]] = place[2]
+    contacts, rows, touched = [], [], 0
     for _ in range(100):
         data.ctrl[index.actuator] = go1.DEFAULT_JOINTS + 0.4 * random.standard_normal((robots, 12))
         mujoco.mj_step(model, data, 4)
         contacts.append(data.ncon)
         rows.append(data.nefc)
+        touched += bool(name and np.any(data.contact.geom == env.objects[name].geom))
     assert max(contacts) >= 4 * robots - 2, "nobody touches anything: the scene is not crowded"
+    assert not name or touched >= 10, f"{name} was touched in {touched} of 100 steps: nobody is at it"
     assert np.mean(contacts) <= env.params.contacts_per_env
     assert max(rows) <= env.params.rows_per_env
-    print(f"{task}: contacts {np.mean(contacts):.1f} on average, {max(contacts)} at most, rows {max(rows)}")
-
-
-def start_of(env: Any, data: mujoco.MjData, name: str) -> np.ndarray:
-    """Where a free object is (2,), m."""
-    return data.qpos[env.objects[name].qpos[:2]]
+    print(f"{task}: contacts {np.mean(contacts):.1f} on average, {max(contacts)} at most, rows {max(rows)}, {touched}")

@@ -222,7 +222,7 @@ def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> No
 def test_goals_at_both_ends(duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
     state = with_ball(duel, fresh[duel.name], ball)
     robots = duel.read(state.data)
-    np.testing.assert_array_equal(duel.wins(state, robots), np.array(goals, bool))
+    np.testing.assert_array_equal(duel.ahead(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
     outcome = duel.outcome(state, robots, NO)
     assert [float(outcome[f"team{team}/win"]) for team in (0, 1)] == list(goals)
@@ -266,7 +266,9 @@ def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
     late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), rest(duel))
     assert late.truncated and not late.terminated and float(late.metrics["team0/draw"]) == 1
     fallen = duel_step(standing(duel, state, places, roll=1.0), rest(duel))
-    assert fallen.terminated and float(fallen.metrics["team0/draw"]) == 1
+    assert fallen.terminated and float(fallen.metrics["team0/loss"]) == 1 and float(fallen.metrics["team1/win"]) == 1
+    assert float(fallen.metrics["reward/fall"]) == -10
+    np.testing.assert_allclose(fallen.reward[0], -fallen.reward[1], atol=1e-6)
     for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
         goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), rest(duel))
         assert goal.terminated and float(goal.metrics["team0/win"]) == (sign == 1)
@@ -354,6 +356,19 @@ def test_an_idle_defender_is_told_to_stand(attack: Any, fresh: Any) -> None:
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
     np.testing.assert_allclose(told[:2], [0.5, 0.5], atol=1e-6)
     np.testing.assert_array_equal(told[3:], rest[3:])
+
+
+def test_the_defender_stands_while_the_agents_give_torques() -> None:
+    """It follows joint targets of the walk policy, whatever an agent's action means."""
+    env: Any = make("go1football-defender", impl="c", control="torque")
+    state = standing(env, env.reset(jax.random.PRNGKey(0)), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+    np.testing.assert_allclose(env.controller.neutral[:2], 0)
+    step = jax.jit(env.step)
+    for _ in range(50):
+        state = step(state, rest(env))
+    height = np.asarray(env.read(state.data).position_w)[:, 2]
+    assert height[2] > 0.25  # while the agents, without torques, lie down
+    assert height[:2].max() < 0.2
 
 
 # -- the whole --------------------------------------------------------------------------------------------------------

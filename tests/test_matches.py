@@ -121,11 +121,14 @@ def test_tug_observation_and_rewards() -> None:
     np.testing.assert_allclose(obs[0], [1.6, -1.3, 0.3, 0, 0, PI / 2, 0.13, 0, 1.43, 0.08], atol=1e-5)
     np.testing.assert_allclose(obs[1], [1.6, -1.63, 0.3, 0, 0, PI / 2, -0.13, 0, 1.5, -0.08], atol=1e-5)
     terms, reward = terms_of(env, state)
-    # Own terms: the cylinder went 0.03 m towards robot 1, who counts half of that as lost; robot 0 came 0.07 m
-    # closer to it, robot 1 got 0.1 m away. Less the opponent's: 0.045 m and 0.17 m.
-    np.testing.assert_allclose(terms["push"], [0.045, -0.045], atol=1e-6)
+    # Own terms: the cylinder is 0.13 m on robot 1's half, and moved on; robot 0 came 0.07 m closer to it, robot 1
+    # got 0.1 m away. Less the opponent's: 0.13 m and 0.17 m.
+    np.testing.assert_allclose(terms["push"], [0.13, -0.13], atol=1e-6)
     np.testing.assert_allclose(terms["approach"], [0.17, -0.17], atol=1e-6)
-    np.testing.assert_allclose(reward, [10 * 0.045 + 2 * 0.17, -10 * 0.045 - 2 * 0.17], atol=1e-5)
+    np.testing.assert_allclose(reward, [10 * 0.13 + 2 * 0.17, -10 * 0.13 - 2 * 0.17], atol=1e-5)
+    # From y 0.1 back to 0.06, still on robot 1's half: that counts half. On robot 0's half: it counts for robot 1.
+    np.testing.assert_allclose(terms_of(env, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6)
+    np.testing.assert_allclose(terms_of(env, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6)
 
 
 def test_tug_result_and_end() -> None:
@@ -136,8 +139,48 @@ def test_tug_result_and_end() -> None:
     state = tug_state(env, 0.0)
     assert not stepped(env, state).terminated
     assert stepped(env, dataclasses.replace(state, step=jnp.int32(env.max_steps - 1))).truncated
-    fallen = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0, 0, 0]])
+    fallen = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0, 0, 0]], {"cylinder": [0.13]})
     assert stepped(env, fallen).terminated
+    assert result(env, fallen) == (0, 1)  # who falls loses, also with the cylinder on the other half
+    both = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0.9, 0, 0]], {"cylinder": [0.13]})
+    assert result(env, both) == (0, 0)
+
+
+def test_the_arena_moves_the_middle_and_spawn_noise_counts() -> None:
+    env: Any = make("go1tug", impl="c", control="position", arena=(4.0, 6.0), spawn_noise=0.05)
+    assert env.center == (2.1, 0.0)
+    spawn = np.asarray(jax.vmap(env.spawn)(jax.random.split(jax.random.PRNGKey(0), 64)))
+    assert np.abs(spawn[..., 0] - 2.1).max() <= 1.05 and 0.04 < np.abs(np.abs(spawn[..., 1]) - 2.5).max() <= 0.05
+
+
+def test_a_diverged_match_is_a_draw() -> None:
+    env = env_of("go1wrestling")
+    state = env.reset(jax.random.PRNGKey(0))
+    state = dataclasses.replace(state, data=state.data.replace(qvel=jnp.full_like(state.data.qvel, jnp.nan)))
+    after = stepped(env, state)
+    assert after.terminated and float(after.metrics["diverged"]) == 1
+    for team in ("team0", "team1"):
+        assert [float(after.metrics[f"{team}/{name}"]) for name in ("win", "draw", "loss")] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("task", ["go1revolvingdoor", "go1wrestling", "go1bridge"])
+def test_a_duel_is_seen_by_both_in_their_own_frames(task: str) -> None:
+    env = env_of(task)
+    obs = observation(env, placed(env, [[1.0, -0.5, 0.3], [2.0, 0.7, 0.4]], [[0.1, 0.2, 0.3], [0, 0, -1.0]]))
+    first, second = [1.0, -0.5, 0.3, 0.1, 0.2, 0.3], [2.0, 0.7, 0.4, 0, 0, -1.0]
+    x = 2 * env.center[0]
+    mirrored = {
+        "reflect": ([2.0, -0.7, 0.4, 0, 0, 1.0], [1.0, 0.5, 0.3, -0.1, 0.2, -0.3]),
+        "turn": ([x - 2.0, -0.7, 0.4, 0, 0, PI - 1.0], [x - 1.0, 0.5, 0.3, 0.1, 0.2, 0.3 - PI]),
+    }[env.symmetry]
+    np.testing.assert_allclose(obs[0], [*first, *second], atol=1e-5)
+    np.testing.assert_allclose(obs[1], [*mirrored[0], *mirrored[1]], atol=1e-5)
+
+
+@pytest.mark.parametrize(("task", "top"), [("go1wrestling", "platform_top"), ("go1bridge", "top")])
+def test_a_platform_above_the_robots_is_refused(task: str, top: str) -> None:
+    with pytest.raises(ValueError, match=r"spawn_height: .* must be at least 2.30"):
+        make(task, impl="c", control="position", num_envs=1, **{top: 2.0})  # pyright: ignore[reportArgumentType]
 
 
 def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_the_arena() -> None:
@@ -171,6 +214,9 @@ def test_door_rewards_result_and_end() -> None:
     assert result(env, state) == (1, 0) and stepped(env, state).terminated
     assert result(env, placed(env, [[3.0, 0.0, 0.3], [3.9, 0.5, 0.3]])) == (0, 1)
     assert result(env, placed(env, [[3.9, 0.0, 0.3], [3.9, 0.5, 0.3]])) == (0, 0)
+    fallen = placed(env, [[3.0, 0.0, 0.3], [3.0, 0.5, 0.3]], [[0, 0, 0], [0.9, 0, 0]])
+    assert result(env, fallen) == (1, 0)
+    np.testing.assert_allclose(terms_of(env, fallen)[0]["win"], [1, -1])
     both = placed(env, [[0.6, -1.0, 0.3], [0.6, 1.0, 0.3]])
     assert not stepped(env, both).terminated
     assert env.max_steps == 250

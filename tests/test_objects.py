@@ -71,7 +71,7 @@ def test_a_box_slides_under_more_than_its_friction_only() -> None:
     assert moved[1] == pytest.approx(0.3 * npc.GRAVITY / 2, rel=0.1)  # (0.8 - 0.5) g for a second
 
 
-def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0) -> np.ndarray:
+def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0, seed: int = 0) -> np.ndarray:
     """Positions (T, S, 2) of sheep that nothing stops."""
 
     def move(carry: Any, key: Any) -> Any:
@@ -80,7 +80,7 @@ def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0) -
         return (position + STEP * velocity, velocity), position
 
     start = jnp.asarray(position, jnp.float32)
-    keys = jax.random.split(jax.random.PRNGKey(0), steps)
+    keys = jax.random.split(jax.random.PRNGKey(seed), steps)
     return np.asarray(jax.lax.scan(move, (start, jnp.zeros_like(start)), keys)[1])
 
 
@@ -103,6 +103,27 @@ def test_the_law_of_the_flock_by_hand() -> None:
         restlessness=0.0, step=STEP,
     )  # fmt: skip
     np.testing.assert_allclose(fast, [[2.0 - 0.0981, 0.0]], atol=1e-4)  # the top speed
+
+
+def test_a_sheep_by_itself_wanders() -> None:
+    restlessness = make("go1sheep-easy", impl="c", control="position").params.restlessness
+    track = [run_flock([[0.0, 0.0]], [[-20.0, 0.0]], 750, restlessness, seed)[:, 0] for seed in range(8)]
+    ways = [np.linalg.norm(way[-1] - way[0]) for way in track]
+    assert 0.03 < np.mean(ways) < 1.0
+
+
+def test_sheep_observation(herd: Any) -> None:
+    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), gates=jnp.array([[8.5, 0.4]]))
+    for number in range(9):
+        state = with_object(herd, state, f"sheep{number}", [number, -0.1 * number])
+    robots = herd.read(state.data)
+    obs = np.asarray(herd.observation_layout.pack(herd.observe(state, robots)))
+    info = np.asarray(robots.base_info)
+    for agent in range(2):
+        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], 8.5, 0.4]
+        for number in range(9):
+            expected += [number, -0.1 * number]
+        np.testing.assert_allclose(obs[agent], expected, atol=1e-6)
 
 
 def test_a_herd_wanders_and_stays_together() -> None:
@@ -146,6 +167,9 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
     reward, _ = weigh(box_env.rewards(behind, robots, no)[0], box_env.params.rewards, 2)
     np.testing.assert_allclose(reward, [10 * 0.05 + 1] * 2, atol=1e-4)
     assert float(box_env.outcome(behind, robots, no)["success"]) == 1
+    # 4.47 m is where the box was last; it is told how far that is from where it started.
+    start = dataclasses.replace(behind, task=dataclasses.replace(behind.task, start=jnp.float32(2.2)))
+    assert float(box_env.outcome(start, robots, no)["success/way"]) == pytest.approx(2.27, abs=1e-4)
 
 
 def test_pushbox_observation(box_env: Any) -> None:

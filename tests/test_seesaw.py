@@ -135,10 +135,10 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
     assert float(reward(readings(SPAWN, roll=(-0.79, 0.0), pitch=(0.9, 0.0)))[1][0]["fall"]) == 0
     fallen = readings([[7.70, 0.5, 0.28], [3.90, -0.5, 0.28]], roll=(0.9, 0.0))
     assert float(reward(fallen)[0]) == pytest.approx(-2, abs=1e-4)
-    # 0.3 m and 0.4 m from each other is 0.5 m, which is not closer; 0.4 m is: -0.25 / 0.16 for each.
+    # 0.3 m and 0.4 m from each other is 0.5 m, which is not closer; 0.4 m is: -0.25 / 0.16.
     assert float(reward(readings([[4.0, 0, 0.3], [4.31, 0.4, 0.3]]))[1][0]["crowding"]) == 0
     close = readings([[7.70, 0.5, 0.28], [7.30, 0.5, 0.28]])
-    assert float(reward(close)[0]) == pytest.approx(5 * (7.30 - 3.90) - 2 * 0.25 / 0.16, abs=1e-3)
+    assert float(reward(close)[0]) == pytest.approx(5 * (7.30 - 3.90) - 0.25 / 0.16, abs=1e-3)
 
 
 def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: State) -> None:

@@ -53,7 +53,6 @@ class VectorEnv:
         self.observation_size = env.observation_size
         self.privileged_observation_size = env.privileged_observation_size
         self.action_size = env.action_size
-        self.max_episode_steps = round(env.params.episode_length / env.dt)
 
     def reset(self, key: jax.Array) -> State:
         """Returns N fresh worlds; every leaf has a leading axis N."""

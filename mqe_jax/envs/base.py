@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -93,6 +93,7 @@ class QuadrupedEnv:
     name: ClassVar[str] = ""
     title: ClassVar[str] = ""
     Params: ClassVar[type[TaskParams]] = TaskParams
+    if_diverged: ClassVar[Mapping[str, float]] = {}  # metrics of a diverged world that are not 0
     any_number: ClassVar[bool] = False  # whether `num_agents` may be another than the task's own
     dt = walk_policy.STEP
 
@@ -112,9 +113,13 @@ class QuadrupedEnv:
         if num_envs < 1:
             raise ValueError(f"num_envs: {num_envs} must be at least 1")
         self.num_agents = self.params.num_agents
+        scene = self.scene()
+        network = self.params.actuator_network if control != "torque" else None
+        # Robots that are no agents follow joint targets, whatever the agents do.
+        torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
         self._scene = dataclasses.replace(
-            self.scene(), friction=self.params.friction, solver_iterations=self.params.solver_iterations,
-            torque_control=control == "torque" or self.params.actuator_network is not None,
+            scene, friction=self.params.friction, solver_iterations=self.params.solver_iterations,
+            torque_robots=torque_robots,
         )  # fmt: skip
         self.compiled = compile_scene(self._scene)
         self.robot, self.objects = self.compiled.robot, self.compiled.objects
@@ -125,10 +130,9 @@ class QuadrupedEnv:
         self.impl = self.physics.impl
         self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.robot, self.params.friction)
         self.privileged = PrivilegedObservation(self.compiled.model, self.robot, len(self.compiled.layout.anchors))
-        network = self.params.actuator_network if control != "torque" else None
         walks = control == "command" or self._scene.num_robots > self.num_agents
         self.controller = Controller(
-            mode=control, physics=self.physics, index=self.robot,
+            mode=control, physics=self.physics, index=self.robot, num_agents=self.num_agents,
             walk_params=walk_policy.load_params(self.params.walk_policy) if walks else None,
             actuator_params=load_actuator_network(network) if network else None, commands=self.params.commands,
             default_commands=walk_policy.default_commands(self.params.gait), lag=self.params.randomization.action_lag,
@@ -330,8 +334,8 @@ class QuadrupedEnv:
         failed = jnp.any(self.fallen(readings)) | diverged | (collision & self.params.end_on_collision)
         terminated = failed | self.ending(state, readings)
         metrics = {**logged, **self.outcome(state, readings, failed), "collision": collision}
-        clean = lambda x: jnp.where(diverged, 0.0, jnp.asarray(x, jnp.float32))  # noqa: E731
-        metrics = {name: clean(value) for name, value in metrics.items()}
+        clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
+        metrics = {name: clean(value, self.if_diverged.get(name, 0.0)) for name, value in metrics.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
         state = dataclasses.replace(
             state, reward=clean(reward), terminated=terminated, metrics=metrics,

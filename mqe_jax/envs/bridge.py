@@ -12,6 +12,7 @@ import numpy as np
 
 from mqe_jax.envs.base import State, TaskParams
 from mqe_jax.envs.match import Duel
+from mqe_jax.envs.params import check_above
 from mqe_jax.npc import Platform
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -36,7 +37,7 @@ class BridgeParams(TaskParams):
     """Parameters of Traverse Bridge.
 
     Attributes:
-        platform: extents of both platforms along x and y, m.
+        platform: extents of both platforms along x and y, m; they lie across the bridge, as in the paper's figure.
         platform_x: of their middles, m.
         top: height of platforms and bridge, m.
         bridge_width: m.
@@ -58,6 +59,10 @@ class BridgeParams(TaskParams):
     off_height: float = 0.5
     rewards: BridgeRewards = BridgeRewards()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above(self.spawn_height, self.top)
+
 
 class Go1Bridge(Duel):
     """Traverse Bridge.
@@ -73,8 +78,12 @@ class Go1Bridge(Duel):
 
     name = "go1bridge"
     title = "Traverse Bridge"
-    center = (5.0, 0.0)
     Params: ClassVar[type[TaskParams]] = BridgeParams
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Between the platforms, m."""
+        return sum(self.params.platform_x) / 2, 0.0
 
     def scene(self) -> Scene:
         """Says what is in the world."""
@@ -85,7 +94,7 @@ class Go1Bridge(Duel):
             Platform(f"platform{side}", center=(x, 0.0, params.top), size=(length, width, params.top))
             for side, x in enumerate(params.platform_x)
         ]
-        middle = ((first + second) / 2, 0.0, params.top)
+        middle = (*self.center, params.top)
         span = second - first - length
         deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
         track = Track(blocks=(Init(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
@@ -99,11 +108,11 @@ class Go1Bridge(Duel):
 
     def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        out = self.out(readings)
+        out = self.lost(readings)
         terms = {"win": self.versus(out[::-1] & ~out), "far_side": self.versus(self.across(readings))}
         return terms, None
 
-    def out(self, readings: RobotReadings) -> jax.Array:
+    def lost(self, readings: RobotReadings) -> jax.Array:
         """Which robots are off the bridge or have fallen (2,) bool."""
         return self.fallen(readings) | (readings.position_w[:, 2] < self.params.off_height)
 
@@ -116,11 +125,10 @@ class Go1Bridge(Duel):
         reached = jnp.stack([x[0] > second - half, x[1] < first + half])
         return reached & (height > params.top)
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
-        """The opponent is out and oneself is not; if neither is, who alone has come across."""
-        out, across = self.out(readings), self.across(readings)
-        return jnp.where(jnp.any(out), out[::-1] & ~out, across & ~across[::-1])
+    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+        """On the opponent's platform."""
+        return self.across(readings)
 
     def ending(self, state: State, readings: RobotReadings) -> jax.Array:
         """One is off the bridge or has fallen."""
-        return jnp.any(self.out(readings))
+        return jnp.any(self.lost(readings))

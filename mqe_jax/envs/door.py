@@ -23,7 +23,7 @@ class DoorRewards:
     """Weights of the reward terms; every side's own less the opponent's.
 
     Attributes:
-        win: for being the first past the line.
+        win: for being the first past the line, or if the opponent falls.
         approach: per m by which the robot came closer to the line's middle.
     """
 
@@ -41,6 +41,7 @@ class DoorParams(TaskParams):
         door_x: of the hinge, m.
         door_size: thickness, width and height of the door, m.
         door_mass: kg.
+        door_inertia: about the hinge, kg m^2.
         door_damping: of the hinge, N m s/rad.
         spawn_x: of the robots, m.
         spawn_y: distance of the robots from the middle line, m.
@@ -54,6 +55,7 @@ class DoorParams(TaskParams):
     door_x: float = 2.6
     door_size: tuple[float, float, float] = (0.08, 1.95, 0.8)
     door_mass: float = 4.0
+    door_inertia: float = 1.232
     door_damping: float = 0.5
     spawn_x: float = 0.5
     spawn_y: float = 1.0
@@ -75,7 +77,7 @@ class Go1RevolvingDoor(Duel):
     - Scene: a wall with a gap of 2 m in which a door turns about its middle; both robots on the same side.
     - Observation, the first on the right in its own view: own base info 6, the other's base info 6.
     - Reward: see `DoorRewards`; zero-sum.
-    - End: one is past the line, a fall, or 5 s. Win: past the line first.
+    - End: one is past the line, a fall, or 5 s. Win: past the line first, or the opponent falls.
 
     Source: paper, section III.
     """
@@ -92,7 +94,7 @@ class Go1RevolvingDoor(Duel):
         blocks = (Init(params.door_x - 0.5), wall, Plane(2.5), Closing())
         door = Door(
             "door", position=(params.door_x, 0.0), size=params.door_size, mass=params.door_mass,
-            damping=params.door_damping,
+            inertia=params.door_inertia, damping=params.door_damping,
         )  # fmt: skip
         contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         return Scene(
@@ -122,10 +124,10 @@ class Go1RevolvingDoor(Duel):
         }
         return terms, DoorState(distance)
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
         """Past the line."""
         return readings.position_w[:, 0] > self.params.line_x
 
     def ending(self, state: State, readings: RobotReadings) -> jax.Array:
         """One is past the line."""
-        return jnp.any(self.wins(state, readings))
+        return jnp.any(self.ahead(state, readings))

@@ -110,17 +110,19 @@ class Football(QuadrupedEnv):
 class FootballMatchRewards:
     """Weights of the reward terms; every side's own less the opponent's.
 
-    The release has no rewards for these matches; the two small terms beside the goal are ours.
+    The release has no rewards for these matches; all terms beside the goal are ours.
 
     Attributes:
         goal: when the ball is in the goal that the team attacks, which ends the episode.
         progress: per m by which the ball came closer to the middle of that goal.
         approach: per m by which the team's robot nearest to the ball came closer to it.
+        fall: when a robot of the team has fallen, which ends the episode as a lost one.
     """
 
     goal: float = 10.0
     progress: float = 0.3
     approach: float = 0.1
+    fall: float = -10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,13 +169,15 @@ class FootballMatch(Football, Match):
     - Observation, own side first: one-hot within the team, own base info 6, mate's, opponents', ball position 3,
       ball velocity 3.
     - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
-    - End: a goal, a fall, or 20 s. Win: a goal.
+    - End: a goal, a fall, or 20 s. Win: a goal, or the opponents' fall.
 
     Source: paper, section III; rewards and observations as the released system leaves them open.
     """
 
-    symmetry: ClassVar[str] = "turn"
-    center: ClassVar[tuple[float, float]] = (7.0, 0.0)
+    @property
+    def center(self) -> tuple[float, float]:
+        """The middle of the field, m."""
+        return float(GOALS[:, 0].mean()), 0.0
 
     def reset_task(
         self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array
@@ -222,6 +226,7 @@ class FootballMatch(Football, Match):
             "goal": self.versus(self.in_goal(state.data)),
             "progress": self.versus(state.task.goal - after.goal),
             "approach": self.versus(state.task.robot - after.robot),
+            "fall": self.versus(self.lost(readings)),
         }
         return terms, after
 
@@ -229,7 +234,7 @@ class FootballMatch(Football, Match):
         """A goal ends the episode."""
         return jnp.any(self.in_goal(state.data))
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
         """The ball is in the goal that the team attacks."""
         return self.in_goal(state.data)
 

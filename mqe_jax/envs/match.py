@@ -8,6 +8,7 @@ Team 0 has the first half of the agents, team 1 the second half.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import jax
@@ -29,12 +30,19 @@ class Match(QuadrupedEnv):
     """Base of the competitive tasks.
 
     Reward: every side has terms of its own, and gets them less the opponent's: what one gains the other loses.
+    Result: a team that has lost outright (`lost`: a robot of it has fallen, in all matches) loses unless both have;
+    otherwise the team that is `ahead` wins, and it is a draw if both or none are.
     Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended now; they count when it
-    ends. `success` is a win of team 0.
+    ends. `success` is a win of team 0. A diverged world is a draw.
     """
 
     symmetry: ClassVar[str] = "turn"
-    center: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """The point about which the match is symmetric, m."""
+        return 0.0, 0.0
 
     @property
     def teams(self) -> tuple[tuple[int, ...], ...]:
@@ -49,9 +57,18 @@ class Match(QuadrupedEnv):
 
     # -- what a match says ----------------------------------------------------------------------------------------
 
+    def lost(self, readings: RobotReadings) -> jax.Array:
+        """Returns which team has lost outright (2,) bool: one of its robots has fallen."""
+        return jnp.any(self.fallen(readings).reshape(2, -1), axis=1)
+
+    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+        """Returns which team is ahead where none has lost outright (2,) bool."""
+        return jnp.zeros(2, bool)
+
     def wins(self, state: State, readings: RobotReadings) -> jax.Array:
-        """Returns which team wins if the episode ends now (2,) bool; a draw if both or none do."""
-        raise TypeError(f"{type(self).__name__}: wins() is not defined")
+        """Returns which team wins if the episode ends now (2,) bool, one at most."""
+        lost, ahead = self.lost(readings), self.ahead(state, readings)
+        return jnp.where(jnp.any(lost), lost[::-1] & ~lost, ahead & ~ahead[::-1])
 
     # -- both sides' views ----------------------------------------------------------------------------------------
 
@@ -95,13 +112,12 @@ class Match(QuadrupedEnv):
     def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
         """Win, draw and loss of each team; `success` is a win of team 0."""
         wins = self.wins(state, readings)
-        decided = wins & ~wins[::-1]
         result = {}
         for team in (0, 1):
-            result[f"team{team}/win"] = decided[team]
-            result[f"team{team}/draw"] = ~jnp.any(decided)
-            result[f"team{team}/loss"] = decided[1 - team]
-        return {"success": decided[0], **result}
+            result[f"team{team}/win"] = wins[team]
+            result[f"team{team}/draw"] = ~jnp.any(wins)
+            result[f"team{team}/loss"] = wins[1 - team]
+        return {"success": wins[0], **result}
 
 
 class Duel(Match):

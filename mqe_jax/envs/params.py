@@ -8,6 +8,8 @@ from mqe_jax.control import check_commands
 from mqe_jax.envs.overrides import Range
 from mqe_jax.envs.randomization import Randomization
 
+CLEARANCE = 0.3  # m, from the ground to the trunk of a robot that stands
+
 
 @dataclasses.dataclass(frozen=True)
 class TaskParams:
@@ -21,7 +23,8 @@ class TaskParams:
         spawn_joint_scale: the joints start at their default angles times a factor from this range.
         spawn_velocity: half-width of the uniform noise on all six base velocities, m/s and rad/s.
         max_roll: an episode ends when any |roll| is greater, rad.
-        max_pitch: likewise |pitch|, rad.
+        max_pitch: likewise |pitch|, rad; pitch is an arcsine, so that a limit over pi / 2, as the released system has
+            it, is never met: a robot that turns over pitching shows a roll of pi.
         min_height: an episode ends when any trunk is lower, m.
         max_height: likewise higher, m.
         end_on_collision: an episode ends when any trunk touches anything with more than `collision_force`.
@@ -67,3 +70,10 @@ class TaskParams:
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name}: {getattr(self, name)} must be positive")
         check_commands(self.commands)
+
+
+def check_above(spawn_height: float, top: float) -> None:
+    """Raises a ValueError if robots would start inside what they are to stand on, whose top is at `top` m."""
+    least = top + CLEARANCE
+    if spawn_height < least:
+        raise ValueError(f"spawn_height: {spawn_height} must be at least {least:.2f}, as the ground is at {top}")

@@ -1,4 +1,4 @@
-"""go1pushbox, the paper's Push Box: two robots push a box, too heavy for one, through a gate."""
+"""go1pushbox, the paper's Push Box: two robots push a box, hard to push for one, through a gate."""
 
 from __future__ import annotations
 
@@ -64,9 +64,10 @@ class PushBoxParams(TaskParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PushBoxState:
-    """`x`: of the box after the last step (), m."""
+    """`x`: of the box after the last step (), m; `start`: at the reset (), m."""
 
     x: jax.Array
+    start: jax.Array
 
 
 class Go1PushBox(QuadrupedEnv):
@@ -102,7 +103,8 @@ class Go1PushBox(QuadrupedEnv):
 
     def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> PushBoxState:
         """Returns the task's own fields of a fresh world."""
-        return PushBoxState(self.object_pose(data, "box")[0])
+        x = self.object_pose(data, "box")[0]
+        return PushBoxState(x, x)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -121,7 +123,7 @@ class Go1PushBox(QuadrupedEnv):
         """Returns the reward terms and the task's fields after the step."""
         x = self.object_pose(state.data, "box")[0]
         terms = {"progress": x - state.task.x, "success": self.through(state).astype(jnp.float32)}
-        return terms, PushBoxState(x)
+        return terms, PushBoxState(x, state.task.start)
 
     def through(self, state: State) -> jax.Array:
         """Whether the box is past the gate () bool."""
@@ -129,4 +131,4 @@ class Go1PushBox(QuadrupedEnv):
 
     def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the box is past the gate; `success/way`: how far it came, m."""
-        return {"success": self.through(state), "success/way": state.task.x - self.params.box_x}
+        return {"success": self.through(state), "success/way": state.task.x - state.task.start}

@@ -29,7 +29,7 @@ class SeesawRewards:
         aside: per m^2 of the robots' squared distances from the centre line, added, above `aside_base`.
         collision: when any trunk touches anything.
         fall: when any robot rolls or pitches over.
-        crowding: per robot and 1 / d^2 while the robots are closer than 0.5 m.
+        crowding: per 1 / d^2 while the robots are closer than 0.5 m, once for both.
     """
 
     success: float = 10.0
@@ -159,7 +159,7 @@ class Go1Seesaw(QuadrupedEnv):
             "aside": jnp.sum(jnp.square(y)) - params.aside_base,
             "collision": collision.astype(jnp.float32),
             "fall": jnp.any((roll > params.max_roll) | (pitch > params.max_pitch)).astype(jnp.float32),
-            "crowding": reward.crowding(readings.position_w[:, :2]),
+            "crowding": reward.crowding(readings.position_w[:, :2]) / 2,
         }
         return terms, SeesawState(x)
 

@@ -49,7 +49,8 @@ class SheepEasyParams(TaskParams):
         flock_center: middle of the flock at reset, m.
         flock_spacing: of the rows, m.
         flock_noise: half-width of the uniform noise on each sheep's position, m.
-        restlessness: how much the sheep move of their own will (s in `mqe_jax.npc.flock`).
+        restlessness: how much the sheep move of their own will (s in `mqe_jax.npc.flock`). The released system has 0
+            for the single sheep; the paper's sheep always move.
         sheep_friction: sliding friction of the sheep with the ground.
         rewards: weights.
     """
@@ -67,7 +68,7 @@ class SheepEasyParams(TaskParams):
     flock_center: tuple[float, float] = (3.0, 0.0)
     flock_spacing: float = 1.5
     flock_noise: float = 0.3
-    restlessness: float = 0.02
+    restlessness: float = 0.08
     sheep_friction: float = 1.0
     rewards: SheepRewards = SheepRewards()
 

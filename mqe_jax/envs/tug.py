@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs.base import State, TaskParams
@@ -17,13 +19,16 @@ from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Track
 
+_START_X = 0.1  # m, where the arena starts
+
 
 @dataclasses.dataclass(frozen=True)
 class TugRewards:
     """Weights of the reward terms; every side's own less the opponent's.
 
     Attributes:
-        push: per m that the cylinder moved towards the opponent, half of it counted where that is negative.
+        push: per m that the cylinder is on the opponent's half, in every step; half of it in steps in which it moves
+            back.
         approach: per m by which the robot came closer to the cylinder's axis.
     """
 
@@ -41,7 +46,7 @@ class TugParams(TaskParams):
         height: of the cylinder, m.
         mass: of the cylinder, kg.
         cylinder_friction: sliding friction of the cylinder with the ground.
-        spawn_x: half-width of the range in which the robots start along x, m.
+        spawn_x: half-width of the range in which the robots start along x, m; the first starts on the side of -y.
         spawn_y: distance of the robots from the middle line, m.
         win_by: a side wins when the cylinder is so far on the opponent's half at the end, m.
         rewards: weights.
@@ -80,22 +85,25 @@ class Go1Tug(Duel):
     - Scene: a closed arena with a cylinder of 3 kg that slides along y; a robot on each side of it.
     - Observation, own side first: own base info 6, the cylinder's y and speed, distance to its axis, its last y.
     - Reward: see `TugRewards`; zero-sum.
-    - End: a fall, or 15 s. Win: the cylinder is on the opponent's half at the end.
+    - End: a fall, or 15 s. Win: the cylinder is on the opponent's half at the end, or the opponent falls.
 
     Source: paper, section III.
     """
 
     name = "go1tug"
     title = "Push Cylinder"
-    center = (1.6, 0.0)
     Params: ClassVar[type[TaskParams]] = TugParams
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """The middle of the arena, m."""
+        return _START_X + self.params.arena[0] / 2, 0.0
 
     def scene(self) -> Scene:
         """Says what is in the world."""
         params = self.params
         length, width = params.arena
-        # The track starts at x 0.1, which the first block keeps free.
-        track = Track(blocks=(Plane(0.1), Init(length), Closing()), width=width)
+        track = Track(blocks=(Plane(_START_X), Init(length), Closing()), width=width)
         reach = width / 2 - params.radius
         cylinder = Cylinder(
             "cylinder", position=self.center, radius=params.radius, height=params.height, mass=params.mass,
@@ -104,12 +112,16 @@ class Go1Tug(Duel):
         contacts = Contacts(robot=("trunk",), object=("trunk", "foot", "calf"))
         return Scene(track, num_robots=2, contacts=contacts, objects=(cylinder,), colors=(0, 2))
 
+    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+        """Says where the robots start, x, y, yaw of each, m and rad: one on each side, facing the middle."""
+        x, apart = self.center[0], self.params.spawn_y
+        return (x, -apart, 0.5 * np.pi), (x, apart, -0.5 * np.pi)
+
     def spawn(self, key: jax.Array) -> jax.Array:
         """Draws poses x, y, z, yaw (2, 4), m and rad: one on each side, facing the middle."""
         params = self.params
-        x = self.center[0] + jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
-        y, yaw = jnp.array([-params.spawn_y, params.spawn_y]), jnp.array([0.5, -0.5]) * jnp.pi
-        return jnp.stack([x, y, jnp.full(2, params.spawn_height), yaw], axis=-1)
+        aside = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
+        return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(aside)
 
     def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> TugState:
         """Returns the task's own fields of a fresh world."""
@@ -150,15 +162,15 @@ class Go1Tug(Duel):
 
     def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        y = self.cylinder_y(state.data)
-        push = (y - state.task.y) * jnp.array([1.0, -1.0])
+        y, side = self.cylinder_y(state.data), jnp.array([1.0, -1.0])
+        back = side * (y - state.task.y) < 0
         distance = self.distance(readings, y)
         terms = {
-            "push": self.versus(jnp.where(push < 0, 0.5 * push, push)),
+            "push": self.versus(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),
             "approach": self.versus(state.task.distance - distance),
         }
         return terms, TugState(y, state.task.y, distance)
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
         """The cylinder is on the opponent's half."""
         return self.cylinder_y(state.data) * jnp.array([1.0, -1.0]) > self.params.win_by

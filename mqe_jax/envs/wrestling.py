@@ -12,6 +12,7 @@ import numpy as np
 
 from mqe_jax.envs.base import State, TaskParams
 from mqe_jax.envs.match import Duel
+from mqe_jax.envs.params import check_above
 from mqe_jax.npc import Platform, Ring
 from mqe_jax.robot import Contacts, RobotReadings
 from mqe_jax.scene import Scene
@@ -32,8 +33,9 @@ class WrestlingParams(TaskParams):
     A robot has lost when its |roll| or |pitch| is over the limit, or its trunk is outside the ring or too low.
 
     Attributes:
+        center: of platform and ring, m.
         platform: extents of the platform, m; a part of it is in the ground.
-        platform_top: height of its top, m.
+        platform_top: height of its top, m: where robots that are dropped from the listed height land on their feet.
         ring_radius: m.
         ring_depth: a trunk this far below the platform's top has left it, m.
         spawn_y: distance of the robots from the ring's middle, m.
@@ -43,12 +45,17 @@ class WrestlingParams(TaskParams):
     episode_length: float = 15.0
     spawn_height: float = 0.74
     max_roll: float = 0.4 * np.pi
+    center: tuple[float, float] = (3.1, 0.0)
     platform: tuple[float, float, float] = (4.37, 4.37, 0.5)
     platform_top: float = 0.4
     ring_radius: float = 1.7
     ring_depth: float = 0.2
     spawn_y: float = 1.0
     rewards: WrestlingRewards = WrestlingRewards()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above(self.spawn_height, self.platform_top)
 
 
 class Go1Wrestling(Duel):
@@ -64,8 +71,12 @@ class Go1Wrestling(Duel):
 
     name = "go1wrestling"
     title = "Sumo Wrestling"
-    center = (3.1, 0.0)
     Params: ClassVar[type[TaskParams]] = WrestlingParams
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """The ring's middle, m."""
+        return self.params.center
 
     def scene(self) -> Scene:
         """Says what is in the world."""
@@ -87,18 +98,13 @@ class Go1Wrestling(Duel):
         """Returns the reward terms and the task's fields after the step."""
         return {"win": self.versus(self.wins(state, readings))}, None
 
-    def out(self, readings: RobotReadings) -> jax.Array:
+    def lost(self, readings: RobotReadings) -> jax.Array:
         """Which robots have fallen or left the ring (2,) bool."""
         params = self.params
         apart = jnp.linalg.norm(readings.position_w[:, :2] - jnp.array(self.center), axis=-1)
         below = readings.position_w[:, 2] < params.platform_top - params.ring_depth
         return self.fallen(readings) | (apart > params.ring_radius) | below
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
-        """The opponent has fallen or left the ring, and oneself has not."""
-        out = self.out(readings)
-        return out[::-1] & ~out
-
     def ending(self, state: State, readings: RobotReadings) -> jax.Array:
         """One has fallen or left the ring."""
-        return jnp.any(self.out(readings))
+        return jnp.any(self.lost(readings))

@@ -30,8 +30,6 @@ def plan_pushbox(obs: jax.Array) -> jax.Array:
     # The robot on the side to which the box shall turn pushes less.
     wish = jnp.clip(1.2 * aside, -0.35, 0.35)
     lead = jnp.clip(2.0 * (wish - turned), -0.4, 0.4) * -side
-    push = go_to(position, yaw, place, turned)
-    speed = jnp.clip(0.4 + 0.5 * lead, 0.1, 0.5)
-    forward = push.at[:, 0].set(speed)
     walk = go_to(position, yaw, place, turned)
-    return jnp.where(both, forward, walk)
+    push = walk.at[:, 0].set(jnp.clip(0.4 + 0.5 * lead, 0.1, 0.5))
+    return jnp.where(both, push, walk)
