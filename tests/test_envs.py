@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax import robot as go1
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
-from mqe_jax.robot import RobotReadings
-from mqe_jax.rotation import euler_to_quaternion
+from tests.worlds import placed, readings
 
 Array = jax.Array
 
@@ -30,27 +28,6 @@ def gate() -> QuadrupedEnv:
 @pytest.fixture(scope="module")
 def gate_step(gate: QuadrupedEnv) -> Any:
     return jax.jit(gate.step)
-
-
-def readings(position: Any, yaw: Any = (0.0, 0.0), roll: Any = (0.0, 0.0), force: Any = (0.0, 0.0)) -> RobotReadings:
-    """Two robots, standing still with the default joints."""
-    zeros = jnp.zeros(2)
-    turn = euler_to_quaternion(jnp.stack([jnp.asarray(roll), zeros, jnp.asarray(yaw)], axis=-1))
-    joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
-    return RobotReadings(
-        jnp.asarray(position), turn, jnp.zeros((2, 3)), jnp.zeros((2, 3)), joints, jnp.zeros((2, 12)),
-        jnp.asarray(force), jnp.zeros((2, 2), bool),
-    )  # fmt: skip
-
-
-def moved(env: QuadrupedEnv, state: State, position: Any, quaternion: Any = None) -> State:
-    """The state with both robots somewhere else, standing still."""
-    index = env.robot
-    qpos = state.data.qpos.at[index.base_qpos[:, :3]].set(jnp.asarray(position))
-    turn = jnp.tile(jnp.array([1.0, 0, 0, 0]), (2, 1)) if quaternion is None else quaternion
-    qpos = qpos.at[index.base_qpos[:, 3:]].set(turn)
-    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
-    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
 
 
 # Observation sizes of the paper's tasks (SPEC of the released system); one-hots of matches are within the team.
@@ -195,19 +172,19 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     """A fall, a trunk too low or too high, a collision and the time limit end an episode; standing does not."""
     state = gate.reset(jax.random.PRNGKey(1))
     still = jnp.zeros((2, 12))
-    stand = moved(gate, state, [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]])
+    stand = placed(gate, [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state)
     after = gate_step(stand, still)
     assert not after.terminated and not after.truncated
     late = gate_step(dataclasses.replace(stand, step=jnp.int32(gate.max_steps - 1)), still)
     assert late.truncated and not late.terminated
-    rolled = euler_to_quaternion(jnp.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]]))
-    assert gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], rolled), still).terminated
-    pitched = euler_to_quaternion(jnp.array([[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]))
-    assert not gate_step(moved(gate, state, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched), still).terminated
-    assert gate_step(moved(gate, state, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]]), still).terminated
+    rolled = [[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    assert gate_step(placed(gate, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], rolled, state=state), still).terminated
+    pitched = [[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]
+    assert not gate_step(placed(gate, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched, state=state), still).terminated
+    assert gate_step(placed(gate, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]], state=state), still).terminated
     fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
     assert fallen.tolist() == [True, False]
-    bumped = gate_step(moved(gate, state, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]]), still)
+    bumped = gate_step(placed(gate, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
 
 

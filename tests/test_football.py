@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import robot as go1
 from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import PLANNERS
 from mqe_jax.walk_policy import default_commands
+from tests.worlds import observation, placed, still, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -60,37 +60,18 @@ def attack_step(attack: Any) -> Any:
     return jax.jit(attack.step)
 
 
-def placed(state: State, qpos: np.ndarray, qvel: np.ndarray) -> State:
-    return dataclasses.replace(state, data=state.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
-
-
 def with_ball(env: QuadrupedEnv, state: State, position: Any, velocity: Any = (0.0, 0.0, 0.0)) -> State:
-    """The state with the ball somewhere else, moving."""
-    ball, qpos, qvel = env.objects["ball"], np.array(state.data.qpos), np.array(state.data.qvel)
-    qpos[ball.qpos[:3]] = [*position, 0.1] if len(position) == 2 else position
-    qvel[ball.qvel[:3]] = velocity
-    return placed(state, qpos, qvel)
+    """The state with the ball somewhere else, moving; on the ground if only x and y are given."""
+    return with_object(env, state, "ball", [*position, 0.1] if len(position) == 2 else position, velocity)
 
 
 def standing(env: QuadrupedEnv, state: State, places: Any, roll: float = 0.0) -> State:
     """The state with all robots at x, y, yaw, standing still; the first one, instead, rolled over at yaw 0."""
-    places, index, qpos = np.asarray(places), env.robot, np.array(state.data.qpos)
-    qpos[index.base_qpos[:, :3]] = np.c_[places[:, :2], np.full(len(places), 0.31)]
-    none = np.zeros(len(places))
-    qpos[index.base_qpos[:, 3:]] = np.stack([np.cos(places[:, 2] / 2), none, none, np.sin(places[:, 2] / 2)], -1)
+    places = np.asarray(places)
+    euler = np.c_[np.zeros((len(places), 2)), places[:, 2]]
     if roll:
-        qpos[index.base_qpos[0, 3:]] = [np.cos(roll / 2), np.sin(roll / 2), 0, 0]
-    qpos[index.joint_qpos] = go1.DEFAULT_JOINTS
-    return placed(state, qpos, np.zeros(env.compiled.model.nv, np.float32))
-
-
-def seen(env: QuadrupedEnv, state: State) -> np.ndarray:
-    """What the agents of a state made by hand observe."""
-    return np.asarray(jax.jit(lambda s: env.observation_layout.pack(env.observe(s, env.read(s.data))))(state))
-
-
-def rest(env: QuadrupedEnv) -> jax.Array:
-    return jnp.zeros((env.num_agents, env.action_size))
+        euler[0] = [roll, 0.0, 0.0]
+    return placed(env, np.c_[places[:, :2], np.full(len(places), 0.31)], euler, state=state)
 
 
 # -- the field --------------------------------------------------------------------------------------------------------
@@ -150,7 +131,7 @@ def test_a_shot_goes_in_or_bounces_off(duel: Any, duel_step: Any, fresh: Any, y:
     state = with_ball(duel, state, (11.0, y), (3.0, 0.0, 0.0))
     scored = False
     for _ in range(40):
-        state = duel_step(state, rest(duel))
+        state = duel_step(state, still(duel))
         x = float(duel.ball(state.data)[0])
         scored |= bool(duel.wins(state, duel.read(state.data))[0])
         assert inside or x < 11.95  # the wall is at 12, the ball's radius 0.1
@@ -178,7 +159,7 @@ def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], fresh: 
     here = with_ball(env, standing(env, state, places), (6.3, 1.1, 0.4), (0.8, -0.3, 0.1))
     there = standing(env, state, np.roll(turned(places), half, axis=0))
     there = with_ball(env, there, (14 - 6.3, -1.1, 0.4), (-0.8, 0.3, 0.1))
-    ours, theirs = seen(env, here), seen(env, there)
+    ours, theirs = observation(env, here), observation(env, there)
     np.testing.assert_allclose(theirs, np.roll(ours, half, axis=0), atol=1e-5)
     assert np.abs(ours[0] - ours[half]).max() > 0.5  # and the two sides do not see the same here
 
@@ -186,7 +167,7 @@ def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], fresh: 
 def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
     env = envs["go1football-2vs2"]
     state = with_ball(env, standing(env, fresh[env.name], PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
-    obs = seen(env, state)
+    obs = observation(env, state)
     info = [[x, y, 0.31, 0, 0, yaw] for x, y, yaw in PLACES]
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
     np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *info[2], *info[3], *ball], atol=1e-5)
@@ -197,12 +178,12 @@ def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> No
 
     env = envs["go1football-1vs1"]
     state = with_ball(env, standing(env, fresh[env.name], PLACES[:2]), (6.3, 1.1))
-    obs = seen(env, state)
+    obs = observation(env, state)
     np.testing.assert_allclose(obs[1], [1, *other[1], *other[0], 7.7, -1.1, 0.1, 0, 0, 0], atol=1e-5)
 
     env = envs["go1football-defender"]
     state = with_ball(env, standing(env, fresh[env.name], PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
-    obs = seen(env, state)
+    obs = observation(env, state)
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
     np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *ball], atol=1e-5)
     np.testing.assert_allclose(obs[1], [0, 1, *info[1], *info[0], *ball], atol=1e-5)
@@ -261,16 +242,16 @@ def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
     """A goal, a fall and the time limit end a match; play does not."""
     places = [(4, 0, 0), (10, 0, np.pi)]
     state = standing(duel, fresh[duel.name], places)
-    play = duel_step(state, rest(duel))
+    play = duel_step(state, still(duel))
     assert not play.terminated and not play.truncated
-    late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), rest(duel))
+    late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), still(duel))
     assert late.truncated and not late.terminated and float(late.metrics["team0/draw"]) == 1
-    fallen = duel_step(standing(duel, state, places, roll=1.0), rest(duel))
+    fallen = duel_step(standing(duel, state, places, roll=1.0), still(duel))
     assert fallen.terminated and float(fallen.metrics["team0/loss"]) == 1 and float(fallen.metrics["team1/win"]) == 1
     assert float(fallen.metrics["reward/fall"]) == -10
     np.testing.assert_allclose(fallen.reward[0], -fallen.reward[1], atol=1e-6)
     for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
-        goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), rest(duel))
+        goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), still(duel))
         assert goal.terminated and float(goal.metrics["team0/win"]) == (sign == 1)
         assert float(goal.metrics["reward/goal"]) == 10 * sign
         np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
@@ -286,14 +267,14 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
     own = with_ball(attack, state, (1.9, 0.0))
     assert float(attack.rewards(own, robots, NO)[0]["goal"]) == 0
     # A goal counts until the end of the episode, also when the ball comes out again.
-    scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), rest(attack))
+    scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), still(attack))
     assert float(scored.metrics["success"]) == 1 and not scored.terminated
-    out = attack_step(with_ball(attack, scored, (11.0, 0.5)), rest(attack))
+    out = attack_step(with_ball(attack, scored, (11.0, 0.5)), still(attack))
     assert float(out.metrics["success"]) == 1 and float(out.metrics["reward/goal"]) == 0
-    late = attack_step(dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)), rest(attack))
+    late = attack_step(dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)), still(attack))
     assert late.truncated and not late.terminated and float(late.metrics["success"]) == 0
     fallen = standing(attack, state, [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)], roll=1.0)
-    assert attack_step(fallen, rest(attack)).terminated
+    assert attack_step(fallen, still(attack)).terminated
 
 
 # -- the defender -----------------------------------------------------------------------------------------------------
@@ -339,7 +320,7 @@ def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, at
     for ball in ((8.0, -2.0), (8.0, 2.0)):
         state = with_ball(attack, state, ball)
         for _ in range(250):
-            state = attack_step(state, rest(attack))
+            state = attack_step(state, still(attack))
         assert not np.asarray(state.terminated)
         target = goal + 0.6 * (np.array(ball) - goal)
         place = np.asarray(attack.read(state.data).position_w)[2, :2]
@@ -365,7 +346,7 @@ def test_the_defender_stands_while_the_agents_give_torques() -> None:
     np.testing.assert_allclose(env.controller.neutral[:2], 0)
     step = jax.jit(env.step)
     for _ in range(50):
-        state = step(state, rest(env))
+        state = step(state, still(env))
     height = np.asarray(env.read(state.data).position_w)[:, 2]
     assert height[2] > 0.25  # while the agents, without torques, lie down
     assert height[:2].max() < 0.2

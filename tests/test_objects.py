@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from mqe_jax import npc
-from mqe_jax.envs import QuadrupedEnv, State, VectorEnv, make
+from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import Ball, Box, Sheep, flock
 from mqe_jax.planners import PLANNERS
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Init, Plane, Track
+from tests.worlds import with_object
 
 STEP = 0.02
 
@@ -30,12 +31,6 @@ def box_env() -> QuadrupedEnv:
 @pytest.fixture(scope="module")
 def herd() -> Any:
     return make("go1sheep-hard", impl="c", control="position")
-
-
-def with_object(env: QuadrupedEnv, state: State, name: str, values: Any) -> State:
-    """The state with one object somewhere else."""
-    qpos = state.data.qpos.at[env.objects[name].qpos].set(jnp.asarray(values))
-    return dataclasses.replace(state, data=state.data.replace(qpos=qpos))
 
 
 def plain(*objects: npc.Object) -> Any:

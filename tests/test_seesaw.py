@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 
 from mqe_jax import npc
-from mqe_jax import robot as go1
 from mqe_jax.envs import State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robot import RobotReadings
-from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Init, Plane, Track
+from tests.worlds import angles, placed, readings
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 WEIGHT = 11.31 * npc.GRAVITY  # N, of a Go1
@@ -39,25 +38,6 @@ def step(env: Any) -> Any:
 @pytest.fixture(scope="module")
 def fresh(env: Any) -> State:
     return jax.jit(env.reset)(jax.random.PRNGKey(0))
-
-
-def readings(position: Any, roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0)) -> RobotReadings:
-    """Two robots, standing still with the default joints."""
-    turn = euler_to_quaternion(jnp.stack([jnp.asarray(angle) for angle in (roll, pitch, yaw)], axis=-1))
-    joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
-    none = jnp.zeros((2, 3))
-    return RobotReadings(
-        jnp.asarray(position), turn, none, none, joints, jnp.zeros((2, 12)), jnp.zeros(2), jnp.zeros((2, 2), bool)
-    )
-
-
-def placed(env: Any, state: State, position: Any, roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0)) -> State:
-    """The state with both robots somewhere else, standing still with the default joints."""
-    at, qpos = env.robot, state.data.qpos
-    turn = euler_to_quaternion(jnp.stack([jnp.asarray(roll), jnp.asarray(pitch), jnp.zeros(2)], axis=-1))
-    qpos = qpos.at[at.base_qpos].set(jnp.concatenate([jnp.asarray(position), turn], axis=-1))
-    qpos = qpos.at[at.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
-    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
 
 
 def on_plank(x: float, height: float = 0.31) -> list[float]:
@@ -153,20 +133,20 @@ def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: S
 def test_endings(env: Any, step: Any, fresh: State) -> None:
     """A fall, a trunk too low, a collision and the time limit end an episode; standing, also high up, does not."""
     still = jnp.zeros((2, 12))
-    stand = placed(env, fresh, SPAWN)
+    stand = placed(env, SPAWN, state=fresh)
     after = step(stand, still)
     assert not after.terminated and not after.truncated
     late = step(dataclasses.replace(stand, step=jnp.int32(env.max_steps - 1)), still)
     assert late.truncated and not late.terminated
     high = [[1.0, -0.75, 1.6], SPAWN[1]]
-    assert not step(placed(env, fresh, high), still).terminated
-    assert not step(placed(env, fresh, high, pitch=(1.2, 0.0)), still).terminated
-    rolled = step(placed(env, fresh, high, roll=(0.9, 0.0)), still)
+    assert not step(placed(env, high, state=fresh), still).terminated
+    assert not step(placed(env, high, angles(pitch=(1.2, 0.0)), state=fresh), still).terminated
+    rolled = step(placed(env, high, angles(roll=(0.9, 0.0)), state=fresh), still)
     assert rolled.terminated and float(rolled.metrics["reward/fall"]) == -2
-    bumped = step(placed(env, fresh, [[0.16, -0.75, 0.31], SPAWN[1]]), still)  # into the back wall
+    bumped = step(placed(env, [[0.16, -0.75, 0.31], SPAWN[1]], state=fresh), still)  # into the back wall
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
-    low = placed(env, fresh, [[1.0, -0.75, 0.075], SPAWN[1]])
+    low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
     qpos = low.data.qpos.at[env.robot.joint_qpos[0, 1::3]].set(np.pi)
     low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still)
     assert low.terminated and float(low.metrics["collision"]) == 0 and float(low.metrics["reward/fall"]) == 0
@@ -211,7 +191,7 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
     still = jnp.zeros((2, 12))
 
     def stand(first: Any, second: Any, pitch: Any) -> State:
-        after = placed(env, fresh, [first, second], pitch=pitch)
+        after = placed(env, [first, second], angles(pitch=pitch), state=fresh)
         for _ in range(30):
             after = step(after, still)
         return after

@@ -12,6 +12,7 @@ import numpy as np
 
 from mqe_jax import robot as go1
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.robot import RobotReadings
 from mqe_jax.rotation import euler_to_quaternion
 
 
@@ -31,6 +32,29 @@ def placed(
     for name, coordinates in (objects or {}).items():
         qpos = qpos.at[env.objects[name].qpos].set(jnp.asarray(coordinates, jnp.float32))
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
+
+
+def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0)) -> jax.Array:
+    """Roll, pitch, yaw (R, 3), rad, from one row each."""
+    return jnp.stack([jnp.asarray(angle, jnp.float32) for angle in (roll, pitch, yaw)], axis=-1)
+
+
+def readings(position: Any, **euler: Any) -> RobotReadings:
+    """What is read off two robots at positions (2, 3), m, which stand still with the default joints; see `angles`."""
+    joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
+    none = jnp.zeros((2, 3))
+    return RobotReadings(
+        jnp.asarray(position), euler_to_quaternion(angles(**euler)), none, none, joints, jnp.zeros((2, 12)),
+        jnp.zeros(2), jnp.zeros((2, 2), bool),
+    )  # fmt: skip
+
+
+def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()) -> State:
+    """The state with an object's first coordinates, and its first velocities, as given."""
+    index, data = env.objects[name], state.data
+    qpos = data.qpos.at[index.qpos[: len(position)]].set(jnp.asarray(position, jnp.float32))
+    qvel = data.qvel.at[index.qvel[: len(velocity)]].set(jnp.asarray(velocity, jnp.float32))
+    return dataclasses.replace(state, data=data.replace(qpos=qpos, qvel=qvel))
 
 
 def observation(env: QuadrupedEnv, state: State) -> np.ndarray:

@@ -38,7 +38,7 @@ class WrestlingParams(TaskParams):
         platform_top: height of its top, m: where robots that are dropped from the listed height land on their feet.
         ring_radius: m.
         ring_depth: a trunk this far below the platform's top has left it, m.
-        spawn_y: distance of the robots from the ring's middle, m.
+        spawn_y: distance of the robots from the ring's middle, m; the first starts on the side of -y.
         rewards: weights.
     """
 
