@@ -217,7 +217,7 @@ def build_robot(
         sphere = mujoco.mjtGeom.mjGEOM_SPHERE
         collide(calf, "foot", f"{leg}_foot", type=sphere, size=(FOOT_RADIUS, 0, 0), pos=(0, 0, -CALF_LENGTH))
         if visual:
-            look.add_leg(hip, thigh, calf, left, paint)
+            look.add_leg(hip, thigh, calf, left, paint, (THIGH_LENGTH, CALF_LENGTH), FOOT_RADIUS)
     if visual:
         look.add_trunk(trunk, paint)
     for index, name in enumerate(JOINT_NAMES):

@@ -15,8 +15,6 @@ COLORS = (
 )
 
 
-_THIGH = _CALF = 0.213  # m, lengths of the links
-_FOOT = 0.02  # m, radius
 _DARK = (0.13, 0.14, 0.16, 1.0)
 _GREY = (0.32, 0.34, 0.37, 1.0)
 
@@ -48,14 +46,25 @@ def add_trunk(trunk: Any, color: tuple[float, ...]) -> None:
         )
 
 
-def add_leg(hip: Any, thigh: Any, calf: Any, left: int, color: tuple[float, ...]) -> None:
-    """Adds what is looked at of one leg, on the left (1) or the right (-1), in a colour."""
+def add_leg(
+    hip: Any, thigh: Any, calf: Any, left: int, color: tuple[float, ...], lengths: tuple[float, float], foot: float
+) -> None:
+    """Adds what is looked at of one leg, on the left (1) or the right (-1), in a colour.
+
+    Args:
+        hip, thigh, calf: bodies.
+        left: 1 or -1.
+        color: red, green, blue, alpha.
+        lengths: of thigh and calf, m.
+        foot: its radius, m.
+    """
+    thigh_length, calf_length = lengths
     cylinder, capsule = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
     _look(hip, cylinder, _GREY, size=(0.043, 0, 0), fromto=(0, left * 0.03, 0, 0, left * 0.075, 0))
     _look(thigh, cylinder, color, size=(0.04, 0, 0), fromto=(0, -left * 0.022, 0, 0, left * 0.02, 0))
     _look(thigh, capsule, _DARK, size=(0.022, 0, 0), fromto=(0, 0, -0.02, -0.012, 0, -0.11))
-    _look(thigh, capsule, _DARK, size=(0.017, 0, 0), fromto=(-0.012, 0, -0.11, 0, 0, -_THIGH))
+    _look(thigh, capsule, _DARK, size=(0.017, 0, 0), fromto=(-0.012, 0, -0.11, 0, 0, -thigh_length))
     _look(calf, capsule, _GREY, size=(0.013, 0, 0), fromto=(0, 0, 0, 0.008, 0, -0.1))
-    _look(calf, capsule, _GREY, size=(0.01, 0, 0), fromto=(0.008, 0, -0.1, 0, 0, -_CALF))
-    _look(calf, sphere, _DARK, size=(_FOOT, 0, 0), pos=(0, 0, -_CALF))
+    _look(calf, capsule, _GREY, size=(0.01, 0, 0), fromto=(0.008, 0, -0.1, 0, 0, -calf_length))
+    _look(calf, sphere, _DARK, size=(foot, 0, 0), pos=(0, 0, -calf_length))

@@ -118,6 +118,11 @@ BAD = {
     "episodes": (["eval", "fake", "--episodes", "0"], ["episodes", "0", "at least 1"]),
     "planner": (["eval", "fake", "--planner", "randm"], ["'randm'", "random"]),
     "no scripted planner": (["eval", "fake", "--planner", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
+    "commands of a planner": (
+        ["eval", "go1gate", "--planner", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
+        ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],
+    ),
+    "robots": (["eval", "go1tug", "--set", "num_agents=3"], ["num_agents: 3", "go1tug is for 2 robots"]),
     "run": (["eval", "runs/none"], ["runs/none"]),
     "no run": (["eval", "."], ["config.yaml"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
