@@ -32,6 +32,8 @@ class Scene:
         timestep: physics step, s.
         solver_iterations: at most so many Newton iterations per physics step.
         line_search_iterations: at most so many line search steps per iteration.
+        max_contacts: MJX-JAX, which otherwise computes constraints for every pair of shapes that could ever touch, keeps
+            so many of the deepest contacts. The other engines keep all.
     """
 
     track: Track
@@ -45,6 +47,7 @@ class Scene:
     timestep: float = 0.005
     solver_iterations: int = 4
     line_search_iterations: int = 8
+    max_contacts: int = 32
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_robots <= robots.MAX_ROBOTS:
@@ -102,6 +105,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    spec.add_numeric(name="max_contact_points", size=1, data=[scene.max_contacts])
     layout = build_terrain(spec, scene.track, visual=visual)
     for robot in range(scene.num_robots):
         body = robots.build_robot(

@@ -119,13 +119,13 @@ class QuadrupedEnv:
         torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
         self._scene = dataclasses.replace(
             scene, friction=self.params.friction, solver_iterations=self.params.solver_iterations,
-            torque_robots=torque_robots,
+            torque_robots=torque_robots, max_contacts=self.params.contacts_per_robot * scene.num_robots,
         )  # fmt: skip
         self.compiled = compile_scene(self._scene)
         self.robot, self.objects = self.compiled.robot, self.compiled.objects
         self.physics = Physics(
-            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self.params.contacts_per_env,
-            rows_per_env=self.params.rows_per_env,
+            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self._scene.max_contacts,
+            rows_per_env=self.params.rows_per_robot * scene.num_robots,
         )  # fmt: skip
         self.impl = self.physics.impl
         self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.robot, self.params.friction)

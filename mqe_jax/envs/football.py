@@ -145,8 +145,6 @@ class Football2vs2Params(FootballParams):
     """
 
     num_agents: int = 4
-    contacts_per_env: int = 48
-    rows_per_env: int = 256
     rewards: FootballMatchRewards = FootballMatchRewards()
 
 

@@ -40,8 +40,6 @@ class DefenderParams(FootballParams):
         rewards: weights.
     """
 
-    contacts_per_env: int = 36
-    rows_per_env: int = 192
     defender_idle: bool = False
     rewards: DefenderRewards = DefenderRewards()
 

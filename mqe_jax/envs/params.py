@@ -35,8 +35,9 @@ class TaskParams:
         actuator_network: weights file of an actuator network in place of PD; none if None.
         friction: sliding friction of robots and ground.
         solver_iterations: at most so many solver iterations per physics step.
-        contacts_per_env: contacts that a world may have on average, for Warp's buffer.
-        rows_per_env: constraint rows that a world may have, for Warp's buffer.
+        contacts_per_robot: room for contacts, times the robots of a world: of a world on MJX-JAX, which keeps the
+            deepest ones, and of all worlds together on Warp.
+        rows_per_robot: room for constraint rows of a world on Warp, likewise.
         randomization: domain randomisation.
         hold_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
             for up to hold_time x aid, s, so that agents first learn one at a time what they must do in turn.
@@ -60,13 +61,20 @@ class TaskParams:
     actuator_network: str | None = None
     friction: float = 1.0
     solver_iterations: int = 4
-    contacts_per_env: int = 24
-    rows_per_env: int = 128
+    contacts_per_robot: int = 12
+    rows_per_robot: int = 64
     randomization: Randomization = Randomization()
     hold_time: float = 4.0
 
     def __post_init__(self) -> None:
-        for name in ("episode_length", "collision_force", "friction", "solver_iterations"):
+        for name in (
+            "episode_length",
+            "collision_force",
+            "friction",
+            "solver_iterations",
+            "contacts_per_robot",
+            "rows_per_robot",
+        ):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name}: {getattr(self, name)} must be positive")
         check_commands(self.commands)

@@ -57,7 +57,7 @@ class PushBoxParams(TaskParams):
     box_friction: float = 1.0
     box_x: float = 2.5
     box_noise: float = 0.5
-    contacts_per_env: int = 32
+    contacts_per_robot: int = 16
     rewards: PushBoxRewards = PushBoxRewards()
 
 

@@ -86,6 +86,8 @@ class SheepHardParams(SheepEasyParams):
     flock: tuple[int, int] = (3, 3)
     flock_center: tuple[float, float] = (5.0, 0.0)
     restlessness: float = 0.1
+    contacts_per_robot: int = 20  # sheep touch each other
+    rows_per_robot: int = 96
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
 
 
