@@ -33,7 +33,7 @@ class Scene:
         solver_iterations: at most so many Newton iterations per physics step.
         line_search_iterations: at most so many line search steps per iteration.
         max_contacts: MJX-JAX keeps so many of the deepest contacts; it would otherwise have constraints for every pair
-            of shapes that could ever touch, and be half as fast. The other engines keep all.
+            of shapes that could ever touch, and be half as fast on a CPU. The other engines keep all.
     """
 
     track: Track
