@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
+from mqe_jax.collision import OBJECT_BIT, WALL_BIT
 from mqe_jax.envs import QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.npc import Object
+from mqe_jax.objects import Object
 from mqe_jax.planners import PLANNERS
 from mqe_jax.planners.steering import go_to
-from mqe_jax.robot import OBJECT_BIT, WALL_BIT, Contacts, RobotReadings
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Block as TerrainBlock
 from mqe_jax.terrain import Closing, Init, Layout, Plane, Track, Wall, register_block

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
-    from mqe_jax.train.policy_api import load_policy
+    from mqe_jax.train.policy import load_policy
 
 __version__ = "0.1.0"
 __all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks"]
@@ -24,5 +24,5 @@ def __getattr__(name: str) -> Any:
     # Imported when first used, so that `mqe --help` does not wait for JAX and MuJoCo.
     if name not in __all__:
         raise AttributeError(f"module 'mqe_jax' has no attribute {name!r}")
-    home = "mqe_jax.train.policy_api" if name == "load_policy" else "mqe_jax.envs"
+    home = "mqe_jax.train.policy" if name == "load_policy" else "mqe_jax.envs"
     return getattr(importlib.import_module(home), name)

@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax import robot as go1
 from mqe_jax import walk_policy
+from mqe_jax.errors import nearest
 from mqe_jax.physics import Physics
-from mqe_jax.robot import RobotIndex
-from mqe_jax.terrain import nearest
+from mqe_jax.robots import go1
+from mqe_jax.robots.index import RobotIndex
 from mqe_jax.walk_policy import WalkMemory
 
 MODES = ("command", "position", "torque")

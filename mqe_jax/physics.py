@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.terrain import nearest
+from mqe_jax.errors import nearest
 
 IMPLS = ("auto", "jax", "warp", "c")
 

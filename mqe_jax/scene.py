@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax import robot as robots
-from mqe_jax.npc import Object, ObjectIndex, index_objects
-from mqe_jax.robot import Contacts, RobotIndex
+from mqe_jax import robots
+from mqe_jax.collision import MAX_ROBOTS
+from mqe_jax.objects import Object, ObjectIndex, index_objects
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotIndex
 from mqe_jax.terrain import Layout, Track, build_terrain
 
 
@@ -25,7 +27,7 @@ class Scene:
         num_robots: R.
         contacts: which parts of the robots touch what.
         objects: everything else that is in it, added after the robots.
-        colors: of the robots, as indices of `mqe_jax.robot_look.COLORS`; one after the other if empty.
+        colors: of the robots, as indices of `mqe_jax.robots.visuals.COLORS`; one after the other if empty.
         friction: sliding friction of the robots' shapes and the ground.
         torque_robots: the actuators of the first so many robots take torques (N m), not PD joint targets (rad).
         foot_sensors: whether the feet's contact forces are measured too.
@@ -50,8 +52,8 @@ class Scene:
     max_contacts: int = 32
 
     def __post_init__(self) -> None:
-        if not 1 <= self.num_robots <= robots.MAX_ROBOTS:
-            raise ValueError(f"Scene.num_robots: {self.num_robots} is not between 1 and {robots.MAX_ROBOTS}")
+        if not 1 <= self.num_robots <= MAX_ROBOTS:
+            raise ValueError(f"Scene.num_robots: {self.num_robots} is not between 1 and {MAX_ROBOTS}")
         if self.colors and len(self.colors) != self.num_robots:
             raise ValueError(f"Scene.colors: {self.colors} has not one of each of the {self.num_robots} robots")
 

@@ -11,14 +11,14 @@ Frame: the environment's, x along the track from its start, y across it with 0 o
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
 import mujoco
 import numpy as np
 
-from mqe_jax.robot import GROUND_BIT, WALL_BIT
+from mqe_jax.collision import GROUND_BIT, WALL_BIT
+from mqe_jax.errors import nearest
 
 # A block parameter that may be given as (easy, hard): its value is interpolated by the track's difficulty in [0, 1].
 Ranged = float | tuple[float, float]
@@ -123,12 +123,6 @@ def block(name: str, **parameters: Any) -> Block:
                 f"terrain block {name}: unknown parameter {key!r}{nearest(key, fields)}; allowed: {', '.join(fields)}"
             )
     return BLOCKS[name](**parameters)
-
-
-def nearest(word: str, known: Any) -> str:
-    """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
-    match = difflib.get_close_matches(str(word), [str(name) for name in known], 1, 0.5)
-    return f" (did you mean {match[0]!r}?)" if match else ""
 
 
 @dataclasses.dataclass(frozen=True)

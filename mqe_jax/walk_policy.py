@@ -23,7 +23,6 @@ import itertools
 import json
 import os
 import pathlib
-import zipfile
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -31,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.robot import ACTION_SCALE, DEFAULT_JOINTS, NUM_JOINTS
+from mqe_jax.robots.go1 import ACTION_SCALE, DEFAULT_JOINTS, NUM_JOINTS
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
@@ -282,27 +281,3 @@ def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[
         os.replace(temporary, file)
     except OSError as error:
         raise ValueError(f"walk policy: cannot write {file}: {error.strerror}") from None
-
-
-def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Reads the float32 weights of a TorchScript file of a `torch.nn.Sequential`, without torch.
-
-    The file is a zip archive whose `data.pkl` names storages kept beside it; only tensors and plain
-    containers are accepted, so nothing in the file is executed.
-
-    Returns:
-        `{"0.weight": (out, in), "0.bias": (out,), ...}`.
-    """
-    from mqe_jax._torchscript import read_state
-
-    try:
-        return read_state(path)
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"walk policy {path}: not a TorchScript Sequential of float32 layers ({error})") from None
-
-
-def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:
-    """Reads the official pair of TorchScript checkpoints into this package's weights."""
-    flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
-    flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}
-    return _nested(flat, f"{adaptation}, {body}")

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
-from mqe_jax import cli, commands
+from mqe_jax import cli
+from mqe_jax.cli import arguments, commands
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--minibatches", "1"]
 
@@ -45,7 +46,7 @@ def test_alone_it_says_what_to_do_first(capfd: pytest.CaptureFixture[str]) -> No
     assert "mqe train go1gate" in out and "mqe render" in out
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in cli.COMMANDS), ["walk", "eval"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in arguments.COMMANDS), ["walk", "eval"]])
 def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main([*command, "--help"])
@@ -94,7 +95,7 @@ def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest
 
 
 def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mqe_jax.render.gl_backend", lambda: None)
+    monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
     assert cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
     assert (tmp_path / "new" / "clip.png").stat().st_size > 500
 

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import robot as go1
 from mqe_jax.envs import TASKS, make
+from mqe_jax.robots import go1
 
 # What a crowd stands around or upon, and how far from its middle, m.
 REACH = {

@@ -270,7 +270,7 @@ def test_overrides_reach_every_level() -> None:
 
 def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
     code = (
-        "import sys, jax, mqe_jax, mqe_jax.train.train, mqe_jax.train.walk\n"
+        "import sys, jax, mqe_jax, mqe_jax.train.runner, mqe_jax.walk.training\n"
         "env = mqe_jax.make('go1plane', impl='c', control='position')\n"
         "env.reset(jax.random.PRNGKey(0))\n"
         "print([m for m in ('flax', 'optax', 'brax', 'torch') if m in sys.modules])"

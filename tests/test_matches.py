@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
-from mqe_jax.npc import Cylinder, Door
+from mqe_jax.objects import Cylinder, Door
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Init, Plane, Track
 from tests.worlds import observation, placed, still, terms_of

@@ -11,10 +11,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import npc
+from mqe_jax import objects
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.reward import weigh
-from mqe_jax.npc import Ball, Box, Sheep, flock
+from mqe_jax.npc import flock
+from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import PLANNERS
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Init, Plane, Track
@@ -33,7 +34,7 @@ def herd() -> Any:
     return make("go1sheep-hard", impl="c", control="position")
 
 
-def plain(*objects: npc.Object) -> Any:
+def plain(*objects: objects.Object) -> Any:
     return compile_scene(Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
 
 
@@ -54,7 +55,7 @@ def test_a_ball_that_was_kicked_rolls_and_comes_to_rest() -> None:
 def test_a_box_slides_under_more_than_its_friction_only() -> None:
     scene = plain(Box("box", friction=0.5))
     index = scene.objects["box"]
-    weight = 6.0 * npc.GRAVITY
+    weight = 6.0 * objects.GRAVITY
     moved = []
     for share in (0.3, 0.8):
         data = mujoco.MjData(scene.model)
@@ -63,7 +64,7 @@ def test_a_box_slides_under_more_than_its_friction_only() -> None:
         mujoco.mj_step(scene.model, data, 200)
         moved.append(data.qpos[index.qpos[0]] - 2.0)
     assert abs(moved[0]) < 0.02
-    assert moved[1] == pytest.approx(0.3 * npc.GRAVITY / 2, rel=0.1)  # (0.8 - 0.5) g for a second
+    assert moved[1] == pytest.approx(0.3 * objects.GRAVITY / 2, rel=0.1)  # (0.8 - 0.5) g for a second
 
 
 def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0, seed: int = 0) -> np.ndarray:

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import make, physics
-from mqe_jax import robot as go1
+from mqe_jax import make, physics, robots
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.physics import Physics
+from mqe_jax.robots import go1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 
@@ -66,7 +66,7 @@ def test_closed_form_feet_are_where_mujoco_puts_them(plane: CompiledScene) -> No
     data.qpos[index.joint_qpos[0]] = joints
     mujoco.mj_kinematics(model, data)
     expected = data.geom_xpos[index.foot_geom[0]] - [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(go1.foot_positions(jnp.asarray(joints)), expected, atol=1e-5)
+    np.testing.assert_allclose(robots.foot_positions(jnp.asarray(joints)), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("impl", IMPLS)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from fake_env import FakeEnv
 
-from mqe_jax import clips, render
-from mqe_jax.actors import planner
+from mqe_jax.cli.players import planner
+from mqe_jax.viz import cameras, clips, geometry, gl, recording, render
 
 
 @pytest.fixture(scope="module")
@@ -20,35 +20,35 @@ def env() -> FakeEnv:
 
 
 @pytest.fixture(scope="module")
-def episode(env: FakeEnv) -> render.Episode:
+def episode(env: FakeEnv) -> recording.Episode:
     act = planner("forward", env)
-    return render.record(env, act, (), jax.random.PRNGKey(0), worlds=2, seconds=1.0)[1]
+    return recording.record(env, act, (), jax.random.PRNGKey(0), worlds=2, seconds=1.0)[1]
 
 
-def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, episode: render.Episode) -> None:
+def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, episode: recording.Episode) -> None:
     assert len(episode) == 11  # the reset and ten steps
     np.testing.assert_allclose(episode.qpos[:, 0], 1.0 + 0.025 * np.arange(11), rtol=1e-5)
     assert episode.success == 1.0
     assert episode.reward == pytest.approx(0.05)
 
 
-def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: render.Episode) -> None:
-    assert [env.mj_model.body(body).name for body in render.robot_bases(env.mj_model)] == ["a", "b"]
-    drawn = render._drawn_model(env.mj_model, episode)
-    low, high = render._extent(drawn, episode)
+def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: recording.Episode) -> None:
+    assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
+    drawn = geometry.drawn_model(env.mj_model, episode)
+    low, high = geometry.extent(drawn, episode)
     assert high[1] == pytest.approx(1.5) and low[1] == pytest.approx(-1.5)
-    own = render._extent(env.mj_model, episode)[1][1]
+    own = geometry.extent(env.mj_model, episode)[1][1]
     assert own == pytest.approx(2.4)  # the environment's own model is as it was
 
 
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9])
-def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: render.Episode, aspect: float) -> None:
-    model = render._drawn_model(env.mj_model, episode)
-    camera = render.default_camera(model, episode, aspect)
+def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: recording.Episode, aspect: float) -> None:
+    model = geometry.drawn_model(env.mj_model, episode)
+    camera = cameras.default_camera(model, episode, aspect)
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])
-    low, high = render._extent(model, episode)
+    low, high = geometry.extent(model, episode)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     reach = []
     for corner in np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T:
@@ -62,7 +62,7 @@ def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: render.
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".mp4"])
 def test_clips_land_whole_without_gl(
-    env: FakeEnv, episode: render.Episode, tmp_path: Path, capsys: Any, suffix: str
+    env: FakeEnv, episode: recording.Episode, tmp_path: Path, capsys: Any, suffix: str
 ) -> None:
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
@@ -75,8 +75,8 @@ def test_clips_land_whole_without_gl(
     assert errors.count("\n") == 1 and "libegl1" in errors
 
 
-def test_gl_draws_robots_walls_and_floor(env: FakeEnv, episode: render.Episode) -> None:
-    if render.gl_backend() is None:
+def test_gl_draws_robots_walls_and_floor(env: FakeEnv, episode: recording.Episode) -> None:
+    if gl.gl_backend() is None:
         pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
     frames = list(render.render_frames(env, episode.every(10), size=(160, 90)))
     assert len(frames) == 2 and frames[0].shape == (90, 160, 3)
@@ -111,8 +111,8 @@ def test_bad_outputs_are_refused(tmp_path: Path, name: str, said: str) -> None:
         clips.check_output(tmp_path / name)
 
 
-def test_the_models_own_settings_are_left_alone(env: FakeEnv, episode: render.Episode) -> None:
-    if render.gl_backend() is None:
+def test_the_models_own_settings_are_left_alone(env: FakeEnv, episode: recording.Episode) -> None:
+    if gl.gl_backend() is None:
         pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
     before = env.mj_model.vis.global_.offwidth
     list(render.render_frames(env, episode.every(10), size=(1000, 80)))

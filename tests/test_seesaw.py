@@ -11,18 +11,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import npc
+from mqe_jax import objects
 from mqe_jax.envs import State, make
 from mqe_jax.envs.reward import weigh
-from mqe_jax.npc import Door, Seesaw
+from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
-from mqe_jax.robot import RobotReadings
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Init, Plane, Track
 from tests.worlds import angles, placed, readings
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
-WEIGHT = 11.31 * npc.GRAVITY  # N, of a Go1
+WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,8 @@ from mqe_jax.train.checkpoint import latest, list_checkpoints, load_tree, save_c
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.policy_api import load_policy
-from mqe_jax.train.train import load_run_config, train
+from mqe_jax.train.policy import load_policy
+from mqe_jax.train.runner import load_run_config, train
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 
@@ -276,6 +276,6 @@ def test_the_learner_imports_no_task_and_no_learning_library() -> None:
                 names = [node.module or ""]
             for name in names:
                 assert name.split(".")[0] not in forbidden, path
-                assert not name.startswith(("mqe_jax.envs", "mqe_jax.adapters", "mqe_jax.cli", "mqe_jax.commands")), (
-                    path
-                )
+                assert not name.startswith(
+                    ("mqe_jax.envs", "mqe_jax.adapters", "mqe_jax.cli", "mqe_jax.cli.commands")
+                ), path

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from mqe_jax import control, walk_policy
-from mqe_jax import robot as go1
-from mqe_jax.envs.walk import WalkEnv, WalkTask, gravity_w
-from mqe_jax.envs.walk_rewards import desired_contact
-from mqe_jax.train.walk import windows
+from mqe_jax.robots import go1
+from mqe_jax.walk import convert
+from mqe_jax.walk.env import WalkEnv, WalkTask, gravity_w
+from mqe_jax.walk.rewards import desired_contact
+from mqe_jax.walk.training import windows
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
 
 
@@ -123,7 +124,7 @@ def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.P
     adaptation, body = random_layers(ADAPTATION_SIZES, 0), random_layers(BODY_SIZES, 1)
     write_torchscript(tmp_path / "a.jit", adaptation)
     write_torchscript(tmp_path / "b.jit", body)
-    params = walk_policy.convert(tmp_path / "a.jit", tmp_path / "b.jit")
+    params = convert.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     walk_policy.save_params(params, tmp_path / "walk.safetensors")
     params = walk_policy.load_params(tmp_path / "walk.safetensors")
     history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
@@ -143,7 +144,7 @@ def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:
             layers += [torch.nn.Linear(n_in, n_out), torch.nn.ELU()]
         nets[name] = torch.nn.Sequential(*layers[:-1])
         torch.jit.script(nets[name]).save(str(tmp_path / f"{name}.jit"))
-    params = walk_policy.convert(tmp_path / "a.jit", tmp_path / "b.jit")
+    params = convert.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     history = torch.randn(2, 2100)
     latent = nets["a"](history)
     action = nets["b"](torch.cat([history, latent], -1)).detach().numpy()
@@ -156,10 +157,10 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     text = tmp_path / "text.jit"
     text.write_text("hello")
     with pytest.raises(ValueError, match=r"text\.jit: not a TorchScript Sequential"):
-        walk_policy.read_torchscript(text)
+        convert.read_torchscript(text)
     write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
     with pytest.raises(ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"):
-        walk_policy.convert(tmp_path / "small.jit", tmp_path / "small.jit")
+        convert.convert(tmp_path / "small.jit", tmp_path / "small.jit")
 
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
@@ -243,7 +244,7 @@ def test_slope_turns_gravity() -> None:
 
 def test_shipped_policy_walks() -> None:
     """Three seconds at 0.8 m/s: the robot keeps its feet and its speed."""
-    from mqe_jax.envs.walk_eval import Scenario, measure
+    from mqe_jax.walk.evaluation import Scenario, measure
 
     task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
     env = WalkEnv(task, impl="c", num_envs=4)

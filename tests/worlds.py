@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robot as go1
 from mqe_jax.envs import QuadrupedEnv, State
-from mqe_jax.robot import RobotReadings
+from mqe_jax.robots import go1
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.rotation import euler_to_quaternion
 
 

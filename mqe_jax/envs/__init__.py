@@ -6,13 +6,14 @@ import typing
 from typing import Any
 
 from mqe_jax.envs.autoreset import VectorEnv
-from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.bridge import Go1Bridge
 from mqe_jax.envs.door import Go1RevolvingDoor
 from mqe_jax.envs.football import Go1Football1vs1, Go1Football2vs2
 from mqe_jax.envs.football_defender import Go1FootballDefender
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.overrides import override
+from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.pushbox import Go1PushBox
 from mqe_jax.envs.randomization import Randomization
@@ -20,7 +21,7 @@ from mqe_jax.envs.seesaw import Go1Seesaw
 from mqe_jax.envs.sheep import Go1SheepEasy, Go1SheepHard
 from mqe_jax.envs.tug import Go1Tug
 from mqe_jax.envs.wrestling import Go1Wrestling
-from mqe_jax.terrain import nearest
+from mqe_jax.errors import nearest
 
 TASKS: dict[str, type[QuadrupedEnv]] = {
     task.name: task

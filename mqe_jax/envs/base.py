@@ -20,8 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from mujoco import mjx
 
-from mqe_jax import robot as go1
-from mqe_jax import walk_policy
+from mqe_jax import robots, walk_policy
 from mqe_jax.control import Controller, ControlState, check_mode, load_actuator_network
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
@@ -29,7 +28,8 @@ from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer, World
 from mqe_jax.envs.reward import weigh
 from mqe_jax.physics import Physics
-from mqe_jax.robot import RobotReadings
+from mqe_jax.robots import go1
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, build_model, compile_scene
 
@@ -345,7 +345,7 @@ class QuadrupedEnv:
 
     def read(self, data: mjx.Data) -> RobotReadings:
         """Reads all robots of one world."""
-        return go1.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
+        return robots.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
         """Returns the coordinates of an object by name, as its class gives them."""

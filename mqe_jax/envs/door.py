@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
-from mqe_jax.npc import Door
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.objects import Door
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Rotation, Track
 

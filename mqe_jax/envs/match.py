@@ -17,7 +17,8 @@ import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.robot import NUM_JOINTS, RobotReadings
+from mqe_jax.robots.go1 import NUM_JOINTS
+from mqe_jax.robots.index import RobotReadings
 
 # How a command changes where left and right are swapped.
 _MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from mqe_jax.terrain import nearest
+from mqe_jax.errors import nearest
 
 Range = tuple[float, float]
 T = TypeVar("T")

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, others
-from mqe_jax.robot import RobotReadings
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Init, Plane, Track
 

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax import robot as go1
 from mqe_jax.envs.observation import Block, ObservationLayout
-from mqe_jax.robot import RobotIndex, RobotReadings
+from mqe_jax.robots import go1
+from mqe_jax.robots.index import RobotIndex, RobotReadings
 
 _ROBOT = (
     Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),

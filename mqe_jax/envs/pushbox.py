@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State, TaskParams
+from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
-from mqe_jax.npc import Box
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.objects import Box
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Track
 

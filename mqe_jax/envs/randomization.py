@@ -10,7 +10,7 @@ import mujoco
 from mujoco import mjx
 
 from mqe_jax.envs.overrides import Range
-from mqe_jax.robot import RobotIndex
+from mqe_jax.robots.index import RobotIndex
 
 
 @dataclasses.dataclass(frozen=True)

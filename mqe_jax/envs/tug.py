@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.npc import Cylinder
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.objects import Cylinder
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Track
 

@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.base import State, TaskParams
+from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
-from mqe_jax.envs.params import check_above
-from mqe_jax.npc import Platform, Ring
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.envs.params import TaskParams, check_above
+from mqe_jax.objects import Platform, Ring
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Init, Plane, Track
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import tempfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
+
+from mqe_jax.files import write_atomically
 
 FORMAT = "mqe_jax.train"
 VERSION = 1
@@ -28,21 +28,6 @@ class Checkpoint(NamedTuple):
 
     tree: Any
     metadata: dict[str, Any]
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file whole: under a temporary name in the same folder, flushed to disk, then renamed."""
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
+from mqe_jax.train.networks import Network, Params, Sizes, make_network
 from mqe_jax.train.normalize import (
     ValueStatistics,
     running_init,
@@ -27,7 +28,6 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
-from mqe_jax.train.policy import Network, Params, Sizes, make_network
 from mqe_jax.train.rollout import Cursor, ObservationNormalizer, normalize_obs, rollout
 from mqe_jax.train.types import Batch, Transition, VectorEnv
 

@@ -16,7 +16,7 @@ from typing import Any, Self, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mqe_jax.train.checkpoint import write_atomically
+from mqe_jax.files import write_atomically
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0

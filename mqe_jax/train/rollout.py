@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.train.networks import Network, Params, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.policy import Network, Params, reset_memory
 from mqe_jax.train.types import Memory, Transition, VectorEnv
 
 

@@ -17,14 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax import robot as go1
-from mqe_jax import walk_policy
-from mqe_jax.envs.walk_rewards import RewardInputs, WalkRewards, combine, reward_terms
+from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
-from mqe_jax.robot import Contacts, RobotReadings
+from mqe_jax.robots import go1
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
+from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
 from mqe_jax.walk_policy import WalkMemory
 
 GRAVITY = 9.81  # m/s^2
@@ -330,7 +331,7 @@ class WalkEnv:
 
     def read(self, data: mjx.Data) -> RobotReadings:
         """Reads the robot."""
-        return go1.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
+        return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def foot_force(self, data: mjx.Data) -> jax.Array:
         """Strongest contact force on each foot (4,), N."""
@@ -380,7 +381,7 @@ class WalkEnv:
             )  # fmt: skip
         velocity = rotate_inverse(quaternion, readings.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
-        feet = go1.foot_positions(joint_position)
+        feet = robots.foot_positions(joint_position)
         foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
         phases = walk_policy.foot_phases(state.memory.gait, state.condition.commands)
         body = state.body

@@ -11,9 +11,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import robot as go1
-from mqe_jax import walk_policy
-from mqe_jax.robot import RobotReadings
+from mqe_jax import robots, walk_policy
+from mqe_jax.robots import go1
+from mqe_jax.robots.index import RobotReadings
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 
 
@@ -75,7 +75,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     velocity_b = rotate_inverse(quaternion, readings.linear_velocity_w[0])
     rate = readings.angular_velocity_b[0]
 
-    feet, feet_velocity = jax.jvp(go1.foot_positions, (joint_position,), (joint_velocity,))
+    feet, feet_velocity = jax.jvp(robots.foot_positions, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
     turn = jnp.broadcast_to(quaternion, (4, 4))
     feet_w, feet_velocity = rotate(turn, feet), rotate(turn, feet_velocity)
@@ -103,7 +103,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     margin = 0.05 * (go1.JOINT_UPPER - go1.JOINT_LOWER)
     beyond = jnp.maximum(joint_position - go1.JOINT_UPPER + margin, 0)
     beyond += jnp.maximum(go1.JOINT_LOWER + margin - joint_position, 0)
-    knees = rotate(turn, go1.knee_positions(joint_position))[:, 2] + height
+    knees = rotate(turn, robots.knee_positions(joint_position))[:, 2] + height
     on_ground = inputs.foot_force > 1.0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {

@@ -18,15 +18,16 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import walk_policy
+from mqe_jax.robots.go1 import NUM_JOINTS
 from mqe_jax.train import nn
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
 from mqe_jax.train.optim import adam
-from mqe_jax.walk_policy import HISTORY, NUM_JOINTS, OBSERVATION_SIZE
+from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 
 class WalkWorld(Protocol):
-    """What the trainer needs of the walking environment; see `mqe_jax.envs.walk.WalkEnv`."""
+    """What the trainer needs of the walking environment; see `mqe_jax.walk.env.WalkEnv`."""
 
     privileged_size: int
 

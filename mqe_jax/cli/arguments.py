@@ -1,4 +1,4 @@
-"""Command line `mqe`: arguments and messages; the work is done in `mqe_jax.commands`.
+"""Command line `mqe`: arguments and messages; the work is done in `mqe_jax.cli.commands`.
 
 Nothing heavy is imported before a command runs, so that `mqe --help` answers at once.
 """
@@ -13,13 +13,9 @@ import functools
 import importlib
 import io
 import itertools
-import json
 import operator
-import os
 import re
-import sys
-import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -37,9 +33,7 @@ Do first:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-
 COMMANDS = ("tasks", "train", "eval", "render", "bench", "demo", "walk")
-
 Repeated = tyro.conf.UseAppendAction
 MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
@@ -52,9 +46,9 @@ class Command(Protocol):
         ...
 
 
-def _commands() -> Any:
+def _commands(module: str = "commands") -> Any:
     with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that warp-lang is missing
-        return importlib.import_module("mqe_jax.commands")
+        return importlib.import_module(f"mqe_jax.cli.{module}")
 
 
 Impl = Annotated[
@@ -118,7 +112,7 @@ def _setting_fields() -> list[tuple[str, Any, Any]]:
 
 
 @dataclass(frozen=True)
-class _Train:
+class Train:
     """Train a team on a task, into a run folder. Settings: the configuration file, then the flags below."""
 
     task: tyro.conf.Positional[str]
@@ -136,7 +130,7 @@ class _Train:
 
     def settings(self) -> dict[str, str]:
         """The training settings given as flags, still as text."""
-        known = {f.name for f in dataclasses.fields(_Train)}
+        known = {f.name for f in dataclasses.fields(Train)}
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in known}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -244,7 +238,7 @@ class Demo:
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().demo(self)
+        return _commands("demo").demo(self)
 
 
 @dataclass(frozen=True)
@@ -265,7 +259,7 @@ class WalkTrain:
     seed: Seed = 1
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().walk_train(self)
+        return _commands("walk_commands").walk_train(self)
 
 
 @dataclass(frozen=True)
@@ -283,7 +277,7 @@ class WalkEval:
     seed: Seed = 0
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().walk_eval(self)
+        return _commands("walk_commands").walk_eval(self)
 
 
 @dataclass(frozen=True)
@@ -298,7 +292,7 @@ class WalkConvert:
     """Weights to write (.safetensors)."""
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().walk_convert(self)
+        return _commands("walk_commands").walk_convert(self)
 
 
 @dataclass(frozen=True)
@@ -317,14 +311,14 @@ class Walk:
 
 def _parser(wanted: Sequence[str]) -> Any:
     """The union of all subcommands; training's flags are only made where they can be asked for."""
-    train: Any = _Train
+    train: Any = Train
     if "train" in wanted[:1]:
-        train = dataclasses.make_dataclass("Train", _setting_fields(), bases=(_Train,), frozen=True)
-        train.__doc__ = _Train.__doc__
+        train = dataclasses.make_dataclass("Train", _setting_fields(), bases=(Train,), frozen=True)
+        train.__doc__ = Train.__doc__
     subcommand = tyro.conf.subcommand
     records: list[Any] = [
         Annotated[Tasks, subcommand("tasks")],
-        Annotated[train, subcommand("train", description=_Train.__doc__)],
+        Annotated[train, subcommand("train", description=Train.__doc__)],
         Annotated[Eval, subcommand("eval")],
         Annotated[Render, subcommand("render")],
         Annotated[Bench, subcommand("bench")],
@@ -353,10 +347,10 @@ def parse(arguments: Sequence[str]) -> Command:
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise ValueError(_one_line(errors.getvalue())) from None
+        raise ValueError(one_line(errors.getvalue())) from None
 
 
-def _one_line(box: str) -> str:
+def one_line(box: str) -> str:
     """What tyro says in a box, as one line without the frame."""
     lines = [re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()]
     kept = []
@@ -367,73 +361,3 @@ def _one_line(box: str) -> str:
             break
         kept.append(line)
     return " ".join(" ".join(kept).split()) or "the arguments cannot be read; see mqe --help"
-
-
-@contextlib.contextmanager
-def _quiet_stdout(active: bool) -> Iterator[Any]:
-    """While active, everything written to standard output, from C too, goes to standard error.
-
-    Gives a file that writes to the real standard output.
-    """
-    if not active:
-        yield sys.stdout
-        return
-    sys.stdout.flush()
-    real = os.dup(1)
-    try:
-        os.dup2(2, 1)
-        with contextlib.redirect_stdout(sys.stderr), os.fdopen(os.dup(real), "w", encoding="utf-8") as file:
-            yield file
-    finally:
-        os.dup2(real, 1)
-        os.close(real)
-
-
-def _is_ours(error: BaseException) -> bool:
-    """Whether the error was raised by this package's own code, that is, by a check of input."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and Path(frames[-1].filename).resolve().is_relative_to(Path(__file__).resolve().parent)
-
-
-def _run(command: Command) -> None:
-    as_json = bool(getattr(getattr(command, "action", command), "json", False))
-    with _quiet_stdout(as_json) as out:
-        result = command.run()
-        if as_json and result is not None:
-            print(json.dumps(result, allow_nan=True), file=out, flush=True)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs `mqe`; returns the exit code: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C."""
-    as_program = arguments is None
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if not arguments:
-        print(FIRST_STEPS)
-        return 0
-    try:
-        _run(parse(arguments))
-    except KeyboardInterrupt:
-        print("mqe: interrupted", file=sys.stderr, flush=True)
-        if as_program:
-            sys.stdout.flush()
-            os._exit(130)  # an ordinary exit would wait for steps that JAX is still computing
-        return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 0
-    except ValueError as error:
-        if not _is_ours(error):
-            raise
-        return _refuse(error)
-    except OSError as error:
-        return _refuse(error)
-    return 0
-
-
-def _refuse(error: BaseException) -> int:
-    print(f"mqe: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robot as go1
-from mqe_jax import walk_policy
-from mqe_jax.envs.walk import Condition, WalkEnv, WalkTask
+from mqe_jax import robots, walk_policy
+from mqe_jax.errors import nearest
 from mqe_jax.rotation import rotate, rotate_inverse
-from mqe_jax.terrain import nearest
+from mqe_jax.walk.env import Condition, WalkEnv, WalkTask
 
 WARM_UP = 1.0  # s at the start of an episode that no error counts
 
@@ -106,7 +105,7 @@ def measure(
             state = env.step(state, memory.action)
             readings = env.read(state.data)
             quaternion = readings.quaternion[0]
-            feet = go1.foot_positions(readings.joint_position[0])
+            feet = robots.foot_positions(readings.joint_position[0])
             height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
             squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
             speed = rotate_inverse(quaternion, readings.linear_velocity_w[0])[0]

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from mqe_jax.train.checkpoint import latest, load_checkpoint, save_checkpoint, write_atomically
+from mqe_jax.files import write_atomically
+from mqe_jax.train.checkpoint import latest, load_checkpoint, save_checkpoint
 from mqe_jax.train.config import TrainConfig, config_to_mapping, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_sizes, make_learner
 from mqe_jax.train.logs import CsvLog, ProgressLog, TensorBoardLog
-from mqe_jax.train.policy_api import policy_of, save_policy
+from mqe_jax.train.policy import policy_of, save_policy
 from mqe_jax.train.types import VectorEnv
 
 CONFIG_FILE = "config.yaml"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from mqe_jax.envs import TaskParams
 from mqe_jax.planners import PLANNERS
-from mqe_jax.train import policy_api
+from mqe_jax.train import policy
 
 PLANNER_NAMES = ("scripted", "random", "idle", "forward")
 
@@ -63,7 +63,7 @@ class Actor:
 
     task: str
     overrides: dict[str, Any]
-    policy: policy_api.Policy | str
+    policy: policy.Policy | str
     opponent: str | None = None
 
     def act(self, env: Any, deterministic: bool) -> Act:

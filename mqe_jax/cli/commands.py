@@ -1,0 +1,184 @@
+"""Implementations of the subcommands, imported when one of them runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from mqe_jax.cli import bench as benchmark
+from mqe_jax.cli.arguments import Bench, Eval, Render, Tasks, Train
+from mqe_jax.cli.output import print_table, say
+from mqe_jax.cli.players import PLANNER_NAMES, Actor
+from mqe_jax.cli.setup import make_env, parse_overrides, train_config
+from mqe_jax.envs import ALIASES, TASKS
+from mqe_jax.errors import nearest
+from mqe_jax.planners import PLANNERS
+from mqe_jax.train import evaluate as evaluation
+from mqe_jax.train import policy, runner
+from mqe_jax.viz import curves, recording
+from mqe_jax.viz import render as rendering
+from mqe_jax.viz.clips import check_output
+
+
+def is_run(target: str) -> bool:
+    """Whether the argument is meant as a run's folder rather than as a task's id."""
+    return os.sep in target or Path(target).exists()
+
+
+def find_actor(arguments: Eval | Render, default: str) -> Actor:
+    """Reads RUN|TASK, --policy and --planner; `default` acts on a task where nobody is named."""
+    target = arguments.target
+    given = parse_overrides(arguments.set) | ({} if arguments.control is None else {"control": arguments.control})
+    if arguments.planner is not None and arguments.policy is not None:
+        raise ValueError("planner: give --planner or --policy, not both")
+    for flag, name, allowed in (
+        ("planner", arguments.planner, PLANNER_NAMES),
+        ("opponent", arguments.opponent, (*PLANNER_NAMES, "self")),
+    ):
+        if name is not None and name not in allowed:
+            raise ValueError(f"{flag}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}")
+    run = arguments.policy
+    if is_run(target):
+        _check_run(target)
+        config = runner.load_run_config(target)
+        if config.task is None:
+            raise ValueError(f"{target}: its {runner.CONFIG_FILE} names no task")
+        task, env_values = config.task, {**config.env, **given}
+        run = Path(target) if run is None and arguments.planner is None else run
+    else:
+        task, env_values = ALIASES.get(target, target), given
+    if run is not None:
+        return Actor(task, env_values, policy.load_policy(run), arguments.opponent)
+    if default == "scripted" and task not in PLANNERS:
+        default = "forward"
+    return Actor(task, env_values, arguments.planner or default, arguments.opponent)
+
+
+def _check_run(target: str) -> None:
+    if not Path(target).is_dir():
+        raise ValueError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
+    if not (Path(target) / runner.CONFIG_FILE).is_file():
+        raise ValueError(f"run: {target!r} holds no {runner.CONFIG_FILE}; it is not the folder of a training")
+
+
+def tasks(arguments: Tasks) -> dict[str, Any] | None:
+    """Lists the tasks, each from an environment made with its own parameters."""
+    rows = []
+    for name, task in TASKS.items():
+        env = task(control="position", num_envs=1)  # the same sizes, without reading the walk policy
+        rows.append(
+            {
+                "task": name,
+                "title": task.title,
+                "agents": env.num_agents,
+                "observation": env.observation_size,
+                "privileged": env.privileged_observation_size,
+                "time_limit_s": env.params.episode_length,
+            }
+        )
+    if not arguments.json:
+        print(f"{'task':<22} {'title':<22} agents  observation  time limit")
+        for row in rows:
+            print(
+                f"{row['task']:<22} {row['title']:<22} {row['agents']:>6}  {row['observation']:>11}"
+                f"  {row['time_limit_s']:>8g} s"
+            )
+        print("\nactions per agent: command 3 (velocities for the walk policy), position 12, torque 12")
+    return {"tasks": rows}
+
+
+def train(arguments: Train) -> None:
+    """Trains into the run folder."""
+    overrides = parse_overrides(arguments.set)
+    if arguments.control is not None:
+        overrides["control"] = arguments.control
+    config = train_config(arguments.task, arguments.config, arguments.settings(), overrides)
+    run_dir = arguments.run_dir or Path("runs") / arguments.task
+    _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
+    try:
+        runner.train(vector_env, config, run_dir, resume=arguments.resume)
+    except KeyboardInterrupt:
+        say(f"mqe: stopped; go on with: mqe train {arguments.task} --run-dir {run_dir} --resume")
+        raise
+    curves.draw_curve([run_dir], run_dir / "curve.png", arguments.task)
+    say(f"mqe: {run_dir} holds the policy, metrics.csv, curve.png; measure it with: mqe eval {run_dir}")
+
+
+def evaluate(arguments: Eval) -> dict[str, Any]:
+    """Measures a policy and prints a table, or gives the object for `--json`."""
+    if arguments.episodes < 1:
+        raise ValueError(f"episodes: {arguments.episodes} is not allowed; it must be at least 1")
+    actor = find_actor(arguments, "random")
+    num_envs = min(arguments.num_envs, arguments.episodes)
+    env, vector_env = make_env(actor.task, arguments.impl, actor.overrides, num_envs)
+    result = evaluation.evaluate(
+        vector_env,
+        actor.act(env, arguments.deterministic),
+        arguments.episodes,
+        jax.random.PRNGKey(arguments.seed),
+        memory=actor.memory(num_envs),
+    ).to_dict()
+    if not arguments.json:
+        print_table(result)
+    return result
+
+
+def render(arguments: Render) -> None:
+    """Draws an episode into a file."""
+    for name, value in (("best_of", arguments.best_of), ("seconds", arguments.seconds)):
+        if not value > 0:
+            raise ValueError(f"{name}: {value} is not allowed; it must be greater than 0")
+    for name, value in (("width", arguments.width), ("fps", arguments.fps)):
+        if value is not None and not 0 < value <= 4096:
+            raise ValueError(f"{name}: {value} is not allowed; it must be between 1 and 4096")
+    check_output(arguments.output)
+    actor = find_actor(arguments, "scripted")
+    env, _ = make_env(actor.task, arguments.impl, actor.overrides, arguments.best_of)
+    drawn_by = draw(
+        env,
+        actor,
+        arguments.output,
+        seed=arguments.seed,
+        worlds=arguments.best_of,
+        seconds=arguments.seconds,
+        deterministic=not arguments.sample,
+        size=None if arguments.width is None else (arguments.width, round(arguments.width * 9 / 32) * 2),
+        fps=arguments.fps,
+    )
+    say(f"mqe: wrote {arguments.output} ({drawn_by})")
+
+
+def draw(
+    env: Any,
+    actor: Actor,
+    path: Path,
+    *,
+    seed: int,
+    worlds: int = 1,
+    seconds: float = 20.0,
+    deterministic: bool = True,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+) -> str:
+    """Plays `worlds` episodes and draws the best one; returns what drew it."""
+    act, memory = actor.act(env, deterministic), actor.memory(worlds)
+    episodes = recording.record(env, act, memory, jax.random.PRNGKey(seed), worlds=worlds, seconds=seconds)
+    return rendering.render_episode(env, recording.best(episodes), path, size=size, fps=fps)
+
+
+def bench(arguments: Bench) -> dict[str, Any]:
+    """Measures throughput and prints a table, or gives the object for `--json`."""
+    overrides = parse_overrides(arguments.set)
+    if arguments.control is not None:
+        overrides["control"] = arguments.control
+    env, vector_env = make_env(arguments.task, arguments.impl, overrides, arguments.num_envs)
+    key = jax.random.PRNGKey(arguments.seed)
+    result = benchmark.bench(env, vector_env, key, steps=arguments.steps, repeats=arguments.repeats)
+    if arguments.csv is not None:
+        benchmark.append_csv(arguments.csv, result)
+    if not arguments.json:
+        print_table(result)
+    return result

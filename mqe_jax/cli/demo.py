@@ -1,0 +1,92 @@
+"""Implementation of `mqe demo`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from mqe_jax.cli.arguments import Demo
+from mqe_jax.cli.commands import draw
+from mqe_jax.cli.output import say
+from mqe_jax.cli.players import Actor
+from mqe_jax.cli.setup import make_env, train_config
+from mqe_jax.envs import VectorEnv
+from mqe_jax.files import check_folder, write_atomically
+from mqe_jax.train import evaluate as evaluation
+from mqe_jax.train import policy, runner
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import env_sizes, make_learner
+from mqe_jax.viz import curves
+from mqe_jax.viz.clips import check_output
+
+DEMO_TASK = "go1gate"
+
+
+def demo(arguments: Demo) -> None:
+    """Trains from scratch, measures before and after, draws curve and video; goes on where it stopped."""
+    began, run_dir = time.perf_counter(), arguments.run_dir
+    config = train_config(DEMO_TASK, arguments.config, {}, {})
+    check_folder(run_dir)
+    env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
+    _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)
+    size = f"{config.num_envs} worlds, {config.total_steps / 1e6:g} M steps"
+    say(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
+
+    untrained = make_learner(vector_env, config)
+    state = jax.jit(untrained.init)(runner.initial_key(config))
+    before = policy.policy_of(state, env_sizes(vector_env), config, task=DEMO_TASK)
+    del state
+    say("mqe demo: measuring the untrained policy")
+    table = {"before": _measure(vector_env, before, arguments.episodes, config)}
+    print(f"before training: {_summary(table['before'])}", flush=True)
+    try:
+        runner.train(training_env, config, run_dir, resume=True)
+    except KeyboardInterrupt:
+        say("mqe: stopped; the same command goes on from here")
+        raise
+    after = policy.load_policy(run_dir)
+    table["after"] = _measure(vector_env, after, arguments.episodes, config)
+    write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
+    curves.draw_curve([run_dir], run_dir / "curve.png", DEMO_TASK, "Narrow Gate, trained on the CPU")
+    video = run_dir / "video.mp4"
+    try:
+        check_output(video)
+    except ValueError:
+        video = run_dir / "video.gif"
+    say("mqe demo: drawing an episode")
+    draw(
+        env,
+        Actor(DEMO_TASK, dict(config.env), after),
+        video,
+        seed=config.seed + 1,
+        worlds=16,
+        size=(640, 360),
+    )
+    print(f"before training: {_summary(table['before'])}")
+    print(f"after training:  {_summary(table['after'])}")
+    print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
+    print(f"took {(time.perf_counter() - began) / 60:.1f} minutes; measure it again with: mqe eval {run_dir}")
+
+
+def _measure(env: VectorEnv, policy: policy.Policy, episodes: int, config: TrainConfig) -> dict[str, Any]:
+    """Evaluates a policy on its mean actions."""
+
+    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return policy.act(obs, memory, key, deterministic=True)
+
+    memory = policy.initial_memory(env.num_envs)
+    key = jax.random.PRNGKey(config.seed + 1000)
+    return evaluation.evaluate(env, act, episodes, key, memory=memory).to_dict()
+
+
+def _summary(result: Mapping[str, Any]) -> str:
+    """One line of the figures that a person looks for."""
+    parts = [f"both robots through {result['success_rate']:.0%}"]
+    if "success/one" in result:
+        parts.append(f"at least one {result['success/one']:.0%}")
+    parts.append(f"average step reward {result['average_step_reward']:.3f}")
+    return f"{', '.join(parts)} ({result['episodes']} episodes)"

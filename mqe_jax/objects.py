@@ -1,0 +1,373 @@
+"""Everything in a scene that is no agent and no wall: boxes, balls, sheep, doors, planks, platforms.
+
+An object is a small frozen dataclass that adds one body named `object/<name>` to a scene; `index_objects` says
+where the coordinates of a compiled scene's objects are. The rules that drive NPCs are in `npc`.
+
+Frame: the environment's; metre, kilogram, second, radian, newton.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mqe_jax.collision import GROUND_BIT, OBJECT_BIT, WALL_BIT
+
+GRAVITY = 9.81  # m/s^2
+Color = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
+_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+# What touches ground, walls, other objects, and those parts of robots that answer to objects.
+_FREE = {"contype": OBJECT_BIT, "conaffinity": GROUND_BIT | WALL_BIT | OBJECT_BIT}
+# What the scene holds in place or at its height: it need not touch the ground.
+_HELD = {"contype": OBJECT_BIT, "conaffinity": WALL_BIT | OBJECT_BIT}
+# What robots and free objects stand on.
+_FLOOR = {"contype": GROUND_BIT, "conaffinity": 0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Object:
+    """Base of all objects.
+
+    Attributes:
+        name: unique in the scene.
+    """
+
+    name: str
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the body, and the geoms that are only looked at if `visual`."""
+        raise TypeError(f"object {type(self).__name__}: add() is not defined")
+
+    def _body(
+        self, spec: mujoco.MjSpec, position: Sequence[float], mass: float, inertia: Sequence[float] | np.ndarray
+    ) -> Any:
+        body = spec.worldbody.add_body(name=f"object/{self.name}", pos=position)
+        body.explicitinertial, body.mass, body.inertia = True, mass, inertia
+        body.ipos = (0, 0, 0)  # or MuJoCo puts the centre of mass at `position` from the body
+        return body
+
+    def _joint(self, body: Any, suffix: str, kind: Any, damping: float = 0.0, **shape: Any) -> None:
+        body.add_joint(name=f"object/{self.name}/{suffix}", type=kind, damping=(damping, 0, 0), **shape)
+
+    def _slides(self, body: Any, axes: str, damping: float = 0.0) -> None:
+        for axis in axes:
+            self._joint(body, axis, _JOINT.mjJNT_SLIDE, damping, axis=_AXES[axis])
+
+    def _solid(self, body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **shape: Any) -> None:
+        body.add_geom(
+            name=f"object/{self.name}", type=kind, condim=3, friction=(friction, 0.005, 0.0001), rgba=color,
+            priority=1, group=group, mass=0.0, **shape,
+        )  # fmt: skip
+
+
+def _look(body: Any, kind: Any, color: Color, **shape: Any) -> None:
+    body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class Box(Object):
+    """A box to push. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
+
+    Attributes:
+        size: full extents, m.
+        mass: kg.
+        friction: sliding friction with the ground, which takes precedence over the ground's own.
+    """
+
+    size: Vector = (1.0, 1.0, 1.0)
+    mass: float = 6.0
+    friction: float = 1.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the box."""
+        x, y, z = np.square(self.size)
+        body = self._body(spec, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
+        self._joint(body, "free", _JOINT.mjJNT_FREE)
+        half = np.array(self.size) / 2
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.93, 0.93, 0.93, 1.0), self.friction, size=half, **_FREE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ball(Object):
+    """A football that rolls and comes to rest. Coordinates and velocity as those of `Box`.
+
+    Attributes:
+        radius: m.
+        mass: kg.
+        drag: resistance to its motion, N s/m.
+        spin_drag: resistance to its rotation, N m s/rad.
+    """
+
+    radius: float = 0.1
+    mass: float = 0.318
+    drag: float = 0.1
+    spin_drag: float = 0.0003
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the ball, a thin shell; three slides and a ball joint, because a free joint has no drag of its own."""
+        body = self._body(spec, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
+        self._slides(body, "xyz", self.drag)
+        self._joint(body, "turn", _JOINT.mjJNT_BALL, self.spin_drag)
+        self._solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
+        if visual:  # dark patches, so that one sees it roll
+            for axis in _AXES.values():
+                for side in (-1, 1):
+                    _look(
+                        body, _GEOM.mjGEOM_SPHERE, (0.1, 0.1, 0.12, 1.0), size=(0.5 * self.radius, 0, 0),
+                        pos=np.array(axis) * side * 0.56 * self.radius,
+                    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Cylinder(Object):
+    """An upright cylinder that slides along y only. Coordinate: y, m; velocity likewise.
+
+    Its shape for contacts is a capsule that is full up to its height; its friction with the ground is that of the
+    slide, so that it costs no contacts.
+
+    Attributes:
+        position: of its axis at y = 0 (x, y), m.
+        radius: m.
+        height: m.
+        mass: kg.
+        friction: sliding friction with the ground.
+        reach: how far it may slide either way, m.
+    """
+
+    position: tuple[float, float] = (0.0, 0.0)
+    radius: float = 1.2
+    height: float = 0.5
+    mass: float = 3.0
+    friction: float = 1.0
+    reach: float = 1.8
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the cylinder."""
+        body = self._body(spec, (*self.position, 0.0), self.mass, (1.0, 1.0, 1.0))
+        self._joint(
+            body, "y", _JOINT.mjJNT_SLIDE, axis=_AXES["y"], limited=True, range=(-self.reach, self.reach),
+            frictionloss=self.friction * self.mass * GRAVITY,
+        )  # fmt: skip
+        white = (0.95, 0.95, 0.95, 1.0)
+        self._solid(
+            body, _GEOM.mjGEOM_CAPSULE, white, group=3, size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height), **_HELD,
+        )  # fmt: skip
+        if visual:
+            half = self.height / 2
+            _look(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
+
+
+@dataclasses.dataclass(frozen=True)
+class Door(Object):
+    """A revolving door: a panel on a vertical hinge in its middle. Coordinate: angle, rad, 0 along y.
+
+    Attributes:
+        position: of the hinge (x, y), m.
+        size: thickness, width and height, m.
+        mass: kg.
+        inertia: about the hinge, kg m^2.
+        damping: of the hinge, N m s/rad.
+    """
+
+    position: tuple[float, float] = (0.0, 0.0)
+    size: Vector = (0.08, 1.95, 0.8)
+    mass: float = 4.0
+    inertia: float = 1.232
+    damping: float = 0.5
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the door."""
+        body = self._body(spec, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
+        self._joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.93, 0.93, 0.93, 1.0), size=np.array(self.size) / 2, **_HELD)
+
+
+@dataclasses.dataclass(frozen=True)
+class Seesaw(Object):
+    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative where the near end is down.
+
+    Attributes:
+        hinge: position (x, y, z), m.
+        size: length, width and thickness of the plank, m.
+        behind: how far the plank's middle is before the hinge, towards the near end, m.
+        mass: kg; the centre of mass is in the hinge, so that the plank stays as it is.
+        inertia: about the hinge, kg m^2.
+        limit: greatest angle either way, rad; at the lower limit the near end lies on the ground.
+        damping: of the hinge, N m s/rad, which limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge,
+            turns it at 0.21 rad/s.
+    """
+
+    hinge: Vector = (5.6, 0.0, 0.545)
+    size: Vector = (4.123, 1.0, 0.03)
+    behind: float = 0.103
+    mass: float = 100.0
+    inertia: float = 100.0
+    limit: float = 0.254
+    damping: float = 1000.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the plank, and the posts that carry it to look at."""
+        body = self._body(spec, self.hinge, self.mass, (self.inertia,) * 3)
+        self._joint(
+            body, "pitch", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["y"], limited=True,
+            range=(-self.limit, self.limit),
+        )  # fmt: skip
+        half, white = np.array(self.size) / 2, (0.95, 0.95, 0.95, 1.0)
+        self._solid(body, _GEOM.mjGEOM_BOX, white, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
+        if visual:
+            x, y, z = self.hinge
+            grey = (0.55, 0.55, 0.58, 1.0)
+            for side in (-1, 1):
+                edge, post = y + side * half[1], y + side * (half[1] + 0.06)
+                _look(
+                    spec.worldbody, _GEOM.mjGEOM_CYLINDER, grey, size=(0.05, 0, 0),
+                    fromto=(x, edge, z, x, edge + side * 0.08, z),
+                )  # fmt: skip
+                _look(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Platform(Object):
+    """A fixed block to stand on. No coordinates.
+
+    Attributes:
+        center: of its top face (x, y, z), m.
+        size: full extents, m.
+        column: radius of the column that carries it, m; none if 0.
+    """
+
+    center: Vector = (0.0, 0.0, 1.0)
+    size: Vector = (1.0, 1.0, 1.0)
+    column: float = 0.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the block."""
+        x, y, top = self.center
+        body = spec.worldbody.add_body(name=f"object/{self.name}", pos=(x, y, top - self.size[2] / 2))
+        self._solid(body, _GEOM.mjGEOM_BOX, (0.95, 0.95, 0.95, 1.0), size=np.array(self.size) / 2, **_FLOOR)
+        if not self.column:
+            return
+        foot = top - self.size[2]
+        body.add_geom(
+            name=f"object/{self.name}/column", type=_GEOM.mjGEOM_CAPSULE, group=3, mass=0.0, condim=3, priority=1,
+            contype=WALL_BIT, conaffinity=0, size=(self.column, 0, 0),
+            fromto=(0, 0, -top + self.size[2] / 2, 0, 0, -self.size[2] / 2 - self.column),
+        )  # fmt: skip
+        if visual:
+            _look(
+                spec.worldbody, _GEOM.mjGEOM_CYLINDER, (0.75, 0.75, 0.78, 1.0), size=(self.column, foot / 2, 0),
+                pos=(x, y, foot / 2),
+            )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Ring(Object):
+    """A circle drawn on the ground: nothing that can be touched. No coordinates.
+
+    Attributes:
+        center: (x, y, z), m.
+        radius: m.
+        width: of the line, m.
+    """
+
+    center: Vector = (0.0, 0.0, 0.0)
+    radius: float = 1.7
+    width: float = 0.04
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the line, made of short pieces."""
+        body = spec.worldbody.add_body(name=f"object/{self.name}", pos=self.center)
+        if not visual:
+            return
+        pieces = 72
+        half = np.pi * self.radius / pieces * 1.05
+        for angle in np.arange(pieces) * 2 * np.pi / pieces:
+            _look(
+                body, _GEOM.mjGEOM_BOX, (0.2, 0.2, 0.22, 1.0), size=(self.width / 2, half, 0.004),
+                pos=(self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0),
+                quat=(np.cos(angle / 2), 0, 0, np.sin(angle / 2)),
+            )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Sheep(Object):
+    """An upright sheep that slides over the ground without turning. Coordinates: x, y; velocity likewise.
+
+    Its friction with the ground is part of `flock`, so that it costs no contacts.
+
+    Attributes:
+        radius: m.
+        height: m.
+        mass: kg.
+    """
+
+    radius: float = 0.2
+    height: float = 0.5
+    mass: float = 5.0
+
+    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
+        """Adds the sheep: a capsule that is full at the ground and round at the top."""
+        body = self._body(spec, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
+        self._slides(body, "xy")
+        fleece = (0.96, 0.95, 0.90, 1.0)
+        self._solid(
+            body, _GEOM.mjGEOM_CAPSULE, fleece, group=3 if visual else 1, size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height - self.radius), **_HELD,
+        )  # fmt: skip
+        if visual:
+            dark = (0.16, 0.14, 0.13, 1.0)
+            top, wide = self.height, self.radius
+            _look(body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=(wide, 0.75 * wide, 0.32 * top), pos=(0, 0, 0.62 * top))
+            _look(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
+            _look(
+                body, _GEOM.mjGEOM_ELLIPSOID, dark, size=(0.45 * wide, 0.3 * wide, 0.3 * wide),
+                pos=(1.15 * wide, 0, 0.82 * top),
+            )  # fmt: skip
+            for x in (-0.5, 0.5):
+                for y in (-0.35, 0.35):
+                    _look(
+                        body, _GEOM.mjGEOM_CAPSULE, dark, size=(0.12 * wide, 0, 0),
+                        fromto=(x * wide, y * wide, 0.02, x * wide, y * wide, 0.4 * top),
+                    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectIndex:
+    """Where one object of a compiled model is; host integers.
+
+    Attributes:
+        qpos: its coordinates in qpos (C,).
+        qvel: its velocities in qvel (V,).
+        body: body id.
+        geom: id of its collision shape, -1 if it has none.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    body: int
+    geom: int
+
+
+def index_objects(model: mujoco.MjModel, objects: Sequence[Object]) -> Mapping[str, ObjectIndex]:
+    """Looks up by name, once, where every object of a compiled model is."""
+    found = {}
+    for item in objects:
+        body = model.body(f"object/{item.name}")
+        joints = range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]) if body.jntnum[0] else ()
+        widths = {_JOINT.mjJNT_FREE: (7, 6), _JOINT.mjJNT_BALL: (4, 3)}
+        qpos, qvel = [], []
+        for joint in joints:
+            coordinates, speeds = widths.get(_JOINT(model.jnt_type[joint]), (1, 1))
+            qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
+            qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
+        as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"object/{item.name}")
+        found[item.name] = ObjectIndex(as_int(qpos), as_int(qvel), int(body.id), geom)
+    return found

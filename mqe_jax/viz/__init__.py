@@ -1,0 +1,1 @@
+"""Recording, cameras, rendering, clips and learning curves."""

@@ -1,0 +1,99 @@
+"""The scene as plain geometry: which bodies are robots, what is shown, and where its corners are."""
+
+import copy
+
+import mujoco
+import numpy as np
+
+from mqe_jax.viz.recording import Episode
+
+COLLISION_GROUP = 3
+
+
+def robot_bases(model: mujoco.MjModel) -> list[int]:
+    """Ids of the bodies that are robots' trunks: a free joint above at least twelve hinges."""
+    bases = []
+    hinges = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        body = int(model.jnt_bodyid[joint])
+        inside = model.body_rootid[model.jnt_bodyid] == model.body_rootid[body]
+        if np.count_nonzero(hinges & inside) >= 12:
+            bases.append(body)
+    return bases
+
+
+def paint(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
+    """Colour (red, green, blue, alpha) of a robot: of the first shape on its trunk that is looked at."""
+    geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])
+    seen = [geom for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
+    return tuple(map(float, model.geom_rgba[seen[0]]))
+
+
+def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: int) -> None:
+    """Put frame `index` of the episode into `data`."""
+    data.qpos[:] = episode.qpos[index]
+    if model.nmocap:
+        data.mocap_pos[:] = episode.mocap_pos[index]
+        data.mocap_quat[:] = episode.mocap_quat[index]
+    mujoco.mj_kinematics(model, data)
+
+
+def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """World corners (8, 3) of the geom's bounding box."""
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    return data.geom_xpos[geom] + (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
+
+
+def scenery_geoms(model: mujoco.MjModel) -> list[int]:
+    """Ids of the shown geoms that are neither ground nor part of a robot."""
+    robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if int(model.geom_type[geom]) not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+        and int(model.geom_group[geom]) != COLLISION_GROUP
+        and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots
+    ]
+
+
+def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner (3,) of what the clip should hold: the scene and every robot's way."""
+    data = mujoco.MjData(model)
+    points = []
+    for index in np.unique(np.linspace(0, len(episode) - 1, 30).astype(int)):
+        pose(model, data, episode, int(index))
+        for body in robot_bases(model):
+            points += [data.xpos[body] - [0.4, 0.4, 0.3], data.xpos[body] + [0.4, 0.4, 0.2]]
+    for geom in scenery_geoms(model):
+        points += list(box_corners(model, data, geom))
+    if not points:
+        points = [np.full(3, -1.0), np.full(3, 1.0)]
+    return np.min(points, axis=0), np.max(points, axis=0)
+
+
+def drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
+    """A copy to draw from, in which moving walls end at the track's side walls.
+
+    A gate's walls are long enough for every place that its gap may take, so that they stand out behind the
+    side walls; what stands out is not drawn.
+    """
+    model = copy.deepcopy(model)
+    box = int(mujoco.mjtGeom.mjGEOM_BOX)
+    shown = [geom for geom in scenery_geoms(model) if int(model.geom_type[geom]) == box]
+    fixed = [geom for geom in shown if int(model.geom_bodyid[geom]) == 0]
+    if not fixed:
+        return model
+    data = mujoco.MjData(model)
+    pose(model, data, episode, 0)
+    sides = np.concatenate([box_corners(model, data, geom)[:, 1] for geom in fixed])
+    for geom in shown:
+        if model.body_mocapid[model.geom_bodyid[geom]] < 0:
+            continue
+        wall = box_corners(model, data, geom)[:, 1]
+        low, high = max(wall.min(), sides.min() + 0.005), min(wall.max(), sides.max() - 0.005)
+        if low < high and (low, high) != (wall.min(), wall.max()):
+            model.geom_pos[geom, 1] += (low + high) / 2 - data.geom_xpos[geom, 1]
+            model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's pose for the geom's
+            model.geom_size[geom, 1] = model.geom_aabb[geom, 4] = (high - low) / 2
+    return model

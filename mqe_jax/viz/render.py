@@ -1,0 +1,80 @@
+"""An episode's frames, and clips and pictures of it."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mqe_jax.viz.cameras import Camera, default_camera
+from mqe_jax.viz.clips import check_output, write_clip
+from mqe_jax.viz.geometry import drawn_model
+from mqe_jax.viz.gl import draw_gl, gl_backend
+from mqe_jax.viz.recording import Episode
+from mqe_jax.viz.top_view import draw_top
+
+GL_PACKAGES = "libegl1 libgl1-mesa-dri (Debian, Ubuntu)"
+
+
+def render_frames(
+    env: Any,
+    episode: Episode,
+    camera: Camera | None = None,
+    size: tuple[int, int] = (960, 540),
+    backend: str | None = "auto",
+) -> Iterator[np.ndarray]:
+    """Yield the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
+
+    `backend` is `auto` (what `gl_backend` finds), `egl`, `osmesa`, or None for matplotlib's view from above.
+    """
+    model = drawn_model(env.mj_model, episode)
+    if backend == "auto":
+        backend = gl_backend()
+    if backend is None:
+        return draw_top(model, episode, size)
+    return draw_gl(model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend)
+
+
+def render_episode(
+    env: Any,
+    episode: Episode,
+    path: Path,
+    *,
+    camera: Camera | None = None,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    backend: str | None = "auto",
+) -> str:
+    """Draw an episode into a file chosen by suffix; returns what drew it (`egl`, `osmesa`, `matplotlib`).
+
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720, middle frame.
+    Where GL is missing, one line on standard error names the packages that give the real picture.
+    """
+    check_output(path)
+    suffix = path.suffix.lower()
+    size = size or {".mp4": (960, 540), ".gif": (480, 270), ".png": (1280, 720)}[suffix]
+    fps = fps or {".mp4": 25.0, ".gif": 12.5, ".png": 1.0}[suffix]
+    if backend == "auto":
+        backend = gl_backend()
+    if backend is None:
+        print(
+            f"mqe: no GL library, drawn from above instead; for the 3-D picture install {GL_PACKAGES}",
+            file=sys.stderr,
+        )
+    if suffix == ".png":
+        camera = camera or default_camera(drawn_model(env.mj_model, episode), episode, size[0] / size[1])
+        middle = len(episode) // 2
+        if backend is not None:
+            episode = replace(
+                episode,
+                qpos=episode.qpos[middle : middle + 1],
+                mocap_pos=episode.mocap_pos[middle : middle + 1],
+                mocap_quat=episode.mocap_quat[middle : middle + 1],
+            )
+    else:
+        episode = episode.every(max(1, round(1 / (fps * episode.dt))))
+        fps = 1 / episode.dt
+    write_clip(path, render_frames(env, episode, camera, size, backend), fps)
+    return backend or "matplotlib"

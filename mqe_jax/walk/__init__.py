@@ -1,0 +1,1 @@
+"""How the walk policy is made: environment, rewards, training, evaluation, conversion."""

@@ -1,0 +1,34 @@
+"""Conversion of official TorchScript checkpoints of walk-these-ways."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+
+import numpy as np
+
+from mqe_jax.walk_policy import Params, _nested
+
+
+def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """Reads the float32 weights of a TorchScript file of a `torch.nn.Sequential`, without torch.
+
+    The file is a zip archive whose `data.pkl` names storages kept beside it; only tensors and plain
+    containers are accepted, so nothing in the file is executed.
+
+    Returns:
+        `{"0.weight": (out, in), "0.bias": (out,), ...}`.
+    """
+    from mqe_jax.walk.torchscript import read_state
+
+    try:
+        return read_state(path)
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"walk policy {path}: not a TorchScript Sequential of float32 layers ({error})") from None
+
+
+def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:
+    """Reads the official pair of TorchScript checkpoints into this package's weights."""
+    flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
+    flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}
+    return _nested(flat, f"{adaptation}, {body}")
