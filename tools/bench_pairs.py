@@ -1,7 +1,7 @@
 """Compares the throughput of two checkouts: `mqe bench` in each of them in turn, medians and ratios of the pairs.
 
-`python tools/bench_pairs.py BEFORE AFTER --pairs 5 --csv FILE -- go1gate --impl c --num-envs 256` runs the same bench in
-both checkouts, one after the other, five times, so that a machine whose speed drifts slows both alike.
+`python tools/bench_pairs.py BEFORE AFTER --pairs 5 --csv FILE -- go1gate --impl c --num-envs 256` runs the
+same bench in both checkouts, one after the other, five times, so that a machine whose speed drifts slows both alike.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def bench(tree: Path, arguments: list[str]) -> dict[str, object]:
 
 def main() -> int:
     """Runs the pairs and prints one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)
     parser.add_argument("--pairs", type=int, default=5)
