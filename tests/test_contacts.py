@@ -54,5 +54,5 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     assert max(contacts) >= 4 * robots - 2, "nobody touches anything: the scene is not crowded"
     assert not name or touched >= 10, f"{name} was touched in {touched} of 100 steps: nobody is at it"
     assert max(contacts) <= env.params.contacts_per_robot * robots
-    assert max(rows) <= env.params.rows_per_robot * robots
+    assert max(rows) <= env.params.constraints_per_robot * robots
     print(f"{task}: contacts {np.mean(contacts):.1f} on average, {max(contacts)} at most, rows {max(rows)}, {touched}")

@@ -128,11 +128,11 @@ def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
     both = jax.vmap(lambda qpos: env.reset(jax.random.PRNGKey(0)).data.replace(qpos=qpos))(jnp.stack([near, low]))
     ctrl = jnp.asarray(state.data.ctrl)
     after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)))(both)
-    readings = jax.vmap(env.read)(after)
-    assert bool(readings.touching[0, 0, 1]) and bool(readings.touching[0, 1, 0])
-    assert float(readings.trunk_force[0].min()) > 1.0
-    assert not bool(readings.touching[1].any())
-    assert float(readings.trunk_force[1, 0]) > 1.0 and float(readings.trunk_force[1, 1]) == 0.0
+    robot_state = jax.vmap(env.read)(after)
+    assert bool(robot_state.touching[0, 0, 1]) and bool(robot_state.touching[0, 1, 0])
+    assert float(robot_state.trunk_force[0].min()) > 1.0
+    assert not bool(robot_state.touching[1].any())
+    assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
 
 
 def test_gate_moves_with_the_world() -> None:

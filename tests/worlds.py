@@ -12,7 +12,7 @@ import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 
 
@@ -39,11 +39,11 @@ def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0
     return jnp.stack([jnp.asarray(angle, jnp.float32) for angle in (roll, pitch, yaw)], axis=-1)
 
 
-def readings(position: Any, **euler: Any) -> RobotReadings:
+def robot_state(position: Any, **euler: Any) -> RobotState:
     """What is read off two robots at positions (2, 3), m, which stand still with the default joints; see `angles`."""
     joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
     none = jnp.zeros((2, 3))
-    return RobotReadings(
+    return RobotState(
         jnp.asarray(position), euler_to_quaternion(angles(**euler)), none, none, joints, jnp.zeros((2, 12)),
         jnp.zeros(2), jnp.zeros((2, 2), bool),
     )  # fmt: skip

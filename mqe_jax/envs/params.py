@@ -37,7 +37,7 @@ class TaskParams:
         solver_iterations: at most so many solver iterations per physics step.
         contacts_per_robot: room for contacts, times the robots of a world: of a world on MJX-JAX, which keeps the
             deepest ones, and of all worlds together on Warp.
-        rows_per_robot: room for constraint rows of a world on Warp, likewise.
+        constraints_per_robot: room for constraint rows of a world on Warp, likewise.
         randomization: domain randomisation.
         hold_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
             for up to hold_time x aid, s, so that agents first learn one at a time what they must do in turn.
@@ -62,7 +62,7 @@ class TaskParams:
     friction: float = 1.0
     solver_iterations: int = 4
     contacts_per_robot: int = 12
-    rows_per_robot: int = 64
+    constraints_per_robot: int = 64
     randomization: Randomization = Randomization()
     hold_time: float = 4.0
 
@@ -73,7 +73,7 @@ class TaskParams:
             "friction",
             "solver_iterations",
             "contacts_per_robot",
-            "rows_per_robot",
+            "constraints_per_robot",
         ):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name}: {getattr(self, name)} must be positive")

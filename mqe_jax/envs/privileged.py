@@ -10,7 +10,7 @@ from mujoco import mjx
 
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotIndex, RobotReadings
+from mqe_jax.robots.index import RobotIndex, RobotState
 
 _ROBOT = (
     Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),
@@ -32,18 +32,19 @@ class PrivilegedObservation:
         self._qvel = np.setdiff1d(np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1))
         blocks = (
             *(Block(f"robot{i}/{block.name}", block.width, block.meaning) for i in robots for block in _ROBOT),
-            Block("objects/qpos", len(self._qpos), "positions of everything that is no robot"),
-            Block("objects/qvel", len(self._qvel), "velocities of everything that is no robot"),
+            Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
+            Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
             Block("gates", 2 * num_gates, "centres, m"),
         )
         self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 
-    def observe(self, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> jax.Array:
+    def observe(self, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> jax.Array:
         """Returns the observation of one world (P,)."""
         robots = jnp.concatenate(
             [
-                readings.position_w, readings.quaternion, readings.linear_velocity_w, readings.angular_velocity_b,
-                readings.joint_position - go1.DEFAULT_JOINTS, readings.joint_velocity,
+                robot_state.position_w, robot_state.quaternion, robot_state.linear_velocity_w,
+                robot_state.angular_velocity_b, robot_state.joint_position - go1.DEFAULT_JOINTS,
+                robot_state.joint_velocity,
             ],
             axis=-1,
         )  # fmt: skip

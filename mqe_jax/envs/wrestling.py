@@ -15,7 +15,7 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Init, Plane, Track
 
@@ -95,17 +95,17 @@ class Go1Wrestling(Duel):
         (x, y), apart = self.center, self.params.spawn_y
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        return {"win": self.versus(self.wins(state, readings))}, None
+        return {"win": self.versus(self.wins(state, robot_state))}, None
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
+    def lost(self, robot_state: RobotState) -> jax.Array:
         """Which robots have fallen or left the ring (2,) bool."""
         params = self.params
-        apart = jnp.linalg.norm(readings.position_w[:, :2] - jnp.array(self.center), axis=-1)
-        below = readings.position_w[:, 2] < params.platform_top - params.ring_depth
-        return self.fallen(readings) | (apart > params.ring_radius) | below
+        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
+        below = robot_state.position_w[:, 2] < params.platform_top - params.ring_depth
+        return self.fallen(robot_state) | (apart > params.ring_radius) | below
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One has fallen or left the ring."""
-        return jnp.any(self.lost(readings))
+        return jnp.any(self.lost(robot_state))

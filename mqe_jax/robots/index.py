@@ -131,7 +131,7 @@ def index_robots(model: mujoco.MjModel, num_robots: int, contacts: Contacts, *, 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class RobotReadings:
+class RobotState:
     """What every engine tells about the A robots of a scene after a step.
 
     Attributes:
@@ -170,7 +170,7 @@ class RobotReadings:
         return rotate_inverse(self.quaternion, jnp.array([0.0, 0.0, -1.0]))
 
 
-def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotReadings:
+def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotState:
     """Reads all robots off the state vectors of one world (nq,), (nv,), (nsensordata,)."""
     base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
     count = index.num_robots
@@ -179,7 +179,7 @@ def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata:
         first, second, address = index.touch.T
         found = sensordata[address] > 0
         touching = touching.at[first, second].max(found).at[second, first].max(found)
-    return RobotReadings(
+    return RobotState(
         position_w=base[:, :3],
         quaternion=base[:, 3:],
         linear_velocity_w=base_velocity[:, :3],

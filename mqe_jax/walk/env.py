@@ -21,7 +21,7 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
 from mqe_jax.robots import go1
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -160,7 +160,9 @@ class WalkEnv:
             solver_iterations=self.task.solver_iterations,
         )  # fmt: skip
         self.compiled = compile_scene(scene)
-        self.physics = Physics(self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, rows_per_env=44)
+        self.physics = Physics(
+            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, max_constraints_per_env=44
+        )
         self.index = self.compiled.robot
         self._mass = np.asarray(self.compiled.model.body_mass)
 
@@ -291,25 +293,25 @@ class WalkEnv:
             fields=self._fields(state.body),
             xfrc_applied=self._forces(data, state.body, slope, force),
         )
-        readings = self.read(data)
+        robot_state = self.read(data)
         commands = state.condition.commands
-        velocity, yaw_rate = heading_velocity(readings)
+        velocity, yaw_rate = heading_velocity(robot_state)
         error = jnp.stack([velocity[0] - commands[0], velocity[1] - commands[1], yaw_rate - commands[2]])
         mean_error = state.mean_error + 0.04 * (error - state.mean_error)
         gait = walk_policy.advance_gait(state.memory.gait, commands)
         memory = WalkMemory(state.memory.history, action, state.memory.action, gait)
 
         inputs = RewardInputs(
-            readings=readings, commands=commands, error=error, mean_error=mean_error, gait=gait, target=target,
+            robot_state=robot_state, commands=commands, error=error, mean_error=mean_error, gait=gait, target=target,
             previous_target=previous_target, before_target=before_target, body_height=task.body_height,
             foot_force=self.foot_force(data), strength=state.body.strength,
         )  # fmt: skip
         terms = reward_terms(inputs)
         reward, weighted = combine(terms, task.rewards)
 
-        up = rotate_inverse(readings.quaternion, jnp.array([0.0, 0.0, 1.0]))[0]
+        up = rotate_inverse(robot_state.quaternion, jnp.array([0.0, 0.0, 1.0]))[0]
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        fallen = (readings.trunk_force[0] > 1.0) | (up[2] < 0.5) | (readings.position_w[0, 2] < 0.1) | ~finite
+        fallen = (robot_state.trunk_force[0] > 1.0) | (up[2] < 0.5) | (robot_state.position_w[0, 2] < 0.1) | ~finite
         step, age = state.step + 1, state.age + 1
         metrics = {f"reward/{name}": value for name, value in weighted.items()} | {
             "error_vx": jnp.square(error[0]), "error_vy": jnp.square(error[1]), "error_yaw": jnp.square(error[2]),
@@ -327,9 +329,9 @@ class WalkEnv:
         )  # fmt: skip
         return self._observed(state, noise_key)
 
-    # -- readings -----------------------------------------------------------------------------------------------
+    # -- robot state --------------------------------------------------------------------------------------------
 
-    def read(self, data: mjx.Data) -> RobotReadings:
+    def read(self, data: mjx.Data) -> RobotState:
         """Reads the robot."""
         return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
@@ -365,10 +367,10 @@ class WalkEnv:
         return forces.at[trunk, :2].add(force[0] * along + force[1] * left)
 
     def _observed(self, state: WalkState, key: jax.Array) -> WalkState:
-        readings = self.read(state.data)
-        quaternion = readings.quaternion[0]
+        robot_state = self.read(state.data)
+        quaternion = robot_state.quaternion[0]
         gravity = rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
-        joint_position, joint_velocity = readings.joint_position[0], readings.joint_velocity[0]
+        joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
         clean = walk_policy.observe(state.memory, state.condition.commands, gravity, joint_position, joint_velocity)
         obs = clean
         if self.task.randomize:
@@ -379,16 +381,17 @@ class WalkEnv:
                 joint_position + 0.005 * jax.random.normal(b, (go1.NUM_JOINTS,)),
                 joint_velocity + 0.5 * jax.random.normal(c, (go1.NUM_JOINTS,)),
             )  # fmt: skip
-        velocity = rotate_inverse(quaternion, readings.linear_velocity_w[0])
+        velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
         feet = robots.foot_positions(joint_position)
-        foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
+        foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
         phases = walk_policy.foot_phases(state.memory.gait, state.condition.commands)
         body = state.body
         privileged = jnp.concatenate([
-            clean, 2.0 * velocity, 0.25 * readings.angular_velocity_b[0], up, 5.0 * readings.position_w[0, 2:] - 1.5,
-            10.0 * foot_height, jnp.cos(2 * jnp.pi * phases), jnp.tanh(self.foot_force(state.data) / 50.0),
-            2.0 * state.mean_error, state.force / 20.0, state.slope * 4.0, body.com * 20.0,
+            clean, 2.0 * velocity, 0.25 * robot_state.angular_velocity_b[0], up,
+            5.0 * robot_state.position_w[0, 2:] - 1.5, 10.0 * foot_height, jnp.cos(2 * jnp.pi * phases),
+            jnp.tanh(self.foot_force(state.data) / 50.0), 2.0 * state.mean_error, state.force / 20.0,
+            state.slope * 4.0, body.com * 20.0,
             jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
         ])  # fmt: skip
         obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))
@@ -417,10 +420,10 @@ def gravity_w(slope: jax.Array) -> jax.Array:
     return GRAVITY * jnp.concatenate([-jnp.sin(angle) * along, -jnp.cos(angle)[None]])
 
 
-def heading_velocity(readings: RobotReadings) -> tuple[jax.Array, jax.Array]:
+def heading_velocity(robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
     """Returns the first robot's velocity along its heading and to its left (2,), m/s, and yaw rate (), rad/s."""
-    velocity = rotate_inverse(readings.quaternion[0], readings.linear_velocity_w[0])
-    return velocity[:2], readings.angular_velocity_b[0, 2]
+    velocity = rotate_inverse(robot_state.quaternion[0], robot_state.linear_velocity_w[0])
+    return velocity[:2], robot_state.angular_velocity_b[0, 2]
 
 
 def _zero_metrics(weights: WalkRewards) -> dict[str, Any]:

@@ -96,20 +96,20 @@ def measure(
         state, memory = carry
 
         def one(state: Any, memory: Any) -> Any:
-            readings = env.read(state.data)
+            robot_state = env.read(state.data)
             gravity = state.obs[:3]
             commands = state.condition.commands
             _, memory = walk_policy.walk(
-                params, memory, commands, gravity, readings.joint_position[0], readings.joint_velocity[0]
+                params, memory, commands, gravity, robot_state.joint_position[0], robot_state.joint_velocity[0]
             )
             state = env.step(state, memory.action)
-            readings = env.read(state.data)
-            quaternion = readings.quaternion[0]
-            feet = robots.foot_positions(readings.joint_position[0])
-            height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
+            robot_state = env.read(state.data)
+            quaternion = robot_state.quaternion[0]
+            feet = robots.foot_positions(robot_state.joint_position[0])
+            height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
             squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
-            speed = rotate_inverse(quaternion, readings.linear_velocity_w[0])[0]
-            return state, memory, (squares, speed, readings.position_w[0, :2], height, state.terminated)
+            speed = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])[0]
+            return state, memory, (squares, speed, robot_state.position_w[0, :2], height, state.terminated)
 
         state, memory, record = jax.vmap(one)(state, memory)
         return (state, memory), record

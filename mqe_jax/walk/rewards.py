@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 
 
@@ -46,7 +46,7 @@ class WalkRewards:
 class RewardInputs:
     """What the reward terms are functions of; see `WalkState` for shapes and units."""
 
-    readings: RobotReadings
+    robot_state: RobotState
     commands: jax.Array
     error: jax.Array
     mean_error: jax.Array
@@ -67,13 +67,13 @@ def desired_contact(phases: jax.Array, width: float = 0.07) -> jax.Array:
 
 def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     """Computes every term (), named as its weight in `WalkRewards`."""
-    readings, commands = inputs.readings, inputs.commands
-    quaternion, height = readings.quaternion[0], readings.position_w[0, 2]
-    joint_position, joint_velocity = readings.joint_position[0], readings.joint_velocity[0]
+    robot_state, commands = inputs.robot_state, inputs.commands
+    quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
+    joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
     phases = walk_policy.foot_phases(inputs.gait, commands)
     contact = desired_contact(phases)
-    velocity_b = rotate_inverse(quaternion, readings.linear_velocity_w[0])
-    rate = readings.angular_velocity_b[0]
+    velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
+    rate = robot_state.angular_velocity_b[0]
 
     feet, feet_velocity = jax.jvp(robots.foot_positions, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
@@ -124,7 +124,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
         "low_knee": jnp.sum(jnp.maximum(0.06 - knees, 0.0) > 0).astype(jnp.float32),
-        "vertical_speed": jnp.square(readings.linear_velocity_w[0, 2]),
+        "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }
 
