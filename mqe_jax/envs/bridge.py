@@ -62,7 +62,7 @@ class BridgeParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.top)
+        check_above(self.spawn_height, self.top, self.robot)
 
 
 class Go1Bridge(Duel):

@@ -16,7 +16,7 @@ from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
-from mqe_jax.walk_policy import command_index, default_commands
+from mqe_jax.walk_policy import command_index
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Go1FootballDefender(Football):
 
     def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns the defender's walk commands (1, 15)."""
-        commands = jnp.asarray(default_commands(self.params.gait))
+        commands = jnp.asarray(self.controller.default_commands)
         if not self.params.defender_idle:
             move = defend(
                 robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])

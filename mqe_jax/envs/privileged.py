@@ -9,8 +9,8 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs.observation import Block, ObservationLayout
-from mqe_jax.robots import go1
 from mqe_jax.robots.index import RobotIndex, RobotState
+from mqe_jax.robots.robot import Robot
 
 _ROBOT = (
     Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),
@@ -26,7 +26,8 @@ class PrivilegedObservation:
         layout: its blocks, in order; raw units.
     """
 
-    def __init__(self, model: mujoco.MjModel, index: RobotIndex, num_gates: int) -> None:
+    def __init__(self, robot: Robot, model: mujoco.MjModel, index: RobotIndex, num_gates: int) -> None:
+        self._default_joints = robot.default_joints
         robots = range(index.num_robots)
         self._qpos = np.setdiff1d(np.arange(model.nq), np.concatenate([index.base_qpos, index.joint_qpos], axis=1))
         self._qvel = np.setdiff1d(np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1))
@@ -43,7 +44,7 @@ class PrivilegedObservation:
         robots = jnp.concatenate(
             [
                 robot_state.position_w, robot_state.quaternion, robot_state.linear_velocity_w,
-                robot_state.angular_velocity_b, robot_state.joint_position - go1.DEFAULT_JOINTS,
+                robot_state.angular_velocity_b, robot_state.joint_position - self._default_joints,
                 robot_state.joint_velocity,
             ],
             axis=-1,
