@@ -19,7 +19,6 @@ from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
@@ -157,13 +156,12 @@ class WalkEnv:
             Track(blocks=(Plane(4.0),), walled=False, num_robots=1),
             num_robots=1,
             robot=robot,
-            contacts=Contacts(ground=("trunk", "foot"), wall=(), robot=(), object=()),
             foot_sensors=True,
             solver_iterations=self.task.solver_iterations,
         )
         self.compiled = compile_scene(scene)
         self.physics = Physics(
-            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, max_constraints_per_env=44
+            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=16, max_constraints_per_env=80
         )
         self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)
