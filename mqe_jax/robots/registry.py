@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.go2 import GO2
 from mqe_jax.robots.robot import Robot
 
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1,)}
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 
 
 def get(name: str) -> Robot:
