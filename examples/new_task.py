@@ -19,8 +19,7 @@ from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object
 from mqe_jax.planners import PLANNERS
 from mqe_jax.planners.steering import go_to
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Block as TerrainBlock
 from mqe_jax.terrain import Closing, Init, Layout, Plane, Track, Wall, register_block
@@ -126,48 +125,48 @@ class Go1Catch(QuadrupedEnv):
     def scene(self) -> Scene:
         """Says what is in the world."""
         track = Track(blocks=(Init(1.5), Pillar(2.0), Plane(1.5), Closing()), width=3.0, num_robots=1)
-        return Scene(track, num_robots=1, contacts=Contacts(object=("trunk", "foot")), objects=(Mouse("mouse"),))
+        return Scene(track, num_robots=1, objects=(Mouse("mouse"),))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draws where the mouse starts."""
         place = jnp.array([3.8, 0.0]) + jax.random.uniform(key, (2,), minval=-0.5, maxval=0.5)
         return qpos.at[self.objects["mouse"].qpos].set(place), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> CatchState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> CatchState:
         """Returns the task's own fields of a fresh world."""
-        return CatchState(self.distance(readings, data))
+        return CatchState(self.distance(robot_state, data))
 
-    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
+    def drive(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Lets the mouse run."""
-        velocity = flee(self.object_pose(data, "mouse"), readings.position_w[0, :2], self.params.mouse_speed)
+        velocity = flee(self.object_pose(data, "mouse"), robot_state.position_w[0, :2], self.params.mouse_speed)
         return data.replace(qvel=data.qvel.at[self.objects["mouse"].qvel].set(velocity))
 
-    def distance(self, readings: RobotReadings, data: mjx.Data) -> jax.Array:
+    def distance(self, robot_state: RobotState, data: mjx.Data) -> jax.Array:
         """Returns the horizontal distance of the robot to the mouse (), m."""
-        return jnp.linalg.norm(self.object_pose(data, "mouse") - readings.position_w[0, :2])
+        return jnp.linalg.norm(self.object_pose(data, "mouse") - robot_state.position_w[0, :2])
 
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("mouse", 2, "x, y, m")))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (1, width)."""
-        return {"base": readings.base_info, "mouse": self.object_pose(state.data, "mouse")[None]}
+        return {"base": robot_state.base_info, "mouse": self.object_pose(state.data, "mouse")[None]}
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        distance = self.distance(readings, state.data)
+        distance = self.distance(robot_state, state.data)
         terms = {"approach": state.task.distance - distance, "caught": distance < self.params.reach}
         return terms, CatchState(distance)
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The mouse is caught."""
-        return self.distance(readings, state.data) < self.params.reach
+        return self.distance(robot_state, state.data) < self.params.reach
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the mouse is caught."""
-        return {"success": self.ending(state, readings) & ~failed}
+        return {"success": self.ending(state, robot_state) & ~failed}
 
 
 def plan_catch(obs: jax.Array) -> jax.Array:

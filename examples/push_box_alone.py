@@ -17,7 +17,7 @@ WORLDS, SECONDS = 32, 3.0
 def start(env: QuadrupedEnv, key: jax.Array, place: jax.Array) -> State:
     """Returns a fresh world with the robots at (2, 2), m."""
     state = env.reset(key)
-    qpos = state.data.qpos.at[env.robot.base_qpos[:, :2]].set(place)
+    qpos = state.data.qpos.at[env.index.base_qpos[:, :2]].set(place)
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos))
 
 
@@ -31,10 +31,10 @@ def pushed(robots: int, worlds: int = WORLDS) -> float:
     pushes = jnp.array([1.0, 1.0 if robots == 2 else 0.0])[:, None]
 
     def step(state: State, _: None) -> tuple[State, None]:
-        readings = env.read(state.data)
-        position = readings.position_w[:, :2]
+        robot_state = env.read(state.data)
+        position = robot_state.position_w[:, :2]
         goal = jnp.stack([position[:, 0] + 1.0, lane], axis=-1)
-        action = go_to(position, readings.euler[:, 2], goal).at[:, 0].set(0.4)
+        action = go_to(position, robot_state.euler[:, 2], goal).at[:, 0].set(0.4)
         return env.step(state, pushes * action), None
 
     def way(key: jax.Array) -> jax.Array:

@@ -1,8 +1,17 @@
-"""Collision bits: which shapes touch which."""
+"""Collision bits: two shapes touch where the contype of one has a bit of the other's conaffinity."""
 
 from __future__ import annotations
 
-# Collision bits. Every robot's trunk has one of its own, which only other robots' shapes answer to: so a robot
-# never touches itself, and limbs touch trunks but not limbs.
 GROUND_BIT, WALL_BIT, OBJECT_BIT = 1, 2, 4
 MAX_ROBOTS = 16
+
+
+def robot_bits(number: int) -> tuple[int, int]:
+    """Returns (contype, conaffinity) of all shapes of robot `number`.
+
+    Its contype is a bit of its own; its conaffinity has the bits of ground, walls, objects and every other robot. So
+    robots collide with each other with all of their body and never with themselves.
+    """
+    first = 2 * OBJECT_BIT
+    own, robots = first << number, (first << MAX_ROBOTS) - first
+    return own, GROUND_BIT | WALL_BIT | OBJECT_BIT | (robots & ~own)

@@ -86,7 +86,7 @@ class Physics:
         num_substeps: physics steps a call of `step`.
         num_envs: how many worlds the Warp engine's contact buffer has room for.
         contacts_per_env: how many contacts a world may have on average on Warp.
-        rows_per_env: how many constraint rows a world may have on Warp.
+        max_constraints_per_env: how many constraint rows a world may have on Warp.
     """
 
     def __init__(
@@ -97,20 +97,22 @@ class Physics:
         num_substeps: int = 4,
         num_envs: int = 4096,
         contacts_per_env: int = 32,
-        rows_per_env: int = 160,
+        max_constraints_per_env: int = 160,
     ) -> None:
         self.model = model
         self.impl = resolve_impl(impl)
         self.num_substeps = num_substeps
         self.num_envs = num_envs
         self.contacts_per_env = contacts_per_env
-        self.rows_per_env = rows_per_env
+        self.max_constraints_per_env = max_constraints_per_env
         if self.impl == "c":
             self._engine = _CEngine(model, num_substeps)
             self._template = _without_pointers(mjx.make_data(model, impl="cpp"))
         elif self.impl == "warp":
             self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
-            self._template = mjx.make_data(model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env)
+            self._template = mjx.make_data(
+                model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=max_constraints_per_env
+            )
         else:
             self._mjx_model = mjx.put_model(model, impl="jax")
             self._template = mjx.make_data(model, impl="jax")
@@ -126,10 +128,15 @@ class Physics:
         """
         as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
         return self._template.replace(
-            qpos=as_float(qpos), qvel=as_float(qvel), mocap_pos=as_float(mocap_pos), ctrl=as_float(ctrl),
-            qacc_warmstart=jnp.zeros(self.model.nv), xfrc_applied=jnp.zeros((self.model.nbody, 6)),
-            sensordata=jnp.zeros(self.model.nsensordata), time=jnp.zeros(()),
-        )  # fmt: skip
+            qpos=as_float(qpos),
+            qvel=as_float(qvel),
+            mocap_pos=as_float(mocap_pos),
+            ctrl=as_float(ctrl),
+            qacc_warmstart=jnp.zeros(self.model.nv),
+            xfrc_applied=jnp.zeros((self.model.nbody, 6)),
+            sensordata=jnp.zeros(self.model.nsensordata),
+            time=jnp.zeros(()),
+        )
 
     def step(
         self,
@@ -210,14 +217,25 @@ class _CEngine:
             return self._call(names, forced, substeps, qpos, *rest)
 
         row = jax.pure_callback(
-            call, out, data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, *mocap, *forces,
-            *(fields[name] for name in names), vmap_method="broadcast_all",
-        )  # fmt: skip
+            call,
+            out,
+            data.qpos,
+            data.qvel,
+            data.qacc_warmstart,
+            data.ctrl,
+            *mocap,
+            *forces,
+            *(fields[name] for name in names),
+            vmap_method="broadcast_all",
+        )
         qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
         return data.replace(
-            qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, sensordata=sensordata,
+            qpos=qpos,
+            qvel=qvel,
+            qacc_warmstart=warmstart,
+            sensordata=sensordata,
             time=data.time + substeps * self._model.opt.timestep,
-        )  # fmt: skip
+        )
 
     def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
         qpos, *rest = (np.asarray(array) for array in arrays)

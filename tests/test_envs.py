@@ -15,7 +15,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
-from tests.worlds import placed, readings
+from tests.worlds import placed, robot_state
 
 Array = jax.Array
 
@@ -85,7 +85,7 @@ def test_contract(task: str) -> None:
     np.testing.assert_array_equal(np.asarray(state.step) == 0, ended)
     assert np.all(np.abs(np.asarray(state.obs - state.final_obs)).max((1, 2))[ended] > 0)
     np.testing.assert_array_equal(np.asarray(state.obs)[~ended], np.asarray(state.final_obs)[~ended])
-    spawned = np.asarray(state.data.qpos)[ended][:, env.robot.base_qpos[:, 2]]
+    spawned = np.asarray(state.data.qpos)[ended][:, env.index.base_qpos[:, 2]]
     np.testing.assert_allclose(spawned, env.params.spawn_height, atol=1e-6)
 
     fine, diverged = [], []
@@ -128,7 +128,7 @@ def test_two_engines_step_alike(task: str) -> None:
 
 def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv) -> None:
     state = gate.reset(jax.random.PRNGKey(0))
-    both = readings([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
+    both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
     state = dataclasses.replace(state, gates=jnp.array([[3.4, 0.2]]))
     obs = gate.observation_layout.pack(gate.observe(state, both))
     first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
@@ -140,11 +140,11 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     from mqe_jax.envs.reward import weigh
 
     state = gate.reset(jax.random.PRNGKey(0))
-    before = readings([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
+    before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
     # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
     task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.gates)
     state = dataclasses.replace(state, gates=jnp.array([[3.5, 0.0]]), task=task)
-    after = readings([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
+    after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
     terms, _ = gate.rewards(state, after, jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
     assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
@@ -152,7 +152,7 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     assert float(terms["crowding"]) == 0
     reward, logged = weigh(terms, gate.params.rewards, 2)
     np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
-    near, _ = gate.rewards(state, readings([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
+    near, _ = gate.rewards(state, robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
     assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
     assert float(near["collision"]) == 0
     assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
@@ -160,7 +160,7 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
 
 def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv) -> None:
     state = dataclasses.replace(gate.reset(jax.random.PRNGKey(0)), gates=jnp.array([[3.5, 0.0]]))
-    both, one = readings([[3.8, 0, 0.3], [4.5, 0, 0.3]]), readings([[3.8, 0, 0.3], [3.7, 0, 0.3]])
+    both, one = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]]), robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
     fine = jnp.array(False)
     assert float(gate.outcome(state, both, fine)["success"]) == 1
     assert float(gate.outcome(state, both, ~fine)["success"]) == 0
@@ -182,7 +182,7 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     pitched = [[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]
     assert not gate_step(placed(gate, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched, state=state), still).terminated
     assert gate_step(placed(gate, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]], state=state), still).terminated
-    fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
+    fallen = gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
     assert fallen.tolist() == [True, False]
     bumped = gate_step(placed(gate, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0

@@ -15,7 +15,6 @@ from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import PLANNERS
-from mqe_jax.walk_policy import default_commands
 from tests.worlds import observation, placed, still, with_object
 
 NO = jnp.array(False)
@@ -99,8 +98,8 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
 def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
     """Rays at the height of the ball, from the field's middle outwards, end where the listed walls are."""
     model, data = duel.compiled.model, mujoco.MjData(duel.compiled.model)
-    data.qpos[duel.robot.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
-    data.qpos[duel.robot.base_qpos[:, 0]] = [3.0, 4.0]
+    data.qpos[duel.index.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
+    data.qpos[duel.index.base_qpos[:, 0]] = [3.0, 4.0]
     data.qpos[duel.objects["ball"].qpos[:3]] = [11.0, -4.0, 0.1]
     mujoco.mj_forward(model, data)
 
@@ -331,7 +330,7 @@ def test_an_idle_defender_is_told_to_stand(attack: Any, fresh: Any) -> None:
     state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
     idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
     robots = attack.read(state.data)
-    rest = default_commands()
+    rest = idle.controller.default_commands
     np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
     told = np.asarray(attack.npc_commands(state, robots))[0]
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.

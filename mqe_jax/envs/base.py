@@ -28,8 +28,7 @@ from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer, World
 from mqe_jax.envs.reward import weigh
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, build_model, compile_scene
 
@@ -83,6 +82,7 @@ class QuadrupedEnv:
 
     Attributes:
         params: the task's parameters.
+        robot: all robots of the task.
         impl: physics engine: 'jax', 'warp' or 'c'.
         control: 'command', 'position' or 'torque'.
         num_agents: A.
@@ -113,29 +113,38 @@ class QuadrupedEnv:
         if num_envs < 1:
             raise ValueError(f"num_envs: {num_envs} must be at least 1")
         self.num_agents = self.params.num_agents
+        self.robot = robots.get(self.params.robot)
         scene = self.scene()
         network = self.params.actuator_network if control != "torque" else None
         # Robots that are no agents follow joint targets, whatever the agents do.
         torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
         self._scene = dataclasses.replace(
-            scene, friction=self.params.friction, solver_iterations=self.params.solver_iterations,
-            torque_robots=torque_robots, max_contacts=self.params.contacts_per_robot * scene.num_robots,
-        )  # fmt: skip
+            scene,
+            robot=self.robot,
+            contacts=self.params.contacts,
+            friction=self.params.friction,
+            solver_iterations=self.params.solver_iterations,
+            torque_robots=torque_robots,
+            max_contacts=self.params.contacts_per_robot * scene.num_robots,
+        )
         self.compiled = compile_scene(self._scene)
-        self.robot, self.objects = self.compiled.robot, self.compiled.objects
+        self.index, self.objects = self.compiled.index, self.compiled.objects
         self.physics = Physics(
             self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self._scene.max_contacts,
-            rows_per_env=self.params.rows_per_robot * scene.num_robots,
+            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots,
         )  # fmt: skip
         self.impl = self.physics.impl
-        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.robot, self.params.friction)
-        self.privileged = PrivilegedObservation(self.compiled.model, self.robot, len(self.compiled.layout.anchors))
+        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
+        self.privileged = PrivilegedObservation(
+            self.robot, self.compiled.model, self.index, len(self.compiled.layout.anchors)
+        )
         walks = control == "command" or self._scene.num_robots > self.num_agents
         self.controller = Controller(
-            mode=control, physics=self.physics, index=self.robot, num_agents=self.num_agents,
-            walk_params=walk_policy.load_params(self.params.walk_policy) if walks else None,
+            mode=control, robot=self.robot, physics=self.physics, index=self.index, num_agents=self.num_agents,
+            walk_params=walk_policy.load_params(self.robot, self.params.walk_policy) if walks else None,
             actuator_params=load_actuator_network(network) if network else None, commands=self.params.commands,
-            default_commands=walk_policy.default_commands(self.params.gait), lag=self.params.randomization.action_lag,
+            default_commands=walk_policy.default_commands(self.robot, self.params.gait),
+            lag=self.params.randomization.action_lag,
         )  # fmt: skip
 
     # -- what a task says ---------------------------------------------------------------------------------------
@@ -159,11 +168,11 @@ class QuadrupedEnv:
         """Draws where movable objects start, into qpos (nq,) and qvel (nv,)."""
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> Any:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> Any:
         """Returns the task's own fields of a fresh world."""
         return None
 
-    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array | None:
+    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array | None:
         """Returns walk commands (R - A, 15) of the robots that are no agents."""
         return None
 
@@ -171,7 +180,7 @@ class QuadrupedEnv:
         """Turns actions (A, action_size), each in its agent's own frame, into those that the robots carry out."""
         return action
 
-    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
+    def drive(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Moves what has a will of its own: returns the world with its velocities for the next step."""
         return data
 
@@ -180,30 +189,30 @@ class QuadrupedEnv:
         """The blocks of an agent's observation, in order."""
         raise TypeError(f"{type(self).__name__}: observation_layout is not defined")
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
         raise TypeError(f"{type(self).__name__}: observe() is not defined")
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms, () or (A,), and the task's fields after the step.
 
         Args:
             state: the state before the step, with the physics after it.
-            readings: of the robots after the step.
+            robot_state: of the robots after the step.
             collision: whether any trunk touches anything () bool.
         """
         raise TypeError(f"{type(self).__name__}: rewards() is not defined")
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns whether the task's own rules end the episode () bool."""
         return jnp.zeros((), bool)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Returns `success` () and further `success/...` measures, which count when the episode ends.
 
         Args:
             state: after the step.
-            readings: of the robots.
+            robot_state: of the robots.
             failed: whether the step ended by a fall, a collision or a divergence () bool.
         """
         return {"success": jnp.zeros(())}
@@ -274,23 +283,23 @@ class QuadrupedEnv:
         gates = self._draw_gates(gate_key)
         qpos, qvel = self._draw_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel)
-        ctrl = jnp.zeros(self.compiled.model.nu).at[self.robot.actuator].set(self.controller.neutral)
+        ctrl = jnp.zeros(self.compiled.model.nu).at[self.index.actuator].set(self.controller.neutral)
         data = self.physics.init(qpos, qvel, self._mocap(gates), ctrl)
-        readings = self.read(data)
+        robot_state = self.read(data)
         no = jnp.zeros((), bool)
         empty = jnp.zeros((0,))
         state = State(
             data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
             reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
             step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
-            world=self.randomizer.draw(world_key), task=self.reset_task(task_key, readings, data, gates), aid=aid,
+            world=self.randomizer.draw(world_key), task=self.reset_task(task_key, robot_state, data, gates), aid=aid,
             hold=self._draw_hold(aid_key, aid), key=next_key,
         )  # fmt: skip
-        terms, _ = self.rewards(state, readings, no)
+        terms, _ = self.rewards(state, robot_state, no)
         _, logged = weigh(terms, self.params.rewards, self.num_agents)
-        metrics = {**logged, **self.outcome(state, readings, no), "collision": 0.0, "diverged": 0.0}
+        metrics = {**logged, **self.outcome(state, robot_state, no), "collision": 0.0, "diverged": 0.0}
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in metrics})
-        return self._observed(state, readings, noise_key)
+        return self._observed(state, robot_state, noise_key)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one world by one environment step.
@@ -323,17 +332,17 @@ class QuadrupedEnv:
             self.randomizer.fields(state.world),
             self.external_forces(state),
         )
-        readings = self.read(data)
+        robot_state = self.read(data)
         state = dataclasses.replace(state, data=data, control=control, step=state.step + 1, key=key)
 
         diverged = bad_action | self._diverged(data)
-        collision = jnp.any(readings.trunk_force[: self.num_agents] > self.params.collision_force)
-        terms, task = self.rewards(state, readings, collision)
+        collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
+        terms, task = self.rewards(state, robot_state, collision)
         reward, logged = weigh(terms, self.params.rewards, self.num_agents)
         state = dataclasses.replace(state, task=task)
-        failed = jnp.any(self.fallen(readings)) | diverged | (collision & self.params.end_on_collision)
-        terminated = failed | self.ending(state, readings)
-        metrics = {**logged, **self.outcome(state, readings, failed), "collision": collision}
+        failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
+        terminated = failed | self.ending(state, robot_state)
+        metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
         metrics = {name: clean(value, self.if_diverged.get(name, 0.0)) for name, value in metrics.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
@@ -341,21 +350,21 @@ class QuadrupedEnv:
             state, reward=clean(reward), terminated=terminated, metrics=metrics,
             truncated=~terminated & (state.step >= self.max_steps),
         )  # fmt: skip
-        return self._observed(state, readings, noise_key)
+        return self._observed(state, robot_state, noise_key)
 
-    def read(self, data: mjx.Data) -> RobotReadings:
+    def read(self, data: mjx.Data) -> RobotState:
         """Reads all robots of one world."""
-        return robots.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
+        return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
         """Returns the coordinates of an object by name, as its class gives them."""
         return data.qpos[self.objects[name].qpos]
 
-    def fallen(self, readings: RobotReadings) -> jax.Array:
+    def fallen(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots lie on their side or back, or are too low or too high (R,) bool."""
         params = self.params
-        roll, pitch = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1])
-        height = readings.position_w[:, 2]
+        roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
+        height = robot_state.position_w[:, 2]
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
         return out | (height < params.min_height) | (height > params.max_height)
 
@@ -376,12 +385,12 @@ class QuadrupedEnv:
         return self.compiled.wall_positions(gates)
 
     def _draw_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        params, model, index = self.params, self.compiled.model, self.robot
+        params, model, index = self.params, self.compiled.model, self.index
         pose = self.spawn(spawn_key)
         joint_key, velocity_key = jax.random.split(body_key)
         low, high = params.spawn_joint_scale
-        joints = go1.DEFAULT_JOINTS * jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
-        joints = jnp.clip(joints, go1.JOINT_LOWER, go1.JOINT_UPPER)
+        factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
+        joints = jnp.clip(self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper)
         speed = params.spawn_velocity
         velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
         level = jnp.zeros(len(pose))
@@ -409,15 +418,15 @@ class QuadrupedEnv:
 
     def _diverged(self, data: mjx.Data) -> jax.Array:
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        position = data.qpos[self.robot.base_qpos[:, :3]]
+        position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
 
-    def _observed(self, state: State, readings: RobotReadings, key: jax.Array) -> State:
-        obs = self.observation_layout.pack(self.observe(state, readings))
+    def _observed(self, state: State, robot_state: RobotState, key: jax.Array) -> State:
+        obs = self.observation_layout.pack(self.observe(state, robot_state))
         noise = self.params.randomization.observation_noise
         if noise:
             obs = obs + noise * jax.random.normal(key, obs.shape)
-        privileged = self.privileged.observe(readings, state.data, state.gates)
+        privileged = self.privileged.observe(robot_state, state.data, state.gates)
         obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
         return dataclasses.replace(
             state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged

@@ -14,8 +14,7 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Init, Plane, Track
 
@@ -62,7 +61,7 @@ class BridgeParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.top)
+        check_above(self.spawn_height, self.top, self.robot)
 
 
 class Go1Bridge(Duel):
@@ -99,37 +98,36 @@ class Go1Bridge(Duel):
         span = second - first - length
         deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
         track = Track(blocks=(Init(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
-        contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
-        return Scene(track, num_robots=2, contacts=contacts, objects=(*blocks, deck), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(*blocks, deck), colors=(0, 2))
 
     def spawn_places(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: one on each platform, facing the bridge."""
         first, second = self.params.spawn_x
         return (first, 0.0, 0.0), (second, 0.0, np.pi)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        out = self.lost(readings)
-        terms = {"win": self.versus(out[::-1] & ~out), "far_side": self.versus(self.across(readings))}
+        out = self.lost(robot_state)
+        terms = {"win": self.versus(out[::-1] & ~out), "far_side": self.versus(self.across(robot_state))}
         return terms, None
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
+    def lost(self, robot_state: RobotState) -> jax.Array:
         """Which robots are off the bridge or have fallen (2,) bool."""
-        return self.fallen(readings) | (readings.position_w[:, 2] < self.params.off_height)
+        return self.fallen(robot_state) | (robot_state.position_w[:, 2] < self.params.off_height)
 
-    def across(self, readings: RobotReadings) -> jax.Array:
+    def across(self, robot_state: RobotState) -> jax.Array:
         """Which robots are on the opponent's platform (2,) bool."""
         params = self.params
-        x, height = readings.position_w[:, 0], readings.position_w[:, 2]
+        x, height = robot_state.position_w[:, 0], robot_state.position_w[:, 2]
         first, second = params.platform_x
         half = params.platform[0] / 2
         reached = jnp.stack([x[0] > second - half, x[1] < first + half])
         return reached & (height > params.top)
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
         """On the opponent's platform."""
-        return self.across(readings)
+        return self.across(robot_state)
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One is off the bridge or has fallen."""
-        return jnp.any(self.lost(readings))
+        return jnp.any(self.lost(robot_state))

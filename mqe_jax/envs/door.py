@@ -14,8 +14,7 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Door
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Rotation, Track
 
@@ -98,9 +97,8 @@ class Go1RevolvingDoor(Duel):
             "door", position=(params.door_x, 0.0), size=params.door_size, mass=params.door_mass,
             inertia=params.door_inertia, damping=params.door_damping,
         )  # fmt: skip
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         return Scene(
-            Track(blocks=blocks, width=params.track_width, wall_height=0.85), num_robots=2, contacts=contacts,
+            Track(blocks=blocks, width=params.track_width, wall_height=0.85), num_robots=2,
             objects=(door,), colors=(0, 2),
         )  # fmt: skip
 
@@ -109,27 +107,27 @@ class Go1RevolvingDoor(Duel):
         x, y = self.params.spawn_x, self.params.spawn_y
         return (x, -y, 0.0), (x, y, 0.0)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DoorState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> DoorState:
         """Returns the task's own fields of a fresh world."""
-        return DoorState(self.distance(readings))
+        return DoorState(self.distance(robot_state))
 
-    def distance(self, readings: RobotReadings) -> jax.Array:
+    def distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to the middle of the line (2,), m."""
-        return jnp.linalg.norm(readings.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1)
+        return jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        distance = self.distance(readings)
+        distance = self.distance(robot_state)
         terms = {
-            "win": self.versus(self.wins(state, readings)),
+            "win": self.versus(self.wins(state, robot_state)),
             "approach": self.versus(state.task.distance - distance),
         }
         return terms, DoorState(distance)
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
         """Past the line."""
-        return readings.position_w[:, 0] > self.params.line_x
+        return robot_state.position_w[:, 0] > self.params.line_x
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One is past the line."""
-        return jnp.any(self.ahead(state, readings))
+        return jnp.any(self.ahead(state, robot_state))

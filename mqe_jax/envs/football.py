@@ -19,8 +19,7 @@ from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, others
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Ball
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
 
@@ -75,9 +74,8 @@ class Football(QuadrupedEnv):
             wall_height=params.wall_height,
         )  # fmt: skip
         ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         robots = len(self.kick_off)
-        return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
+        return Scene(track, num_robots=robots, objects=(ball,), colors=self.colors)
 
     def spawn_places(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad."""
@@ -180,14 +178,14 @@ class FootballMatch(Football, Match):
         return float(GOALS[:, 0].mean()), 0.0
 
     def reset_task(
-        self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array
+        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array
     ) -> FootballMatchState:
         """Returns the task's own fields of a fresh world."""
-        return self.distances(readings, data)
+        return self.distances(robot_state, data)
 
-    def distances(self, readings: RobotReadings, data: mjx.Data) -> FootballMatchState:
+    def distances(self, robot_state: RobotState, data: mjx.Data) -> FootballMatchState:
         """Returns the ball's distances to what matters to each team, m."""
-        apart = jnp.linalg.norm(readings.position_w[:, :2] - self.ball(data)[:2], axis=-1)
+        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - self.ball(data)[:2], axis=-1)
         return FootballMatchState(self.goal_distance(data), jnp.min(apart.reshape(2, -1), axis=1))
 
     @property
@@ -205,10 +203,10 @@ class FootballMatch(Football, Match):
             )
         )
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width), each in its agent's frame."""
         team, side = self.num_agents // 2, self.team_of
-        both = self.views(readings.base_info).reshape(2, 2, team, 6)  # as seen by a team, of a team
+        both = self.views(robot_state.base_info).reshape(2, 2, team, 6)  # as seen by a team, of a team
         own, opponents = both[[0, 1], [0, 1]], both[[0, 1], [1, 0]].reshape(2, -1)
         blocks = {
             "one_hot": jnp.tile(jnp.eye(team), (2, 1)), "base": own.reshape(-1, 6), "opponents": opponents[side],
@@ -219,22 +217,22 @@ class FootballMatch(Football, Match):
             blocks["mate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
         return blocks
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        after = self.distances(readings, state.data)
+        after = self.distances(robot_state, state.data)
         terms = {
             "goal": self.versus(self.in_goal(state.data)),
             "progress": self.versus(state.task.goal - after.goal),
             "approach": self.versus(state.task.robot - after.robot),
-            "fall": self.versus(self.lost(readings)),
+            "fall": self.versus(self.lost(robot_state)),
         }
         return terms, after
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """A goal ends the episode."""
         return jnp.any(self.in_goal(state.data))
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
         """The ball is in the goal that the team attacks."""
         return self.in_goal(state.data)
 

@@ -15,8 +15,8 @@ from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.npc import defend
-from mqe_jax.robots.index import RobotReadings
-from mqe_jax.walk_policy import command_index, default_commands
+from mqe_jax.robots.index import RobotState
+from mqe_jax.walk_policy import command_index
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,17 +71,17 @@ class Go1FootballDefender(Football):
     ball_spot = (5.0, -2.1)
     colors = (0, 1, 2)
 
-    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array:
+    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns the defender's walk commands (1, 15)."""
-        commands = jnp.asarray(default_commands(self.params.gait))
+        commands = jnp.asarray(self.controller.default_commands)
         if not self.params.defender_idle:
             move = defend(
-                readings.position_w[2, :2], readings.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
+                robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
             )
             commands = commands.at[np.array([command_index(name) for name in ("vx", "vy", "yaw_rate")])].set(move)
         return commands[None]
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DefenderState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> DefenderState:
         """Returns the task's own fields of a fresh world."""
         return DefenderState(jnp.zeros((), bool))
 
@@ -90,19 +90,19 @@ class Go1FootballDefender(Football):
         """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, *BALL_BLOCKS))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
         return {
-            **pair(readings.base_info[:2]), "ball": for_all(self.ball(state.data), 2),
+            **pair(robot_state.base_info[:2]), "ball": for_all(self.ball(state.data), 2),
             "ball_velocity": for_all(self.ball_velocity(state.data), 2),
         }  # fmt: skip
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
         goal = self.in_goal(state.data)[0]
         terms = {"goal": goal, "nearness": jnp.exp(-self.goal_distance(state.data)[0] / 3.0)}
         return terms, DefenderState(state.task.scored | goal)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a goal in this episode."""
         return {"success": state.task.scored}

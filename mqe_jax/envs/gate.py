@@ -14,8 +14,7 @@ from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
 
@@ -95,40 +94,39 @@ class Go1Gate(QuadrupedEnv):
         params = self.params
         gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
         track = Track(blocks=(Init(2.0), gate, Plane(1.0), Closing()), width=params.track_width)
-        contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk", "foot"), object=())
-        return Scene(track, num_robots=2, contacts=contacts)
+        return Scene(track, num_robots=2)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> GateState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> GateState:
         """Returns the task's own fields of a fresh world."""
-        return GateState(self.target_distance(readings))
+        return GateState(self.target_distance(robot_state))
 
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, GATE))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        return {**pair(readings.base_info), "gate": for_all(state.gates, 2)}
+        return {**pair(robot_state.base_info), "gate": for_all(state.gates, 2)}
 
-    def target_distance(self, readings: RobotReadings) -> jax.Array:
+    def target_distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to its target (2,), m."""
         params = self.params
         target = np.array([[params.target_x, params.target_y], [params.target_x, -params.target_y]], np.float32)
-        return jnp.linalg.norm(readings.position_w[:, :2] - target, axis=-1)
+        return jnp.linalg.norm(robot_state.position_w[:, :2] - target, axis=-1)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        distance = self.target_distance(readings)
+        distance = self.target_distance(robot_state)
         terms = {
-            "success": reward.past(readings.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
+            "success": reward.past(robot_state.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
             "approach": reward.decrease(state.task.distance, distance),
-            "crowding": reward.crowding(readings.position_w[:, :2]),
+            "crowding": reward.crowding(robot_state.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
         }
         return terms, GateState(distance)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: both robots are through; `success/one`: at least one is, however the episode ended."""
-        through = readings.position_w[:, 0] > state.gates[0, 0] + self.params.past_gate
+        through = robot_state.position_w[:, 0] > state.gates[0, 0] + self.params.past_gate
         return {"success": jnp.all(through) & ~failed, "success/one": jnp.any(through)}

@@ -17,8 +17,8 @@ import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.robots.go1 import NUM_JOINTS
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import NUM_JOINTS
 
 # How a command changes where left and right are swapped.
 _MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}
@@ -58,17 +58,17 @@ class Match(QuadrupedEnv):
 
     # -- what a match says ----------------------------------------------------------------------------------------
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
+    def lost(self, robot_state: RobotState) -> jax.Array:
         """Returns which team has lost outright (2,) bool: one of its robots has fallen."""
-        return jnp.any(self.fallen(readings).reshape(2, -1), axis=1)
+        return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns which team is ahead where none has lost outright (2,) bool."""
         return jnp.zeros(2, bool)
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
+    def wins(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns which team wins if the episode ends now (2,) bool, one at most."""
-        lost, ahead = self.lost(readings), self.ahead(state, readings)
+        lost, ahead = self.lost(robot_state), self.ahead(state, robot_state)
         return jnp.where(jnp.any(lost), lost[::-1] & ~lost, ahead & ~ahead[::-1])
 
     # -- both sides' views ----------------------------------------------------------------------------------------
@@ -110,9 +110,9 @@ class Match(QuadrupedEnv):
         own = jnp.asarray(own, jnp.float32)
         return (own - own[::-1])[self.team_of]
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Win, draw and loss of each team; `success` is a win of team 0."""
-        wins = self.wins(state, readings)
+        wins = self.wins(state, robot_state)
         result = {}
         for team in (0, 1):
             result[f"team{team}/win"] = wins[team]
@@ -129,7 +129,7 @@ class Duel(Match):
         """The blocks of an agent's observation, in order."""
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width), each in its agent's frame."""
-        views = self.views(readings.base_info)
+        views = self.views(robot_state.base_info)
         return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}

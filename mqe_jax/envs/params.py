@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+from mqe_jax import robots
 from mqe_jax.control import check_commands
 from mqe_jax.envs.overrides import Range
 from mqe_jax.envs.randomization import Randomization
-
-CLEARANCE = 0.3  # m, from the ground to the trunk of a robot that stands
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,7 +15,8 @@ class TaskParams:
     """Parameters that all tasks have; a task adds its own.
 
     Attributes:
-        num_agents: robots that are told what to do.
+        num_agents: number of controlled robots.
+        robot: name of the robot, such as go1 or go2 (`mqe_jax.robots`).
         episode_length: time limit, s.
         spawn_height: of the trunks, m.
         spawn_noise: half-width of the uniform noise on the spawn position in x and y, m.
@@ -35,15 +35,18 @@ class TaskParams:
         actuator_network: weights file of an actuator network in place of PD; none if None.
         friction: sliding friction of robots and ground.
         solver_iterations: at most so many solver iterations per physics step.
+        contacts: set of the robots' collision shapes: full, or minimal (trunk and feet: several times faster on
+            MJX-JAX, but limbs pass through everything).
         contacts_per_robot: room for contacts, times the robots of a world: of a world on MJX-JAX, which keeps the
             deepest ones, and of all worlds together on Warp.
-        rows_per_robot: room for constraint rows of a world on Warp, likewise.
+        constraints_per_robot: room for constraint rows of a world on Warp, likewise.
         randomization: domain randomisation.
         hold_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
             for up to hold_time x aid, s, so that agents first learn one at a time what they must do in turn.
     """
 
     num_agents: int = 2
+    robot: str = "go1"
     episode_length: float = 10.0
     spawn_height: float = 0.42
     spawn_noise: float = 0.1
@@ -61,8 +64,9 @@ class TaskParams:
     actuator_network: str | None = None
     friction: float = 1.0
     solver_iterations: int = 4
+    contacts: str = "full"
     contacts_per_robot: int = 12
-    rows_per_robot: int = 64
+    constraints_per_robot: int = 64
     randomization: Randomization = Randomization()
     hold_time: float = 4.0
 
@@ -73,15 +77,16 @@ class TaskParams:
             "friction",
             "solver_iterations",
             "contacts_per_robot",
-            "rows_per_robot",
+            "constraints_per_robot",
         ):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name}: {getattr(self, name)} must be positive")
         check_commands(self.commands)
+        robots.get(self.robot)
 
 
-def check_above(spawn_height: float, top: float) -> None:
-    """Raises a ValueError if robots would start inside what they are to stand on, whose top is at `top` m."""
-    least = top + CLEARANCE
+def check_above(spawn_height: float, top: float, robot: str) -> None:
+    """Checks that the spawn height clears the supporting surface at height `top` (m) for a standing robot."""
+    least = top + robots.get(robot).stand_height
     if spawn_height < least:
         raise ValueError(f"spawn_height: {spawn_height} must be at least {least:.2f}, as the ground is at {top}")

@@ -12,7 +12,7 @@ from mujoco import mjx
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, others
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Init, Plane, Track
 
@@ -69,9 +69,9 @@ class Go1Plane(QuadrupedEnv):
         )
         return Scene(track, num_robots=self.num_agents)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> PlaneState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> PlaneState:
         """Returns the task's own fields of a fresh world."""
-        return PlaneState(readings.position_w[:, 0])
+        return PlaneState(robot_state.position_w[:, 0])
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -81,17 +81,17 @@ class Go1Plane(QuadrupedEnv):
         blocks += [Block("mates", 6 * (agents - 1), BASE_INFO)] if agents > 1 else []
         return ObservationLayout(tuple(blocks))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
-        info = readings.base_info
+        info = robot_state.base_info
         blocks = {"one_hot": jnp.eye(self.num_agents), "base": info}
         return blocks | ({"mates": others(info)} if self.num_agents > 1 else {})
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        x = readings.position_w[:, 0]
+        x = robot_state.position_w[:, 0]
         return {"forward": jnp.sum(x - state.task.x)}, PlaneState(x)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: nobody has fallen."""
         return {"success": 1.0 - failed}

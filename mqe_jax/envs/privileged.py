@@ -9,8 +9,8 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs.observation import Block, ObservationLayout
-from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotIndex, RobotReadings
+from mqe_jax.robots.index import RobotIndex, RobotState
+from mqe_jax.robots.robot import Robot
 
 _ROBOT = (
     Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),
@@ -26,24 +26,26 @@ class PrivilegedObservation:
         layout: its blocks, in order; raw units.
     """
 
-    def __init__(self, model: mujoco.MjModel, index: RobotIndex, num_gates: int) -> None:
+    def __init__(self, robot: Robot, model: mujoco.MjModel, index: RobotIndex, num_gates: int) -> None:
+        self._default_joints = robot.default_joints
         robots = range(index.num_robots)
         self._qpos = np.setdiff1d(np.arange(model.nq), np.concatenate([index.base_qpos, index.joint_qpos], axis=1))
         self._qvel = np.setdiff1d(np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1))
         blocks = (
             *(Block(f"robot{i}/{block.name}", block.width, block.meaning) for i in robots for block in _ROBOT),
-            Block("objects/qpos", len(self._qpos), "positions of everything that is no robot"),
-            Block("objects/qvel", len(self._qvel), "velocities of everything that is no robot"),
+            Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
+            Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
             Block("gates", 2 * num_gates, "centres, m"),
         )
         self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 
-    def observe(self, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> jax.Array:
+    def observe(self, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> jax.Array:
         """Returns the observation of one world (P,)."""
         robots = jnp.concatenate(
             [
-                readings.position_w, readings.quaternion, readings.linear_velocity_w, readings.angular_velocity_b,
-                readings.joint_position - go1.DEFAULT_JOINTS, readings.joint_velocity,
+                robot_state.position_w, robot_state.quaternion, robot_state.linear_velocity_w,
+                robot_state.angular_velocity_b, robot_state.joint_position - self._default_joints,
+                robot_state.joint_velocity,
             ],
             axis=-1,
         )  # fmt: skip

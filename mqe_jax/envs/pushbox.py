@@ -13,8 +13,7 @@ from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Box
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Track
 
@@ -93,8 +92,7 @@ class Go1PushBox(QuadrupedEnv):
         gate = Gate(5.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(Init(2.0), gate, Closing()), width=params.track_width)
         box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
-        return Scene(track, num_robots=2, contacts=contacts, objects=(box,))
+        return Scene(track, num_robots=2, objects=(box,))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draws where the box starts."""
@@ -103,7 +101,7 @@ class Go1PushBox(QuadrupedEnv):
         pose = jnp.array([params.box_x, 0.0, params.box_size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
         return qpos.at[self.objects["box"].qpos].set(pose), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> PushBoxState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> PushBoxState:
         """Returns the task's own fields of a fresh world."""
         x = self.object_pose(data, "box")[0]
         return PushBoxState(x, x)
@@ -113,15 +111,15 @@ class Go1PushBox(QuadrupedEnv):
         """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, GATE, Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
         pose = self.object_pose(state.data, "box")
         return {
-            **pair(readings.base_info), "gate": for_all(state.gates, 2), "box": for_all(pose[:2], 2),
+            **pair(robot_state.base_info), "gate": for_all(state.gates, 2), "box": for_all(pose[:2], 2),
             "box_quaternion": for_all(pose[3:], 2),
         }  # fmt: skip
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
         x = self.object_pose(state.data, "box")[0]
         terms = {"progress": x - state.task.x, "success": self.through(state).astype(jnp.float32)}
@@ -131,6 +129,6 @@ class Go1PushBox(QuadrupedEnv):
         """Whether the box is past the gate () bool."""
         return self.object_pose(state.data, "box")[0] > state.gates[0, 0] + self.params.past_gate
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the box is past the gate; `success/way`: how far it came, m."""
         return {"success": self.through(state), "success/way": state.task.x - state.task.start}

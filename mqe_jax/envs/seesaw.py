@@ -14,8 +14,7 @@ from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Platform, Seesaw
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Track
 
@@ -124,48 +123,47 @@ class Go1Seesaw(QuadrupedEnv):
             "platform", center=params.platform, size=params.platform_size, column=params.platform_column
         )
         # Plank and platform are ground.
-        contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk",), object=())
-        return Scene(track, num_robots=2, contacts=contacts, objects=(plank, platform))
+        return Scene(track, num_robots=2, objects=(plank, platform))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Lays the plank's near end on the ground."""
         return qpos.at[self.objects["seesaw"].qpos].set(self.params.plank_start), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> SeesawState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> SeesawState:
         """Returns the task's own fields of a fresh world."""
-        return SeesawState(readings.position_w[:, 0])
+        return SeesawState(robot_state.position_w[:, 0])
 
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
         return ObservationLayout(PAIR)
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        return pair(readings.base_info)
+        return pair(robot_state.base_info)
 
-    def on_platform(self, readings: RobotReadings) -> jax.Array:
+    def on_platform(self, robot_state: RobotState) -> jax.Array:
         """Which robots are on the platform (2,) bool."""
         x, z = self.params.on_platform
-        return (readings.position_w[:, 0] > x) & (readings.position_w[:, 2] > z)
+        return (robot_state.position_w[:, 0] > x) & (robot_state.position_w[:, 2] > z)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
         params = self.params
-        x, y, z = readings.position_w.T
-        roll, pitch = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1])
+        x, y, z = robot_state.position_w.T
+        roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
         terms = {
-            "success": jnp.sum(self.on_platform(readings)).astype(jnp.float32),
+            "success": jnp.sum(self.on_platform(robot_state)).astype(jnp.float32),
             "height": jnp.sum(z) - params.height_base,
             "progress": jnp.sum(x - state.task.x),
             "aside": jnp.sum(jnp.square(y)) - params.aside_base,
             "collision": collision.astype(jnp.float32),
             "fall": jnp.any((roll > params.max_roll) | (pitch > params.max_pitch)).astype(jnp.float32),
-            "crowding": reward.crowding(readings.position_w[:, :2]) / 2,
+            "crowding": reward.crowding(robot_state.position_w[:, :2]) / 2,
         }
         return terms, SeesawState(x)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a robot stands on the platform; `success/height`: of the highest robot, m."""
-        success = jnp.any(self.on_platform(readings)) & ~failed
-        return {"success": success, "success/height": jnp.max(readings.position_w[:, 2])}
+        success = jnp.any(self.on_platform(robot_state)) & ~failed
+        return {"success": success, "success/height": jnp.max(robot_state.position_w[:, 2])}

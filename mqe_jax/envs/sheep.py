@@ -15,8 +15,7 @@ from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_a
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
 
@@ -90,7 +89,7 @@ class SheepHardParams(SheepEasyParams):
     flock_center: tuple[float, float] = (5.0, 0.0)
     restlessness: float = 0.1
     contacts_per_robot: int = 20  # sheep touch each other
-    rows_per_robot: int = 96
+    constraints_per_robot: int = 96
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
 
 
@@ -130,10 +129,8 @@ class Go1SheepEasy(QuadrupedEnv):
         init = Init(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(init, Plane(middle), gate, Plane(behind), Closing()), width=params.track_width)
-        touching = ("trunk", "foot")
-        contacts = Contacts(ground=touching, wall=touching, robot=touching, object=touching)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
-        return Scene(track, num_robots=2, contacts=contacts, objects=flock)
+        return Scene(track, num_robots=2, objects=flock)
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draws where the sheep start."""
@@ -144,15 +141,15 @@ class Go1SheepEasy(QuadrupedEnv):
         noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> SheepState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> SheepState:
         """Returns the task's own fields of a fresh world."""
         return SheepState(self.sheep(data)[:, 0])
 
-    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
+    def drive(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Lets the sheep flee, wander and flock together."""
         index = self._sheep("qvel")
         velocity = flock(
-            key, self.sheep(data), data.qvel[index], readings.position_w[:, :2], step=self.dt,
+            key, self.sheep(data), data.qvel[index], robot_state.position_w[:, :2], step=self.dt,
             restlessness=self.params.restlessness, friction=self.params.sheep_friction,
         )  # fmt: skip
         return data.replace(qvel=data.qvel.at[index].set(velocity))
@@ -170,16 +167,16 @@ class Go1SheepEasy(QuadrupedEnv):
         """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, GATE, Block("sheep", 2 * self.num_sheep, "x, y of each, m")))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
         sheep = for_all(self.sheep(state.data), 2)
-        return {**pair(readings.base_info), "gate": for_all(state.gates, 2), "sheep": sheep}
+        return {**pair(robot_state.base_info), "gate": for_all(state.gates, 2), "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
         """Which sheep are past the gate (S,) bool."""
         return self.sheep(state.data)[:, 0] > state.gates[0, 0] + self.params.past_gate
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
         sheep, through = self.sheep(state.data), self.through(state)
         distance = jnp.linalg.norm(sheep - state.gates[0], axis=-1)
@@ -190,7 +187,7 @@ class Go1SheepEasy(QuadrupedEnv):
         }
         return terms, SheepState(sheep[:, 0])
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the share of the sheep that are past the gate, however the episode ended."""
         return {"success": jnp.mean(self.through(state))}
 

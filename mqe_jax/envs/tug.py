@@ -16,8 +16,7 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Cylinder
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Track
 
@@ -111,8 +110,7 @@ class Go1Tug(Duel):
             "cylinder", position=self.center, radius=params.radius, height=params.height, mass=params.mass,
             friction=params.cylinder_friction, reach=reach,
         )  # fmt: skip
-        contacts = Contacts(robot=("trunk",), object=("trunk", "foot", "calf"))
-        return Scene(track, num_robots=2, contacts=contacts, objects=(cylinder,), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(cylinder,), colors=(0, 2))
 
     def spawn_places(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: one on each side, facing the middle."""
@@ -125,19 +123,19 @@ class Go1Tug(Duel):
         aside = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
         return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(aside)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> TugState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> TugState:
         """Returns the task's own fields of a fresh world."""
         y = self.cylinder_y(data)
-        return TugState(y, y, self.distance(readings, y))
+        return TugState(y, y, self.distance(robot_state, y))
 
     def cylinder_y(self, data: mjx.Data) -> jax.Array:
         """Returns the cylinder's y (), m."""
         return self.object_pose(data, "cylinder")[0]
 
-    def distance(self, readings: RobotReadings, y: jax.Array) -> jax.Array:
+    def distance(self, robot_state: RobotState, y: jax.Array) -> jax.Array:
         """Returns each robot's horizontal distance to the cylinder's axis (2,), m."""
         axis = jnp.array([self.center[0], 0.0]).at[1].set(y)
-        return jnp.linalg.norm(readings.position_w[:, :2] - axis, axis=-1)
+        return jnp.linalg.norm(robot_state.position_w[:, :2] - axis, axis=-1)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -151,28 +149,28 @@ class Go1Tug(Duel):
             )
         )
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width), each in its agent's frame."""
         speed = state.data.qvel[self.objects["cylinder"].qvel[0]]
         side = jnp.array([1.0, -1.0])
         return {
-            "base": super().observe(state, readings)["base"],
+            "base": super().observe(state, robot_state)["base"],
             "cylinder": jnp.stack([side * self.cylinder_y(state.data), side * speed], axis=-1),
-            "distance": self.distance(readings, self.cylinder_y(state.data))[:, None],
+            "distance": self.distance(robot_state, self.cylinder_y(state.data))[:, None],
             "last_cylinder": (side * state.task.previous_y)[:, None],
         }
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
         y, side = self.cylinder_y(state.data), jnp.array([1.0, -1.0])
         back = side * (y - state.task.y) < 0
-        distance = self.distance(readings, y)
+        distance = self.distance(robot_state, y)
         terms = {
             "push": self.versus(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),
             "approach": self.versus(state.task.distance - distance),
         }
         return terms, TugState(y, state.task.y, distance)
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
         """The cylinder is on the opponent's half."""
         return self.cylinder_y(state.data) * jnp.array([1.0, -1.0]) > self.params.win_by

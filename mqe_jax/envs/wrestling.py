@@ -14,8 +14,7 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform, Ring
-from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Init, Plane, Track
 
@@ -56,7 +55,7 @@ class WrestlingParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.platform_top)
+        check_above(self.spawn_height, self.platform_top, self.robot)
 
 
 class Go1Wrestling(Duel):
@@ -87,25 +86,24 @@ class Go1Wrestling(Duel):
         platform = Platform("platform", center=(x, y, top), size=params.platform)
         ring = Ring("ring", center=(x, y, top), radius=params.ring_radius)
         track = Track(blocks=(Init(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
-        contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
-        return Scene(track, num_robots=2, contacts=contacts, objects=(platform, ring), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(platform, ring), colors=(0, 2))
 
     def spawn_places(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: facing each other across the ring."""
         (x, y), apart = self.center, self.params.spawn_y
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        return {"win": self.versus(self.wins(state, readings))}, None
+        return {"win": self.versus(self.wins(state, robot_state))}, None
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
+    def lost(self, robot_state: RobotState) -> jax.Array:
         """Which robots have fallen or left the ring (2,) bool."""
         params = self.params
-        apart = jnp.linalg.norm(readings.position_w[:, :2] - jnp.array(self.center), axis=-1)
-        below = readings.position_w[:, 2] < params.platform_top - params.ring_depth
-        return self.fallen(readings) | (apart > params.ring_radius) | below
+        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
+        below = robot_state.position_w[:, 2] < params.platform_top - params.ring_depth
+        return self.fallen(robot_state) | (apart > params.ring_radius) | below
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One has fallen or left the ring."""
-        return jnp.any(self.lost(readings))
+        return jnp.any(self.lost(robot_state))
