@@ -235,8 +235,12 @@ def _expected_shapes() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def _nested(flat: Mapping[str, np.ndarray], source: str) -> Params:
-    """Checks names and shapes of flat weights and nests them."""
+def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
+    """Returns flat weights as nested float32 arrays.
+
+    Raises:
+        InputError: for missing names or other shapes; the message starts with `source`.
+    """
     params: Params = {"adaptation": {}, "body": {}}
     for name, shape in _expected_shapes().items():
         if name not in flat:
@@ -273,7 +277,7 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
         flat = load_file(file)
     except SafetensorError as error:
         raise InputError(f"walk policy {file}: not a safetensors file ({error})") from None
-    return _nested(flat, str(file))
+    return nested_params(flat, str(file))
 
 
 def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
