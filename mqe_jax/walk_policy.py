@@ -256,7 +256,7 @@ ASSETS = pathlib.Path(__file__).parent / "assets"
 
 
 def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
-    """Reads weights from a safetensors file; those shipped for the robot if `path` is None.
+    """Reads weights as float32 from a safetensors file; those shipped for the robot if `path` is None.
 
     Raises:
         InputError: if the file is missing, damaged, or holds other names or shapes.
@@ -265,14 +265,14 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     from safetensors.numpy import load_file
 
     file = pathlib.Path(path) if path is not None else ASSETS / robot.walk.weights
-    make = f"make it with 'mqe walk train --robot {robot.name}' or 'mqe walk convert'"
+    train = f"train it with 'mqe walk train --robot {robot.name}'"
     if not file.is_file() and path is None:
         raise InputError(
-            f"walk policy: no weights for {robot.name} ({file.name}) are shipped; {make} and give the file as "
-            "walk_policy (--weights), or use control 'position' or 'torque'"
+            f"walk policy: none for {robot.name} is shipped (assets/{file.name}); {train} and give the weights as "
+            "walk_policy=FILE, or use control 'position' or 'torque'"
         )
     if not file.is_file():
-        raise InputError(f"walk policy: no file {file}; {make}")
+        raise InputError(f"walk policy: no file {file}; {train} or make it with 'mqe walk convert'")
     try:
         flat = load_file(file)
     except SafetensorError as error:
@@ -281,11 +281,11 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
 
 
 def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
-    """Writes weights and metadata to a safetensors file, atomically."""
+    """Writes weights as float16 (3.6 MB) and metadata to a safetensors file, atomically."""
     from safetensors.numpy import save
 
     flat = {
-        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float32)
+        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16)
         for part, layers in params.items()
         for layer, arrays in layers.items()
         for kind, array in arrays.items()
