@@ -19,7 +19,6 @@ from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object
 from mqe_jax.planners import PLANNERS
 from mqe_jax.planners.steering import go_to
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Block as TerrainBlock
@@ -126,7 +125,7 @@ class Go1Catch(QuadrupedEnv):
     def scene(self) -> Scene:
         """Says what is in the world."""
         track = Track(blocks=(Init(1.5), Pillar(2.0), Plane(1.5), Closing()), width=3.0, num_robots=1)
-        return Scene(track, num_robots=1, contacts=Contacts(object=("trunk", "foot")), objects=(Mouse("mouse"),))
+        return Scene(track, num_robots=1, objects=(Mouse("mouse"),))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draws where the mouse starts."""

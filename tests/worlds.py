@@ -45,7 +45,7 @@ def robot_state(position: Any, **euler: Any) -> RobotState:
     none = jnp.zeros((2, 3))
     return RobotState(
         jnp.asarray(position), euler_to_quaternion(angles(**euler)), none, none, joints, jnp.zeros((2, 12)),
-        jnp.zeros(2), jnp.zeros((2, 2), bool),
+        jnp.zeros(2),
     )  # fmt: skip
 
 

@@ -119,9 +119,14 @@ class QuadrupedEnv:
         # Robots that are no agents follow joint targets, whatever the agents do.
         torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
         self._scene = dataclasses.replace(
-            scene, robot=self.robot, friction=self.params.friction, solver_iterations=self.params.solver_iterations,
-            torque_robots=torque_robots, max_contacts=self.params.contacts_per_robot * scene.num_robots,
-        )  # fmt: skip
+            scene,
+            robot=self.robot,
+            contacts=self.params.contacts,
+            friction=self.params.friction,
+            solver_iterations=self.params.solver_iterations,
+            torque_robots=torque_robots,
+            max_contacts=self.params.contacts_per_robot * scene.num_robots,
+        )
         self.compiled = compile_scene(self._scene)
         self.index, self.objects = self.compiled.index, self.compiled.objects
         self.physics = Physics(

@@ -14,7 +14,6 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Door
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Rotation, Track
@@ -98,9 +97,8 @@ class Go1RevolvingDoor(Duel):
             "door", position=(params.door_x, 0.0), size=params.door_size, mass=params.door_mass,
             inertia=params.door_inertia, damping=params.door_damping,
         )  # fmt: skip
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         return Scene(
-            Track(blocks=blocks, width=params.track_width, wall_height=0.85), num_robots=2, contacts=contacts,
+            Track(blocks=blocks, width=params.track_width, wall_height=0.85), num_robots=2,
             objects=(door,), colors=(0, 2),
         )  # fmt: skip
 

@@ -35,6 +35,8 @@ class TaskParams:
         actuator_network: weights file of an actuator network in place of PD; none if None.
         friction: sliding friction of robots and ground.
         solver_iterations: at most so many solver iterations per physics step.
+        contacts: set of the robots' collision shapes: full, or minimal (trunk and feet: several times faster on
+            MJX-JAX, but limbs pass through everything).
         contacts_per_robot: room for contacts, times the robots of a world: of a world on MJX-JAX, which keeps the
             deepest ones, and of all worlds together on Warp.
         constraints_per_robot: room for constraint rows of a world on Warp, likewise.
@@ -62,6 +64,7 @@ class TaskParams:
     actuator_network: str | None = None
     friction: float = 1.0
     solver_iterations: int = 4
+    contacts: str = "full"
     contacts_per_robot: int = 12
     constraints_per_robot: int = 64
     randomization: Randomization = Randomization()

@@ -15,7 +15,6 @@ from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_a
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
@@ -130,10 +129,8 @@ class Go1SheepEasy(QuadrupedEnv):
         init = Init(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(init, Plane(middle), gate, Plane(behind), Closing()), width=params.track_width)
-        touching = ("trunk", "foot")
-        contacts = Contacts(ground=touching, wall=touching, robot=touching, object=touching)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
-        return Scene(track, num_robots=2, contacts=contacts, objects=flock)
+        return Scene(track, num_robots=2, objects=flock)
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draws where the sheep start."""

@@ -16,7 +16,6 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Cylinder
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Closing, Init, Plane, Track
@@ -111,8 +110,7 @@ class Go1Tug(Duel):
             "cylinder", position=self.center, radius=params.radius, height=params.height, mass=params.mass,
             friction=params.cylinder_friction, reach=reach,
         )  # fmt: skip
-        contacts = Contacts(robot=("trunk",), object=("trunk", "foot", "calf"))
-        return Scene(track, num_robots=2, contacts=contacts, objects=(cylinder,), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(cylinder,), colors=(0, 2))
 
     def spawn_places(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: one on each side, facing the middle."""

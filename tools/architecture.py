@@ -1,0 +1,152 @@
+"""The rooms of `mqe_jax`, what each may import, and the picture of it in docs/architecture.svg.
+
+`python tools/architecture.py` draws the picture from the imports in the source; `--check` exits with 1 where the
+picture is out of date or a room imports what it may not. tests/test_architecture.py does the same.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "mqe_jax"
+PICTURE = ROOT / "docs" / "architecture.svg"
+
+# Layers from bottom to top, each a row of rooms. A room may import from the layers below it and from rooms to its left.
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("errors", "files", "settings"),
+    ("collision", "rotation", "robots"),
+    ("terrain", "objects", "npc"),
+    ("scene", "physics"),
+    ("walk_policy", "control"),
+    ("envs", "train"),
+    ("planners", "walk"),
+    ("viz", "adapters"),
+    ("cli",),
+)
+# Where each room stands across the picture, from 0 (left) to 1 (right).
+ACROSS = {
+    "errors": 0.3, "files": 0.86, "settings": 0.58, "rotation": 0.86, "collision": 0.3, "robots": 0.58, "terrain": 0.12,
+    "objects": 0.33, "npc": 0.53, "scene": 0.36, "physics": 0.7, "walk_policy": 0.5, "control": 0.76, "envs": 0.25,
+    "train": 0.9, "planners": 0.34, "walk": 0.62, "viz": 0.14, "adapters": 0.8, "cli": 0.5,
+}  # fmt: skip
+# Exceptions to the rule above: these see less. The trainer knows no task, no robot and no physics.
+ONLY: dict[str, frozenset[str]] = {"train": frozenset({"errors", "files", "settings"})}
+
+
+def rooms() -> list[str]:
+    """Names of the rooms that exist: the package's modules and subpackages, without its `__init__`."""
+    found = {path.stem for path in PACKAGE.glob("*.py")} | {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    return sorted(found - {"__init__"})
+
+
+def allowed(room: str) -> frozenset[str]:
+    """The rooms that `room` may import."""
+    if room in ONLY:
+        return ONLY[room]
+    order = [name for layer in LAYERS for name in layer]
+    return frozenset(order[: order.index(room)])
+
+
+def imports(path: Path) -> set[str]:
+    """Rooms of this package that a source file imports, at any depth of its code."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module == "mqe_jax":
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mqe_jax."):
+            found.add(str(node.module).split(".")[1])
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("mqe_jax.")}
+    return found
+
+
+def edges() -> dict[str, dict[str, str]]:
+    """For each room the rooms that it imports, with one file that does so."""
+    table: dict[str, dict[str, str]] = {}
+    for room in rooms():
+        single = PACKAGE / f"{room}.py"
+        for path in [single] if single.is_file() else sorted((PACKAGE / room).rglob("*.py")):
+            for other in sorted(imports(path) - {room}):
+                table.setdefault(room, {}).setdefault(other, path.relative_to(ROOT).as_posix())
+    return table
+
+
+def violations() -> list[str]:
+    """Imports that go the wrong way, each named with its file; rooms without a layer."""
+    known = {name for layer in LAYERS for name in layer}
+    wrong = [f"{room}: has no layer in tools/architecture.py" for room in rooms() if room not in known]
+    for room, others in edges().items():
+        if room in known:
+            wrong += [f"{path}: {room} may not import {o}" for o, path in others.items() if o not in allowed(room)]
+    return wrong
+
+
+def reduced(table: dict[str, dict[str, str]]) -> dict[str, set[str]]:
+    """The imports that no chain of other imports implies: few enough to be drawn."""
+
+    def reach(room: str) -> set[str]:
+        return {room}.union(*(reach(other) for other in table.get(room, {})))
+
+    return {
+        room: {o for o in others if not any(o in reach(between) for between in others if between != o)}
+        for room, others in table.items()
+    }
+
+
+def draw() -> str:
+    """The picture as SVG text: layers as rows, imports as lines from the importing room down to the imported one."""
+    table, present = reduced(edges()), set(rooms())
+    width, row, box = 860, 76, 132
+    place: dict[str, tuple[float, float]] = {}
+    height = row * len(LAYERS) + 20
+    for level, layer in enumerate(LAYERS):
+        for name in present.intersection(layer):
+            place[name] = (width * ACROSS[name], height - row * (level + 0.5) - 10)
+    lines, boxes = [], []
+    for room, others in sorted(table.items()):
+        for other in sorted(others):
+            (x1, y1), (x2, y2) = place[room], place[other]
+            if y1 == y2:
+                side = 1 if x2 > x1 else -1
+                way = f"M{x1 + side * box / 2:.0f},{y1:.0f} L{x2 - side * box / 2:.0f},{y2:.0f}"
+            else:
+                middle = (y1 + y2) / 2
+                way = f"M{x1:.0f},{y1 + 15:.0f} C{x1:.0f},{middle:.0f} {x2:.0f},{middle:.0f} {x2:.0f},{y2 - 15:.0f}"
+            lines.append(f'<path d="{way}" fill="none" stroke="#8a8f99" stroke-width="1" marker-end="url(#a)"/>')
+    for name, (x, y) in sorted(place.items()):
+        single = (PACKAGE / f"{name}.py").is_file()
+        label = f"{name}.py" if single else f"{name}/"
+        fill = "#f4f5f7" if single else "#dfeaf8"
+        boxes.append(
+            f'<rect x="{x - box / 2:.0f}" y="{y - 15:.0f}" width="{box}" height="30" rx="5" fill="{fill}" '
+            f'stroke="#23252b"/><text x="{x:.0f}" y="{y + 5:.0f}" text-anchor="middle">{label}</text>'
+        )
+    marker = (
+        '<marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        '<path d="M0,0 L8,4 L0,8 z" fill="#8a8f99"/></marker>'
+    )
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        'font-family="monospace" font-size="14" fill="#23252b">'
+    )
+    back = f'<rect width="{width}" height="{height}" fill="white"/>'
+    return "\n".join([head, f"<defs>{marker}</defs>", back, *lines, *boxes, "</svg>"]) + "\n"
+
+
+def main() -> int:
+    """Draws the picture, or checks it; returns the exit status."""
+    wrong = violations()
+    if "--check" in sys.argv[1:]:
+        if not PICTURE.is_file() or PICTURE.read_text(encoding="utf-8") != draw():
+            wrong.append(f"{PICTURE.relative_to(ROOT)}: out of date; run python tools/architecture.py")
+    else:
+        PICTURE.write_text(draw(), encoding="utf-8")
+    print("\n".join(wrong) or "every import goes down")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
