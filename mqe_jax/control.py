@@ -137,7 +137,7 @@ class ControlState:
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """Turns actions into actuator targets and steps the physics under them.
+    """Computes actuator targets from actions and steps the physics under them.
 
     Attributes:
         mode: one of `MODES`.
@@ -177,7 +177,7 @@ class Controller:
         return rest
 
     def reset(self) -> ControlState:
-        """Returns the control state of a fresh world."""
+        """Returns the controller state after a reset."""
         robots = self.index.num_robots
         walk = None
         if self.walk_params is not None:

@@ -1,4 +1,4 @@
-"""Physics on three engines: the compiled robot's figures, agreement with MuJoCo, worlds that stay whole."""
+"""Physics on three engines: the compiled robot's figures, agreement with MuJoCo, states that stay finite."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
 @pytest.mark.parametrize("impl", IMPLS)
 def test_random_actions_break_nothing(impl: str) -> None:
     """No NaN, and no robot passes through a wall or the floor, under full-range joint targets."""
-    worlds, steps = SOAK if impl != "jax" or "MQE_SOAK" in os.environ else (2, 20)
-    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=worlds)
-    vector = VectorEnv(env, worlds)
+    num_envs, steps = SOAK if impl != "jax" or "MQE_SOAK" in os.environ else (2, 20)
+    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=num_envs)
+    vector = VectorEnv(env, num_envs)
 
     def advance(state: Any, key: jax.Array) -> tuple[Any, Any]:
-        action = jax.random.uniform(key, (worlds, 2, 12), minval=-1.0, maxval=1.0)
+        action = jax.random.uniform(key, (num_envs, 2, 12), minval=-1.0, maxval=1.0)
         state = vector.step(state, action)
         position = state.data.qpos[:, env.index.base_qpos[:, :3]]
         overflow = jnp.any(jax.vmap(vector.env.physics.overflow)(state.data))
@@ -121,8 +121,8 @@ def test_trunk_force_is_read(impl: str) -> None:
     assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
 
 
-def test_gate_moves_with_the_world() -> None:
-    """Walls stand where each world's gate was drawn, and stop a robot there."""
+def test_gate_stands_where_each_environment_drew_it() -> None:
+    """Walls stand where each environment's gate was drawn, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     gap = states.gates[:, 0]

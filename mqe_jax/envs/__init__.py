@@ -77,7 +77,7 @@ def make(
         control: what an action means: 'command', 'position' or 'torque'.
         num_envs: how many worlds there will be at most (only Warp's contact buffer needs to know).
         overrides: any parameter of the task by name; nested ones as mappings or, from a dict, dotted names:
-            `make("go1gate", gate_width=0.8, rewards={"collision": -5.0})`.
+            `make("go1gate", robot="go2", gate_width=0.8, rewards={"collision": -5.0})`.
 
     Raises:
         ValueError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.

@@ -32,8 +32,8 @@ _GREY = (0.62, 0.64, 0.66, 1.0)
 _DARK = (0.10, 0.11, 0.12, 1.0)
 _LIGHT = (0.75, 0.95, 1.0, 1.0)
 
-# As on the Go1: one capsule for trunk box and head cylinder, which leaves at most 2 cm of their edges outside. The shank
-# is bent; one capsule follows it.
+# As on the Go1: one capsule for trunk box and head cylinder, which leaves at most 2 cm of their edges outside. One
+# capsule follows the bent shank.
 _COLLISION = (
     CollisionShape("trunk", capsule(0.065, (-0.125, 0, 0), (0.265, 0, 0))),
     CollisionShape("hip", sphere(0.05, (0, 0.065, 0))),
