@@ -23,7 +23,7 @@ from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import Block as TerrainBlock
-from mqe_jax.terrain import Closing, Init, Layout, Plane, Track, Wall, register_block
+from mqe_jax.terrain import EndWall, SpawnArea, Layout, Plane, Track, Wall, register_block
 from mqe_jax.train.evaluate import evaluate
 
 # Step 1: a terrain block says where its walls are.
@@ -125,7 +125,7 @@ class Go1Catch(QuadrupedEnv):
 
     def scene(self) -> Scene:
         """Says what is in the world."""
-        track = Track(blocks=(Init(1.5), Pillar(2.0), Plane(1.5), Closing()), width=3.0, num_robots=1)
+        track = Track(blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1)
         return Scene(track, num_robots=1, contacts=Contacts(object=("trunk", "foot")), objects=(Mouse("mouse"),))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -133,11 +133,11 @@ class Go1Catch(QuadrupedEnv):
         place = jnp.array([3.8, 0.0]) + jax.random.uniform(key, (2,), minval=-0.5, maxval=0.5)
         return qpos.at[self.objects["mouse"].qpos].set(place), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> CatchState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> CatchState:
         """Returns the task's own fields of a fresh world."""
         return CatchState(self.distance(robot_state, data))
 
-    def drive(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Lets the mouse run."""
         velocity = flee(self.object_pose(data, "mouse"), robot_state.position_w[0, :2], self.params.mouse_speed)
         return data.replace(qvel=data.qvel.at[self.objects["mouse"].qvel].set(velocity))

@@ -66,7 +66,7 @@ class Object:
         )  # fmt: skip
 
 
-def _look(body: Any, kind: Any, color: Color, **shape: Any) -> None:
+def _visual_geom(body: Any, kind: Any, color: Color, **shape: Any) -> None:
     body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **shape)
 
 
@@ -118,7 +118,7 @@ class Ball(Object):
         if visual:  # dark patches, so that one sees it roll
             for axis in _AXES.values():
                 for side in (-1, 1):
-                    _look(
+                    _visual_geom(
                         body, _GEOM.mjGEOM_SPHERE, (0.1, 0.1, 0.12, 1.0), size=(0.5 * self.radius, 0, 0),
                         pos=np.array(axis) * side * 0.56 * self.radius,
                     )  # fmt: skip
@@ -161,7 +161,7 @@ class Cylinder(Object):
         )  # fmt: skip
         if visual:
             half = self.height / 2
-            _look(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
+            _visual_geom(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,11 +226,11 @@ class Seesaw(Object):
             grey = (0.55, 0.55, 0.58, 1.0)
             for side in (-1, 1):
                 edge, post = y + side * half[1], y + side * (half[1] + 0.06)
-                _look(
+                _visual_geom(
                     spec.worldbody, _GEOM.mjGEOM_CYLINDER, grey, size=(0.05, 0, 0),
                     fromto=(x, edge, z, x, edge + side * 0.08, z),
                 )  # fmt: skip
-                _look(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
+                _visual_geom(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,7 +261,7 @@ class Platform(Object):
             fromto=(0, 0, -top + self.size[2] / 2, 0, 0, -self.size[2] / 2 - self.column),
         )  # fmt: skip
         if visual:
-            _look(
+            _visual_geom(
                 spec.worldbody, _GEOM.mjGEOM_CYLINDER, (0.75, 0.75, 0.78, 1.0), size=(self.column, foot / 2, 0),
                 pos=(x, y, foot / 2),
             )  # fmt: skip
@@ -289,7 +289,7 @@ class Ring(Object):
         pieces = 72
         half = np.pi * self.radius / pieces * 1.05
         for angle in np.arange(pieces) * 2 * np.pi / pieces:
-            _look(
+            _visual_geom(
                 body, _GEOM.mjGEOM_BOX, (0.2, 0.2, 0.22, 1.0), size=(self.width / 2, half, 0.004),
                 pos=(self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0),
                 quat=(np.cos(angle / 2), 0, 0, np.sin(angle / 2)),
@@ -324,15 +324,15 @@ class Sheep(Object):
         if visual:
             dark = (0.16, 0.14, 0.13, 1.0)
             top, wide = self.height, self.radius
-            _look(body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=(wide, 0.75 * wide, 0.32 * top), pos=(0, 0, 0.62 * top))
-            _look(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
-            _look(
+            _visual_geom(body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=(wide, 0.75 * wide, 0.32 * top), pos=(0, 0, 0.62 * top))
+            _visual_geom(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
+            _visual_geom(
                 body, _GEOM.mjGEOM_ELLIPSOID, dark, size=(0.45 * wide, 0.3 * wide, 0.3 * wide),
                 pos=(1.15 * wide, 0, 0.82 * top),
             )  # fmt: skip
             for x in (-0.5, 0.5):
                 for y in (-0.35, 0.35):
-                    _look(
+                    _visual_geom(
                         body, _GEOM.mjGEOM_CAPSULE, dark, size=(0.12 * wide, 0, 0),
                         fromto=(x * wide, y * wide, 0.02, x * wide, y * wide, 0.4 * top),
                     )  # fmt: skip

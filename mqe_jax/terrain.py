@@ -159,7 +159,7 @@ def _number(value: Ranged) -> float:
 
 @register_block("init")
 @dataclasses.dataclass(frozen=True)
-class Init(Block):
+class SpawnArea(Block):
     """Spawn rooms, one a robot side by side across the track, with a wall behind them.
 
     Attributes:
@@ -195,7 +195,7 @@ class Plane(Block):
 
 @register_block("wall")
 @dataclasses.dataclass(frozen=True)
-class Closing(Block):
+class EndWall(Block):
     """The wall that closes the track."""
 
     length: Ranged = 0.0
@@ -245,7 +245,7 @@ class Gate(Block):
 
 @register_block("rotation")
 @dataclasses.dataclass(frozen=True)
-class Rotation(Gate):
+class DoorGap(Gate):
     """A gate for the revolving door: a fixed gap whose middle holds the door's hinge."""
 
     length: Ranged = 1.0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import TASKS, make
-from tests.worlds import placed, still
+from tests.states import placed, still
 
 COLLISION_ENDS = {"go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard"}
 TIME_LIMIT = {  # s

@@ -15,7 +15,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
-from tests.worlds import placed, robot_state
+from tests.states import placed, robot_state
 
 Array = jax.Array
 
@@ -129,7 +129,7 @@ def test_two_engines_step_alike(task: str) -> None:
 def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv) -> None:
     state = gate.reset(jax.random.PRNGKey(0))
     both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
-    state = dataclasses.replace(state, gates=jnp.array([[3.4, 0.2]]))
+    state = dataclasses.replace(state, anchors=jnp.array([[3.4, 0.2]]))
     obs = gate.observation_layout.pack(gate.observe(state, both))
     first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
     second = [0, 1, 4, 5, 0.6, 0, 0, 0.2, 1, 2, 0.3, 0, 0, 0.1, 3.4, 0.2]
@@ -142,8 +142,8 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     state = gate.reset(jax.random.PRNGKey(0))
     before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
     # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
-    task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.gates)
-    state = dataclasses.replace(state, gates=jnp.array([[3.5, 0.0]]), task=task)
+    task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.anchors)
+    state = dataclasses.replace(state, anchors=jnp.array([[3.5, 0.0]]), task=task)
     after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
     terms, _ = gate.rewards(state, after, jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
@@ -159,7 +159,7 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
 
 
 def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv) -> None:
-    state = dataclasses.replace(gate.reset(jax.random.PRNGKey(0)), gates=jnp.array([[3.5, 0.0]]))
+    state = dataclasses.replace(gate.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[3.5, 0.0]]))
     both, one = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]]), robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
     fine = jnp.array(False)
     assert float(gate.outcome(state, both, fine)["success"]) == 1
@@ -201,11 +201,11 @@ def test_diverged_world_ends_with_finite_numbers_and_is_counted(gate: QuadrupedE
 
 def test_aid_holds_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:
     plain = jax.vmap(gate.reset)(jax.random.split(jax.random.PRNGKey(0), 32))
-    assert not np.asarray(plain.hold).any()
+    assert not np.asarray(plain.frozen_steps).any()
     aided = jax.vmap(lambda key: gate.reset(key, 1.0))(jax.random.split(jax.random.PRNGKey(0), 32))
-    hold = np.asarray(aided.hold)
+    hold = np.asarray(aided.frozen_steps)
     assert np.all((hold > 0).sum(1) <= 1) and (hold[:, 0] > 0).any() and (hold[:, 1] > 0).any()
-    assert hold.max() <= gate.params.hold_time / gate.dt
+    assert frozen_steps.max() <= gate.params.frozen_time / gate.dt
 
 
 def test_randomisation_reaches_the_physics() -> None:

@@ -16,7 +16,7 @@ from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import PLANNERS
 from mqe_jax.walk_policy import default_commands
-from tests.worlds import observation, placed, still, with_object
+from tests.states import observation, placed, still, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -203,7 +203,7 @@ def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> No
 def test_goals_at_both_ends(duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
     state = with_ball(duel, fresh[duel.name], ball)
     robots = duel.read(state.data)
-    np.testing.assert_array_equal(duel.ahead(state, robots), np.array(goals, bool))
+    np.testing.assert_array_equal(duel.leading(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
     outcome = duel.outcome(state, robots, NO)
     assert [float(outcome[f"team{team}/win"]) for team in (0, 1)] == list(goals)
@@ -217,7 +217,7 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
     env = envs["go1football-2vs2"]
     state = fresh[env.name]
     before = with_ball(env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0))
-    task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.gates)
+    task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.anchors)
     np.testing.assert_allclose(task.goal, [5, 5], atol=1e-5)
     np.testing.assert_allclose(task.robot, [2, 3], atol=1e-5)
     # The ball at (8, 0): 4 m from team 0's goal (+1), 6 m from team 1's (-1): 1 - (-1) = 2.

@@ -15,8 +15,8 @@ from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.objects import Cylinder, Door
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import observation, placed, still, terms_of
+from mqe_jax.terrain import SpawnArea, Plane, Track
+from tests.states import observation, placed, still, terms_of
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
 ENVS: dict[str, Any] = {}
@@ -91,15 +91,15 @@ def test_both_sides_see_the_same_of_a_mirrored_world(task: str) -> None:
 def test_actions_are_mirrored_where_left_and_right_are_swapped() -> None:
     command = TASKS["go1revolvingdoor"](impl="c")
     np.testing.assert_allclose(
-        command.to_world(jnp.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]])), [[0.1, 0.2, 0.3], [0.1, -0.2, -0.3]]
+        command.unmirror_action(jnp.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]])), [[0.1, 0.2, 0.3], [0.1, -0.2, -0.3]]
     )
     env = env_of("go1revolvingdoor")
     legs = jnp.arange(12.0)[None] / 12
-    mirrored = 12 * np.asarray(env.to_world(jnp.tile(legs, (2, 1))))
+    mirrored = 12 * np.asarray(env.unmirror_action(jnp.tile(legs, (2, 1))))
     np.testing.assert_allclose(mirrored[0], np.arange(12))
     np.testing.assert_allclose(mirrored[1], [-3, 4, 5, -0, 1, 2, -9, 10, 11, -6, 7, 8], atol=1e-5)
     turned = env_of("go1tug")
-    np.testing.assert_allclose(turned.to_world(jnp.tile(legs, (2, 1)))[1], legs[0])
+    np.testing.assert_allclose(turned.unmirror_action(jnp.tile(legs, (2, 1)))[1], legs[0])
 
 
 # ---------------------------------------------------------------- Push Cylinder
@@ -185,7 +185,7 @@ def test_a_platform_above_the_robots_is_refused(task: str, top: str) -> None:
 
 def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_the_arena() -> None:
     scene = compile_scene(
-        Scene(Track((Init(2.0),), walled=False), num_robots=1, objects=(Cylinder("can", position=(9.0, 0.0)),))
+        Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects=(Cylinder("can", position=(9.0, 0.0)),))
     )
     index = scene.objects["can"]
     way = {}
@@ -224,7 +224,7 @@ def test_door_rewards_result_and_end() -> None:
 
 def test_a_door_turns_about_its_middle_and_lets_one_side_through_at_a_time() -> None:
     scene = compile_scene(
-        Scene(Track((Init(2.0), Plane(4.0)), walled=False), num_robots=1, objects=(Door("door", position=(4.0, 0.0)),))
+        Scene(Track((SpawnArea(2.0), Plane(4.0)), walled=False), num_robots=1, objects=(Door("door", position=(4.0, 0.0)),))
     )
     index, data = scene.objects["door"], mujoco.MjData(scene.model)
     body = scene.model.body(index.body)

@@ -18,8 +18,8 @@ from mqe_jax.npc import flock
 from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import PLANNERS
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import with_object
+from mqe_jax.terrain import SpawnArea, Plane, Track
+from tests.states import with_object
 
 STEP = 0.02
 
@@ -35,7 +35,7 @@ def herd() -> Any:
 
 
 def plain(*objects: objects.Object) -> Any:
-    return compile_scene(Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
+    return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
 
 
 def test_a_ball_that_was_kicked_rolls_and_comes_to_rest() -> None:
@@ -109,7 +109,7 @@ def test_a_sheep_by_itself_wanders() -> None:
 
 
 def test_sheep_observation(herd: Any) -> None:
-    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), gates=jnp.array([[8.5, 0.4]]))
+    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[8.5, 0.4]]))
     for number in range(9):
         state = with_object(herd, state, f"sheep{number}", [number, -0.1 * number])
     robots = herd.read(state.data)
@@ -151,7 +151,7 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
 
 
 def test_pushbox_rewards_and_success(box_env: Any) -> None:
-    state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), gates=jnp.array([[4.5, 0.2]]))
+    state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[4.5, 0.2]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.float32(4.47)))
     robots, no = box_env.read(state.data), jnp.array(False)
     before = with_object(box_env, state, "box", [4.49, 0.2, 0.5, 1, 0, 0, 0])
@@ -174,20 +174,20 @@ def test_pushbox_observation(box_env: Any) -> None:
     obs = np.asarray(box_env.observation_layout.pack(box_env.observe(state, robots)))
     info = np.asarray(robots.base_info)
     for agent in range(2):
-        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.gates[0])]
+        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.anchors[0])]
         np.testing.assert_allclose(obs[agent], [*expected, 3.0, 0.4, 0.8, 0, 0, 0.6], atol=1e-6)
 
 
 def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
     easy: Any = make("go1sheep-easy", impl="c", control="position")
-    state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), gates=jnp.array([[5.0, 0.3]]))
+    state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[5.0, 0.3]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.array([4.98])))
     state = with_object(easy, state, "sheep0", [5.01, 0.3])
     robots, no = easy.read(state.data), jnp.array(False)
     reward, _ = weigh(easy.rewards(state, robots, no)[0], easy.params.rewards, 2)
     np.testing.assert_allclose(reward, [1 + 2 * 0.03] * 2, atol=1e-4)
 
-    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), gates=jnp.array([[8.5, 0.0]]))
+    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[8.5, 0.0]]))
     for number in range(9):  # two are through; the others stand 3 m and 4 m away from the gate: hypot = 5
         state = with_object(herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0])
     reward, _ = weigh(herd.rewards(state, herd.read(state.data), no)[0], herd.params.rewards, 2)
@@ -201,7 +201,7 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
     rows = np.stack(np.meshgrid([3.5, 5.0, 6.5], [-1.5, 0.0, 1.5], indexing="ij"), -1).reshape(9, 2)
     assert np.abs(sheep - rows).max() <= 0.3 and np.abs(sheep - rows).max() > 0.25
     assert herd.observation_size == 34
-    assert np.all(np.abs(np.asarray(states.gates)[:, 0] - [8.5, 0.0]) <= [0.0, 1.0])
+    assert np.all(np.abs(np.asarray(states.anchors)[:, 0] - [8.5, 0.0]) <= [0.0, 1.0])
 
 
 @pytest.mark.parametrize(("task", "share"), [("go1gate", 0.9), ("go1sheep-hard", 0.6)])

@@ -90,7 +90,7 @@ def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> N
 def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
     """Trunk x, y, z of all robots (N, A, 3) and gate centres (N, 1, 2)."""
     position = np.asarray(state.data.qpos)[:, env.robot.base_qpos[:, :3]]
-    return position, np.asarray(state.gates)
+    return position, np.asarray(state.anchors)
 
 
 @pytest.mark.parametrize("impl", IMPLS)
@@ -139,7 +139,7 @@ def test_gate_moves_with_the_world() -> None:
     """Walls stand where each world's gate was drawn, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
-    gap = states.gates[:, 0]
+    gap = states.anchors[:, 0]
     assert len(np.unique(np.asarray(gap[:, 0]))) == 3
     assert np.all(np.abs(np.asarray(gap) - [3.5, 0.0]) <= 0.5)
     right, left = states.data.mocap_pos[:, 0], states.data.mocap_pos[:, 1]

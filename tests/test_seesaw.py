@@ -18,8 +18,8 @@ from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import angles, placed, robot_state
+from mqe_jax.terrain import SpawnArea, Plane, Track
+from tests.states import angles, placed, robot_state
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
@@ -73,7 +73,7 @@ def test_the_scene_is_as_listed(env: Any) -> None:
 def test_what_turns_has_its_centre_of_mass_in_its_hinge(env: Any) -> None:
     scenes = [(env.compiled, "seesaw", 100.0)]
     door = Door("door", position=(2.6, 0.3))
-    scenes.append((compile_scene(Scene(Track((Init(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0))
+    scenes.append((compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0))
     for compiled, name, mass in scenes:
         model, body = compiled.model, compiled.objects[name].body
         assert model.body_mass[body] == mass
@@ -154,7 +154,7 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
 
 def plank() -> Any:
     scene = compile_scene(
-        Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
+        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
     )
     return scene.model, scene.objects["seesaw"]
 

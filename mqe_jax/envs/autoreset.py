@@ -45,7 +45,7 @@ class VectorEnv:
     def __init__(self, env: QuadrupedEnv, num_envs: int) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs: {num_envs} must be at least 1")
-        self.env = env.with_room_for(num_envs)
+        self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.name = env.name
         self.max_episode_steps = env.max_steps

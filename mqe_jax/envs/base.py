@@ -69,7 +69,7 @@ class State:
     truncated: jax.Array
     metrics: dict[str, jax.Array]
     step: jax.Array
-    gates: jax.Array
+    anchors: jax.Array
     control: ControlState
     world: World
     task: Any
@@ -93,8 +93,8 @@ class QuadrupedEnv:
     name: ClassVar[str] = ""
     title: ClassVar[str] = ""
     Params: ClassVar[type[TaskParams]] = TaskParams
-    if_diverged: ClassVar[Mapping[str, float]] = {}  # metrics of a diverged world that are not 0
-    any_number: ClassVar[bool] = False  # whether `num_agents` may be another than the task's own
+    metrics_if_diverged: ClassVar[Mapping[str, float]] = {}  # metrics of a diverged world that are not 0
+    variable_num_agents: ClassVar[bool] = False  # whether `num_agents` may be another than the task's own
     dt = walk_policy.STEP
 
     def __init__(
@@ -107,7 +107,7 @@ class QuadrupedEnv:
     ) -> None:
         self.params: Any = self.Params() if params is None else params
         own = self.Params().num_agents
-        if self.params.num_agents != own and not self.any_number:
+        if self.params.num_agents != own and not self.variable_num_agents:
             raise ValueError(f"num_agents: {self.params.num_agents}; {self.name} is for {own} robots")
         self.control = check_mode(control)
         if num_envs < 1:
@@ -144,14 +144,14 @@ class QuadrupedEnv:
         """Says what is in the world."""
         raise TypeError(f"{type(self).__name__}: scene() is not defined")
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad; where the track's blocks say if not here."""
         return self.compiled.layout.spawn
 
     def spawn(self, key: jax.Array) -> jax.Array:
         """Draws poses x, y, z, yaw (R, 4), m and rad, of all robots."""
         params = self.params
-        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_places()], np.float32)
+        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32)
         noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
         return jnp.asarray(pose).at[:, :2].add(noise)
 
@@ -159,7 +159,7 @@ class QuadrupedEnv:
         """Draws where movable objects start, into qpos (nq,) and qvel (nv,)."""
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> Any:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> Any:
         """Returns the task's own fields of a fresh world."""
         return None
 
@@ -167,11 +167,11 @@ class QuadrupedEnv:
         """Returns walk commands (R - A, 15) of the robots that are no agents."""
         return None
 
-    def to_world(self, action: jax.Array) -> jax.Array:
+    def unmirror_action(self, action: jax.Array) -> jax.Array:
         """Turns actions (A, action_size), each in its agent's own frame, into those that the robots carry out."""
         return action
 
-    def drive(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Moves what has a will of its own: returns the world with its velocities for the next step."""
         return data
 
@@ -255,7 +255,7 @@ class QuadrupedEnv:
         """Environment steps until the time limit."""
         return round(self.params.episode_length / self.dt)
 
-    def with_room_for(self, num_envs: int) -> QuadrupedEnv:
+    def with_num_envs(self, num_envs: int) -> QuadrupedEnv:
         """Returns the environment with buffers for `num_envs` worlds, which only Warp's contacts need."""
         if self.impl != "warp" or self.physics.num_envs >= num_envs:
             return self
@@ -269,10 +269,10 @@ class QuadrupedEnv:
             aid: how much the world helps learning, in [0, 1]; 0 is the task itself.
         """
         keys = jax.random.split(key, 9)
-        next_key, gate_key, spawn_key, body_key, object_key, world_key, task_key, noise_key, aid_key = keys
+        next_key, anchor_key, spawn_key, body_key, object_key, world_key, task_key, noise_key, aid_key = keys
         aid = jnp.asarray(aid, jnp.float32)
-        gates = self._draw_gates(gate_key)
-        qpos, qvel = self._draw_robots(spawn_key, body_key)
+        gates = self._sample_anchors(anchor_key)
+        qpos, qvel = self._sample_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel)
         ctrl = jnp.zeros(self.compiled.model.nu).at[self.robot.actuator].set(self.controller.neutral)
         data = self.physics.init(qpos, qvel, self._mocap(gates), ctrl)
@@ -282,9 +282,9 @@ class QuadrupedEnv:
         state = State(
             data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
             reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
-            step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
+            step=jnp.zeros((), jnp.int32), anchors=gates, control=self.controller.reset(),
             world=self.randomizer.draw(world_key), task=self.reset_task(task_key, robot_state, data, gates), aid=aid,
-            hold=self._draw_hold(aid_key, aid), key=next_key,
+            frozen_steps=self._sample_frozen_steps(aid_key, aid), key=next_key,
         )  # fmt: skip
         terms, _ = self.rewards(state, robot_state, no)
         _, logged = weigh(terms, self.params.rewards, self.num_agents)
@@ -306,15 +306,15 @@ class QuadrupedEnv:
         action = self._checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
-        action = self.to_world(jnp.where((state.step < state.hold)[:, None], 0.0, action))
-        key, push_key, noise_key, drive_key = jax.random.split(state.key, 4)
+        action = self.unmirror_action(jnp.where((state.step < state.frozen_steps)[:, None], 0.0, action))
+        key, push_key, noise_key, npc_key = jax.random.split(state.key, 4)
 
         before = self.read(state.data)
         target, control = self.controller.targets(
             state.control, action, before.projected_gravity, before.joint_position, before.joint_velocity,
             self.npc_commands(state, before),
         )  # fmt: skip
-        data = self.drive(self.randomizer.push(state.data, push_key, self.dt), before, drive_key)
+        data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before, npc_key)
         data, control = self.controller.apply(
             control,
             data,
@@ -335,7 +335,7 @@ class QuadrupedEnv:
         terminated = failed | self.ending(state, robot_state)
         metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
-        metrics = {name: clean(value, self.if_diverged.get(name, 0.0)) for name, value in metrics.items()}
+        metrics = {name: clean(value, self.metrics_if_diverged.get(name, 0.0)) for name, value in metrics.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
         state = dataclasses.replace(
             state, reward=clean(reward), terminated=terminated, metrics=metrics,
@@ -365,17 +365,17 @@ class QuadrupedEnv:
 
     # -- the common parts of reset and step ---------------------------------------------------------------------
 
-    def _draw_gates(self, key: jax.Array) -> jax.Array:
+    def _sample_anchors(self, key: jax.Array) -> jax.Array:
         mean, spread = self.compiled.anchor_mean, self.compiled.anchor_spread
         return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
 
-    def _mocap(self, gates: jax.Array) -> jax.Array:
+    def _mocap(self, anchors: jax.Array) -> jax.Array:
         model = self.compiled.model
         if not model.nmocap:
             return jnp.zeros((0, 3))
         return self.compiled.wall_positions(gates)
 
-    def _draw_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
         params, model, index = self.params, self.compiled.model, self.robot
         pose = self.spawn(spawn_key)
         joint_key, velocity_key = jax.random.split(body_key)
@@ -390,9 +390,9 @@ class QuadrupedEnv:
         qpos = qpos.at[index.base_qpos].set(jnp.concatenate([pose[:, :3], turn], axis=-1))
         return qpos, jnp.zeros(model.nv).at[index.base_qvel].set(velocity)
 
-    def _draw_hold(self, key: jax.Array, aid: jax.Array) -> jax.Array:
+    def _sample_frozen_steps(self, key: jax.Array, aid: jax.Array) -> jax.Array:
         who_key, time_key = jax.random.split(key)
-        steps = aid * self.params.hold_time / self.dt * jax.random.uniform(time_key, ())
+        steps = aid * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
         who = jax.random.randint(who_key, (), 0, self.num_agents)
         return jnp.where(jnp.arange(self.num_agents) == who, steps, 0.0).astype(jnp.int32)
 
@@ -417,7 +417,7 @@ class QuadrupedEnv:
         noise = self.params.randomization.observation_noise
         if noise:
             obs = obs + noise * jax.random.normal(key, obs.shape)
-        privileged = self.privileged.observe(robot_state, state.data, state.gates)
+        privileged = self.privileged.observe(robot_state, state.data, state.anchors)
         obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
         return dataclasses.replace(
             state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged

@@ -17,7 +17,7 @@ from mqe_jax.objects import Platform
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Init, Plane, Track
+from mqe_jax.terrain import SpawnArea, Plane, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,22 +98,22 @@ class Go1Bridge(Duel):
         middle = (*self.center, params.top)
         span = second - first - length
         deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
-        track = Track(blocks=(Init(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
+        track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
         contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(*blocks, deck), colors=(0, 2))
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: one on each platform, facing the bridge."""
         first, second = self.params.spawn_x
         return (first, 0.0, 0.0), (second, 0.0, np.pi)
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        out = self.lost(robot_state)
-        terms = {"win": self.versus(out[::-1] & ~out), "far_side": self.versus(self.across(robot_state))}
+        out = self.eliminated(robot_state)
+        terms = {"win": self.zero_sum(out[::-1] & ~out), "far_side": self.zero_sum(self.across(robot_state))}
         return terms, None
 
-    def lost(self, robot_state: RobotState) -> jax.Array:
+    def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Which robots are off the bridge or have fallen (2,) bool."""
         return self.fallen(robot_state) | (robot_state.position_w[:, 2] < self.params.off_height)
 
@@ -126,10 +126,10 @@ class Go1Bridge(Duel):
         reached = jnp.stack([x[0] > second - half, x[1] < first + half])
         return reached & (height > params.top)
 
-    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """On the opponent's platform."""
         return self.across(robot_state)
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One is off the bridge or has fallen."""
-        return jnp.any(self.lost(robot_state))
+        return jnp.any(self.eliminated(robot_state))

@@ -17,7 +17,7 @@ from mqe_jax.objects import Door
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Init, Plane, Rotation, Track
+from mqe_jax.terrain import EndWall, SpawnArea, Plane, DoorGap, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,8 +92,8 @@ class Go1RevolvingDoor(Duel):
     def scene(self) -> Scene:
         """Says what is in the world."""
         params = self.params
-        wall = Rotation(1.0, width=params.gap)
-        blocks = (Init(params.door_x - 0.5), wall, Plane(2.5), Closing())
+        wall = DoorGap(1.0, width=params.gap)
+        blocks = (SpawnArea(params.door_x - 0.5), wall, Plane(2.5), EndWall())
         door = Door(
             "door", position=(params.door_x, 0.0), size=params.door_size, mass=params.door_mass,
             inertia=params.door_inertia, damping=params.door_damping,
@@ -104,12 +104,12 @@ class Go1RevolvingDoor(Duel):
             objects=(door,), colors=(0, 2),
         )  # fmt: skip
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: side by side before the door."""
         x, y = self.params.spawn_x, self.params.spawn_y
         return (x, -y, 0.0), (x, y, 0.0)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> DoorState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DoorState:
         """Returns the task's own fields of a fresh world."""
         return DoorState(self.distance(robot_state))
 
@@ -121,15 +121,15 @@ class Go1RevolvingDoor(Duel):
         """Returns the reward terms and the task's fields after the step."""
         distance = self.distance(robot_state)
         terms = {
-            "win": self.versus(self.wins(state, robot_state)),
-            "approach": self.versus(state.task.distance - distance),
+            "win": self.zero_sum(self.wins(state, robot_state)),
+            "approach": self.zero_sum(state.task.distance - distance),
         }
         return terms, DoorState(distance)
 
-    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """Past the line."""
         return robot_state.position_w[:, 0] > self.params.line_x
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One is past the line."""
-        return jnp.any(self.ahead(state, robot_state))
+        return jnp.any(self.leading(state, robot_state))

@@ -22,7 +22,7 @@ from mqe_jax.objects import Ball
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.terrain import EndWall, Gate, SpawnArea, Plane, Track
 
 # Middles of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
@@ -71,7 +71,7 @@ class Football(QuadrupedEnv):
         goal = Gate(_GOAL_DEPTH, width=params.goal_width, depth=_GOAL_DEPTH)
         length = float(GOALS[0, 0] - GOALS[1, 0])
         track = Track(
-            blocks=(Init(1.0), goal, Plane(length), goal, Closing()), width=params.field_width,
+            blocks=(SpawnArea(1.0), goal, Plane(length), goal, EndWall()), width=params.field_width,
             wall_height=params.wall_height,
         )  # fmt: skip
         ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
@@ -79,7 +79,7 @@ class Football(QuadrupedEnv):
         robots = len(self.kick_off)
         return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad."""
         return self.kick_off
 
@@ -180,7 +180,7 @@ class FootballMatch(Football, Match):
         return float(GOALS[:, 0].mean()), 0.0
 
     def reset_task(
-        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array
+        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array
     ) -> FootballMatchState:
         """Returns the task's own fields of a fresh world."""
         return self.distances(robot_state, data)
@@ -223,10 +223,10 @@ class FootballMatch(Football, Match):
         """Returns the reward terms and the task's fields after the step."""
         after = self.distances(robot_state, state.data)
         terms = {
-            "goal": self.versus(self.in_goal(state.data)),
-            "progress": self.versus(state.task.goal - after.goal),
-            "approach": self.versus(state.task.robot - after.robot),
-            "fall": self.versus(self.lost(robot_state)),
+            "goal": self.zero_sum(self.in_goal(state.data)),
+            "progress": self.zero_sum(state.task.goal - after.goal),
+            "approach": self.zero_sum(state.task.robot - after.robot),
+            "fall": self.zero_sum(self.eliminated(robot_state)),
         }
         return terms, after
 
@@ -234,7 +234,7 @@ class FootballMatch(Football, Match):
         """A goal ends the episode."""
         return jnp.any(self.in_goal(state.data))
 
-    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """The ball is in the goal that the team attacks."""
         return self.in_goal(state.data)
 

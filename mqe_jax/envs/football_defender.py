@@ -81,7 +81,7 @@ class Go1FootballDefender(Football):
             commands = commands.at[np.array([command_index(name) for name in ("vx", "vy", "yaw_rate")])].set(move)
         return commands[None]
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> DefenderState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
         """Returns the task's own fields of a fresh world."""
         return DefenderState(jnp.zeros((), bool))
 

@@ -17,7 +17,7 @@ from mqe_jax.envs.params import TaskParams
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.terrain import EndWall, Gate, SpawnArea, Plane, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,11 +94,11 @@ class Go1Gate(QuadrupedEnv):
         """Says what is in the world."""
         params = self.params
         gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
-        track = Track(blocks=(Init(2.0), gate, Plane(1.0), Closing()), width=params.track_width)
+        track = Track(blocks=(SpawnArea(2.0), gate, Plane(1.0), EndWall()), width=params.track_width)
         contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk", "foot"), object=())
         return Scene(track, num_robots=2, contacts=contacts)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> GateState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> GateState:
         """Returns the task's own fields of a fresh world."""
         return GateState(self.target_distance(robot_state))
 
@@ -109,7 +109,7 @@ class Go1Gate(QuadrupedEnv):
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
-        return {**pair(robot_state.base_info), "gate": for_all(state.gates, 2)}
+        return {**pair(robot_state.base_info), "gate": for_all(state.anchors, 2)}
 
     def target_distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to its target (2,), m."""
@@ -121,7 +121,7 @@ class Go1Gate(QuadrupedEnv):
         """Returns the reward terms and the task's fields after the step."""
         distance = self.target_distance(robot_state)
         terms = {
-            "success": reward.past(robot_state.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
+            "success": reward.past(robot_state.position_w[:, 0], state.anchors[0, 0], self.params.past_gate),
             "approach": reward.decrease(state.task.distance, distance),
             "crowding": reward.crowding(robot_state.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
@@ -130,5 +130,5 @@ class Go1Gate(QuadrupedEnv):
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: both robots are through; `success/one`: at least one is, however the episode ended."""
-        through = robot_state.position_w[:, 0] > state.gates[0, 0] + self.params.past_gate
+        through = robot_state.position_w[:, 0] > state.anchors[0, 0] + self.params.past_gate
         return {"success": jnp.all(through) & ~failed, "success/one": jnp.any(through)}

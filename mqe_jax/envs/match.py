@@ -38,7 +38,7 @@ class Match(QuadrupedEnv):
     """
 
     symmetry: ClassVar[str] = "turn"
-    if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
+    metrics_if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
 
     @property
     def center(self) -> tuple[float, float]:
@@ -58,17 +58,17 @@ class Match(QuadrupedEnv):
 
     # -- what a match says ----------------------------------------------------------------------------------------
 
-    def lost(self, robot_state: RobotState) -> jax.Array:
+    def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which team has lost outright (2,) bool: one of its robots has fallen."""
         return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
 
-    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns which team is ahead where none has lost outright (2,) bool."""
         return jnp.zeros(2, bool)
 
     def wins(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns which team wins if the episode ends now (2,) bool, one at most."""
-        lost, ahead = self.lost(robot_state), self.ahead(state, robot_state)
+        lost, ahead = self.eliminated(robot_state), self.leading(state, robot_state)
         return jnp.where(jnp.any(lost), lost[::-1] & ~lost, ahead & ~ahead[::-1])
 
     # -- both sides' views ----------------------------------------------------------------------------------------
@@ -92,7 +92,7 @@ class Match(QuadrupedEnv):
         other = jnp.array([-1.0, -1.0, 1.0] if self.symmetry == "turn" else [1.0, -1.0, 1.0])
         return jnp.stack([vectors, vectors * other])
 
-    def to_world(self, action: jax.Array) -> jax.Array:
+    def unmirror_action(self, action: jax.Array) -> jax.Array:
         """Mirrors the actions (A, action_size) of team 1 where it sees left and right swapped."""
         if self.symmetry == "turn":
             return action
@@ -105,7 +105,7 @@ class Match(QuadrupedEnv):
 
     # -- rewards and result ---------------------------------------------------------------------------------------
 
-    def versus(self, own: jax.Array) -> jax.Array:
+    def zero_sum(self, own: jax.Array) -> jax.Array:
         """Turns both teams' own terms (2,) into zero-sum ones of every agent (A,)."""
         own = jnp.asarray(own, jnp.float32)
         return (own - own[::-1])[self.team_of]

@@ -39,8 +39,8 @@ class TaskParams:
             deepest ones, and of all worlds together on Warp.
         constraints_per_robot: room for constraint rows of a world on Warp, likewise.
         randomization: domain randomisation.
-        hold_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
-            for up to hold_time x aid, s, so that agents first learn one at a time what they must do in turn.
+        frozen_time: a training aid, on only where a trainer sets `State.aid`: one agent, drawn at reset, stands still
+            for up to frozen_time x aid, s, so that agents first learn one at a time what they must do in turn.
     """
 
     num_agents: int = 2
@@ -64,7 +64,7 @@ class TaskParams:
     contacts_per_robot: int = 12
     constraints_per_robot: int = 64
     randomization: Randomization = Randomization()
-    hold_time: float = 4.0
+    frozen_time: float = 4.0
 
     def __post_init__(self) -> None:
         for name in (

@@ -14,7 +14,7 @@ from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayou
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Init, Plane, Track
+from mqe_jax.terrain import SpawnArea, Plane, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,19 +57,19 @@ class Go1Plane(QuadrupedEnv):
     name = "go1plane"
     title = "Plane"
     Params: ClassVar[type[TaskParams]] = PlaneParams
-    any_number = True
+    variable_num_agents = True
 
     def scene(self) -> Scene:
         """Says what is in the world."""
         track = Track(
-            blocks=(Init(2.0, back_wall=False), Plane(2.0)),
+            blocks=(SpawnArea(2.0, back_wall=False), Plane(2.0)),
             width=self.params.width,
             num_robots=self.num_agents,
             walled=False,
         )
         return Scene(track, num_robots=self.num_agents)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> PlaneState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PlaneState:
         """Returns the task's own fields of a fresh world."""
         return PlaneState(robot_state.position_w[:, 0])
 

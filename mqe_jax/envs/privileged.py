@@ -38,7 +38,7 @@ class PrivilegedObservation:
         )
         self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 
-    def observe(self, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> jax.Array:
+    def observe(self, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> jax.Array:
         """Returns the observation of one world (P,)."""
         robots = jnp.concatenate(
             [

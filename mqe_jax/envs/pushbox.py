@@ -16,7 +16,7 @@ from mqe_jax.objects import Box
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Track
+from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Go1PushBox(QuadrupedEnv):
         """Says what is in the world."""
         params = self.params
         gate = Gate(5.0, width=params.gate_width, random=params.gate_random)
-        track = Track(blocks=(Init(2.0), gate, Closing()), width=params.track_width)
+        track = Track(blocks=(SpawnArea(2.0), gate, EndWall()), width=params.track_width)
         box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
         contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         return Scene(track, num_robots=2, contacts=contacts, objects=(box,))
@@ -103,7 +103,7 @@ class Go1PushBox(QuadrupedEnv):
         pose = jnp.array([params.box_x, 0.0, params.box_size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
         return qpos.at[self.objects["box"].qpos].set(pose), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> PushBoxState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PushBoxState:
         """Returns the task's own fields of a fresh world."""
         x = self.object_pose(data, "box")[0]
         return PushBoxState(x, x)
@@ -117,7 +117,7 @@ class Go1PushBox(QuadrupedEnv):
         """Returns the observation's blocks by name (2, width)."""
         pose = self.object_pose(state.data, "box")
         return {
-            **pair(robot_state.base_info), "gate": for_all(state.gates, 2), "box": for_all(pose[:2], 2),
+            **pair(robot_state.base_info), "gate": for_all(state.anchors, 2), "box": for_all(pose[:2], 2),
             "box_quaternion": for_all(pose[3:], 2),
         }  # fmt: skip
 
@@ -129,7 +129,7 @@ class Go1PushBox(QuadrupedEnv):
 
     def through(self, state: State) -> jax.Array:
         """Whether the box is past the gate () bool."""
-        return self.object_pose(state.data, "box")[0] > state.gates[0, 0] + self.params.past_gate
+        return self.object_pose(state.data, "box")[0] > state.anchors[0, 0] + self.params.past_gate
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the box is past the gate; `success/way`: how far it came, m."""

@@ -17,7 +17,7 @@ from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Init, Plane, Track
+from mqe_jax.terrain import EndWall, SpawnArea, Plane, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Go1Seesaw(QuadrupedEnv):
     def scene(self) -> Scene:
         """Says what is in the world."""
         params = self.params
-        track = Track(blocks=(Init(2.0), Plane(8.0), Closing()), width=params.track_width)
+        track = Track(blocks=(SpawnArea(2.0), Plane(8.0), EndWall()), width=params.track_width)
         plank = Seesaw(
             "seesaw", hinge=params.hinge, size=params.plank_size, behind=params.plank_behind, mass=params.plank_mass,
             inertia=params.plank_inertia, limit=params.plank_limit, damping=params.plank_damping,
@@ -131,7 +131,7 @@ class Go1Seesaw(QuadrupedEnv):
         """Lays the plank's near end on the ground."""
         return qpos.at[self.objects["seesaw"].qpos].set(self.params.plank_start), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> SeesawState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> SeesawState:
         """Returns the task's own fields of a fresh world."""
         return SeesawState(robot_state.position_w[:, 0])
 

@@ -18,7 +18,7 @@ from mqe_jax.objects import Sheep
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.terrain import EndWall, Gate, SpawnArea, Plane, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,9 +127,9 @@ class Go1SheepEasy(QuadrupedEnv):
         """Says what is in the world."""
         params = self.params
         before, middle, behind = params.lengths
-        init = Init(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
+        init = SpawnArea(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
-        track = Track(blocks=(init, Plane(middle), gate, Plane(behind), Closing()), width=params.track_width)
+        track = Track(blocks=(init, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
         touching = ("trunk", "foot")
         contacts = Contacts(ground=touching, wall=touching, robot=touching, object=touching)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
@@ -144,11 +144,11 @@ class Go1SheepEasy(QuadrupedEnv):
         noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> SheepState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> SheepState:
         """Returns the task's own fields of a fresh world."""
         return SheepState(self.sheep(data)[:, 0])
 
-    def drive(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Lets the sheep flee, wander and flock together."""
         index = self._sheep("qvel")
         velocity = flock(
@@ -173,16 +173,16 @@ class Go1SheepEasy(QuadrupedEnv):
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (2, width)."""
         sheep = for_all(self.sheep(state.data), 2)
-        return {**pair(robot_state.base_info), "gate": for_all(state.gates, 2), "sheep": sheep}
+        return {**pair(robot_state.base_info), "gate": for_all(state.anchors, 2), "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
         """Which sheep are past the gate (S,) bool."""
-        return self.sheep(state.data)[:, 0] > state.gates[0, 0] + self.params.past_gate
+        return self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
         sheep, through = self.sheep(state.data), self.through(state)
-        distance = jnp.linalg.norm(sheep - state.gates[0], axis=-1)
+        distance = jnp.linalg.norm(sheep - state.anchors[0], axis=-1)
         terms = {
             "success": jnp.sum(through).astype(jnp.float32),
             "progress": jnp.sum(sheep[:, 0] - state.task.x),

@@ -19,7 +19,7 @@ from mqe_jax.objects import Cylinder
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Init, Plane, Track
+from mqe_jax.terrain import EndWall, SpawnArea, Plane, Track
 
 _START_X = 0.1  # m, where the arena starts
 
@@ -105,7 +105,7 @@ class Go1Tug(Duel):
         """Says what is in the world."""
         params = self.params
         length, width = params.arena
-        track = Track(blocks=(Plane(_START_X), Init(length), Closing()), width=width)
+        track = Track(blocks=(Plane(_START_X), SpawnArea(length), EndWall()), width=width)
         reach = width / 2 - params.radius
         cylinder = Cylinder(
             "cylinder", position=self.center, radius=params.radius, height=params.height, mass=params.mass,
@@ -114,7 +114,7 @@ class Go1Tug(Duel):
         contacts = Contacts(robot=("trunk",), object=("trunk", "foot", "calf"))
         return Scene(track, num_robots=2, contacts=contacts, objects=(cylinder,), colors=(0, 2))
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: one on each side, facing the middle."""
         x, apart = self.center[0], self.params.spawn_y
         return (x, -apart, 0.5 * np.pi), (x, apart, -0.5 * np.pi)
@@ -125,7 +125,7 @@ class Go1Tug(Duel):
         aside = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
         return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(aside)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, gates: jax.Array) -> TugState:
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> TugState:
         """Returns the task's own fields of a fresh world."""
         y = self.cylinder_y(data)
         return TugState(y, y, self.distance(robot_state, y))
@@ -168,11 +168,11 @@ class Go1Tug(Duel):
         back = side * (y - state.task.y) < 0
         distance = self.distance(robot_state, y)
         terms = {
-            "push": self.versus(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),
-            "approach": self.versus(state.task.distance - distance),
+            "push": self.zero_sum(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),
+            "approach": self.zero_sum(state.task.distance - distance),
         }
         return terms, TugState(y, state.task.y, distance)
 
-    def ahead(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """The cylinder is on the opponent's half."""
         return self.cylinder_y(state.data) * jnp.array([1.0, -1.0]) > self.params.win_by

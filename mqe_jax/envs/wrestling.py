@@ -17,7 +17,7 @@ from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Init, Plane, Track
+from mqe_jax.terrain import SpawnArea, Plane, Track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,20 +86,20 @@ class Go1Wrestling(Duel):
         top = params.platform_top
         platform = Platform("platform", center=(x, y, top), size=params.platform)
         ring = Ring("ring", center=(x, y, top), radius=params.ring_radius)
-        track = Track(blocks=(Init(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
+        track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
         contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(platform, ring), colors=(0, 2))
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Says where the robots start, x, y, yaw of each, m and rad: facing each other across the ring."""
         (x, y), apart = self.center, self.params.spawn_y
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the reward terms and the task's fields after the step."""
-        return {"win": self.versus(self.wins(state, robot_state))}, None
+        return {"win": self.zero_sum(self.wins(state, robot_state))}, None
 
-    def lost(self, robot_state: RobotState) -> jax.Array:
+    def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Which robots have fallen or left the ring (2,) bool."""
         params = self.params
         apart = jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
@@ -108,4 +108,4 @@ class Go1Wrestling(Duel):
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """One has fallen or left the ring."""
-        return jnp.any(self.lost(robot_state))
+        return jnp.any(self.eliminated(robot_state))
