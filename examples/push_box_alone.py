@@ -17,7 +17,7 @@ WORLDS, SECONDS = 32, 3.0
 def start(env: QuadrupedEnv, key: jax.Array, place: jax.Array) -> State:
     """Returns a fresh world with the robots at (2, 2), m."""
     state = env.reset(key)
-    qpos = state.data.qpos.at[env.robot.base_qpos[:, :2]].set(place)
+    qpos = state.data.qpos.at[env.index.base_qpos[:, :2]].set(place)
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos))
 
 

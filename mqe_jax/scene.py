@@ -65,7 +65,7 @@ class CompiledScene:
     Attributes:
         scene: what it was built from.
         model: for the physics, without the geoms that are only looked at.
-        robot: index tables of the robots.
+        index: tables of the robots.
         objects: where each object is, by name.
         layout: the track's walls, anchors and spawn poses.
         mocap_offset: of each moving wall from its anchor (W, 3), m; the anchor's z is 0.
@@ -74,7 +74,7 @@ class CompiledScene:
 
     scene: Scene
     model: mujoco.MjModel
-    robot: RobotIndex
+    index: RobotIndex
     objects: Mapping[str, ObjectIndex]
     layout: Layout
     mocap_offset: np.ndarray
@@ -137,7 +137,7 @@ def compile_scene(scene: Scene) -> CompiledScene:
     return CompiledScene(
         scene=scene,
         model=model,
-        robot=robots.index_robots(model, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
+        index=robots.index_robots(model, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
         objects=index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),

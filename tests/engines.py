@@ -53,7 +53,7 @@ def played(task: str, worlds: int) -> dict[str, np.ndarray]:
     """
     env: Any = make(task, impl="c", num_envs=worlds)
     worlds_env, plan = VectorEnv(env, worlds), jax.vmap(PLANNERS.get(task, ahead))
-    robots = np.concatenate([env.robot.base_qvel, env.robot.joint_qvel], axis=1).ravel()
+    robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 
     def advance(states: State, _: None) -> tuple[State, Any]:
@@ -114,7 +114,7 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     leaves = [jnp.asarray(reference[f"leaf/{i}"]) for i in range(len(jax.tree.leaves(parts)))]
     states = dataclasses.replace(fresh, data=data, **jax.tree.unflatten(jax.tree.structure(parts), leaves))
     apart = np.abs(np.asarray(rolled(env, states, actions_of(env, worlds))[1]) - reference["qpos"])
-    robots = np.concatenate([env.robot.base_qpos, env.robot.joint_qpos], axis=1).ravel()
+    robots = np.concatenate([env.index.base_qpos, env.index.joint_qpos], axis=1).ravel()
     rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
     figures = {}
     for number, kind in enumerate(("standing", "play")):

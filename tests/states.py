@@ -25,7 +25,7 @@ def placed(
     Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the reset.
     """
     state = env.reset(jax.random.PRNGKey(0)) if state is None else state
-    index, position = env.robot, jnp.asarray(position, jnp.float32)
+    index, position = env.index, jnp.asarray(position, jnp.float32)
     turn = euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
     qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))
     qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))

@@ -23,7 +23,7 @@ REACH = {
 def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     """All robots thrown together upon what there is to touch, under random joint targets, for two seconds."""
     env: Any = make(task, impl="c", control="position")
-    model, index = env.compiled.model, env.robot
+    model, index = env.compiled.model, env.index
     start = jax.tree.map(np.asarray, env.reset(jax.random.PRNGKey(0)))
     random = np.random.default_rng(0)
     data = mujoco.MjData(model)

@@ -99,8 +99,8 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
 def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
     """Rays at the height of the ball, from the field's middle outwards, end where the listed walls are."""
     model, data = duel.compiled.model, mujoco.MjData(duel.compiled.model)
-    data.qpos[duel.robot.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
-    data.qpos[duel.robot.base_qpos[:, 0]] = [3.0, 4.0]
+    data.qpos[duel.index.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
+    data.qpos[duel.index.base_qpos[:, 0]] = [3.0, 4.0]
     data.qpos[duel.objects["ball"].qpos[:3]] = [11.0, -4.0, 0.1]
     mujoco.mj_forward(model, data)
 

@@ -134,7 +134,7 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     env: Any = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
     state = env.reset(jax.random.PRNGKey(0))
     state = with_object(env, state, "sheep0", [2.0, 1.0])
-    index = env.robot.base_qpos
+    index = env.index.base_qpos
     qpos = state.data.qpos.at[index[0, :2]].set(jnp.array([1.2, 1.0])).at[index[1, :2]].set(jnp.array([0.5, -1.5]))
     state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
     step = jax.jit(env.step)

@@ -33,9 +33,9 @@ def standing(scene: CompiledScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A robot that has settled on its feet on MuJoCo itself: qpos, qvel, ctrl."""
     model = scene.model
     data = mujoco.MjData(model)
-    data.qpos[scene.robot.base_qpos[0]] = [0, 0, 0.33, 1, 0, 0, 0]
-    data.qpos[scene.robot.joint_qpos[0]] = go1.DEFAULT_JOINTS
-    data.ctrl[scene.robot.actuator[0]] = go1.DEFAULT_JOINTS
+    data.qpos[scene.index.base_qpos[0]] = [0, 0, 0.33, 1, 0, 0, 0]
+    data.qpos[scene.index.joint_qpos[0]] = go1.DEFAULT_JOINTS
+    data.ctrl[scene.index.actuator[0]] = go1.DEFAULT_JOINTS
     mujoco.mj_step(model, data, 300)
     return data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()
 
@@ -59,7 +59,7 @@ def test_robot_has_the_masses_and_inertias_of_a_go1(plane: CompiledScene) -> Non
 
 
 def test_closed_form_feet_are_where_mujoco_puts_them(plane: CompiledScene) -> None:
-    model, index = plane.model, plane.robot
+    model, index = plane.model, plane.index
     data = mujoco.MjData(model)
     joints = np.random.default_rng(0).uniform(go1.JOINT_LOWER, go1.JOINT_UPPER)
     data.qpos[index.base_qpos[0]] = [1.0, 2.0, 3.0, 1, 0, 0, 0]
@@ -89,7 +89,7 @@ def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> N
 
 def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
     """Trunk x, y, z of all robots (N, A, 3) and gate centres (N, 1, 2)."""
-    position = np.asarray(state.data.qpos)[:, env.robot.base_qpos[:, :3]]
+    position = np.asarray(state.data.qpos)[:, env.index.base_qpos[:, :3]]
     return position, np.asarray(state.anchors)
 
 
@@ -103,7 +103,7 @@ def test_random_actions_break_nothing(impl: str) -> None:
     def advance(state: Any, key: jax.Array) -> tuple[Any, Any]:
         action = jax.random.uniform(key, (worlds, 2, 12), minval=-1.0, maxval=1.0)
         state = vector.step(state, action)
-        position = state.data.qpos[:, env.robot.base_qpos[:, :3]]
+        position = state.data.qpos[:, env.index.base_qpos[:, :3]]
         overflow = jnp.any(jax.vmap(vector.env.physics.overflow)(state.data))
         return state, (position, state.metrics["diverged"], jnp.all(jnp.isfinite(state.obs)), overflow)
 
@@ -121,7 +121,7 @@ def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
     """Two robots that overlap touch each other; a robot lying on its belly feels the ground."""
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
     state = env.reset(jax.random.PRNGKey(0))
-    index = env.robot
+    index = env.index
     near = state.data.qpos.at[index.base_qpos[0, :3]].set(jnp.array([1.0, 0.0, 0.30]))
     near = near.at[index.base_qpos[1, :3]].set(jnp.array([1.0, 0.10, 0.30]))
     low = state.data.qpos.at[index.base_qpos[0, 2]].set(0.05)

@@ -53,7 +53,7 @@ def angle(env: Any, state: State) -> float:
 def test_the_scene_is_as_listed(env: Any) -> None:
     model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
-    start = np.asarray(states.data.qpos)[:, env.robot.base_qpos[:, :3]]
+    start = np.asarray(states.data.qpos)[:, env.index.base_qpos[:, :3]]
     assert np.abs(start - [[1.0, -0.75, 0.42], [1.0, 0.75, 0.42]]).max((0, 1)) == pytest.approx([0.1, 0.1, 0], abs=0.02)
     assert env.params.gait == "pace" and env.params.episode_length == 10
     assert env.compiled.layout.anchors == () and env._scene.track.length == 10 and env._scene.track.width == 3
@@ -147,7 +147,7 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
     low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
-    qpos = low.data.qpos.at[env.robot.joint_qpos[0, 1::3]].set(np.pi)
+    qpos = low.data.qpos.at[env.index.joint_qpos[0, 1::3]].set(np.pi)
     low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still)
     assert low.terminated and float(low.metrics["collision"]) == 0 and float(low.metrics["reward/fall"]) == 0
 

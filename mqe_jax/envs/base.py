@@ -122,17 +122,17 @@ class QuadrupedEnv:
             torque_robots=torque_robots, max_contacts=self.params.contacts_per_robot * scene.num_robots,
         )  # fmt: skip
         self.compiled = compile_scene(self._scene)
-        self.robot, self.objects = self.compiled.robot, self.compiled.objects
+        self.index, self.objects = self.compiled.index, self.compiled.objects
         self.physics = Physics(
             self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self._scene.max_contacts,
             max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots,
         )  # fmt: skip
         self.impl = self.physics.impl
-        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.robot, self.params.friction)
-        self.privileged = PrivilegedObservation(self.compiled.model, self.robot, len(self.compiled.layout.anchors))
+        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
+        self.privileged = PrivilegedObservation(self.compiled.model, self.index, len(self.compiled.layout.anchors))
         walks = control == "command" or self._scene.num_robots > self.num_agents
         self.controller = Controller(
-            mode=control, physics=self.physics, index=self.robot, num_agents=self.num_agents,
+            mode=control, physics=self.physics, index=self.index, num_agents=self.num_agents,
             walk_params=walk_policy.load_params(self.params.walk_policy) if walks else None,
             actuator_params=load_actuator_network(network) if network else None, commands=self.params.commands,
             default_commands=walk_policy.default_commands(self.params.gait), lag=self.params.randomization.action_lag,
@@ -274,7 +274,7 @@ class QuadrupedEnv:
         gates = self._sample_anchors(anchor_key)
         qpos, qvel = self._sample_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel)
-        ctrl = jnp.zeros(self.compiled.model.nu).at[self.robot.actuator].set(self.controller.neutral)
+        ctrl = jnp.zeros(self.compiled.model.nu).at[self.index.actuator].set(self.controller.neutral)
         data = self.physics.init(qpos, qvel, self._mocap(gates), ctrl)
         robot_state = self.read(data)
         no = jnp.zeros((), bool)
@@ -345,7 +345,7 @@ class QuadrupedEnv:
 
     def read(self, data: mjx.Data) -> RobotState:
         """Reads all robots of one world."""
-        return robots.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
+        return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
         """Returns the coordinates of an object by name, as its class gives them."""
@@ -376,7 +376,7 @@ class QuadrupedEnv:
         return self.compiled.wall_positions(gates)
 
     def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        params, model, index = self.params, self.compiled.model, self.robot
+        params, model, index = self.params, self.compiled.model, self.index
         pose = self.spawn(spawn_key)
         joint_key, velocity_key = jax.random.split(body_key)
         low, high = params.spawn_joint_scale
@@ -409,7 +409,7 @@ class QuadrupedEnv:
 
     def _diverged(self, data: mjx.Data) -> jax.Array:
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        position = data.qpos[self.robot.base_qpos[:, :3]]
+        position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
 
     def _observed(self, state: State, robot_state: RobotState, key: jax.Array) -> State:

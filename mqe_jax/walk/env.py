@@ -163,7 +163,7 @@ class WalkEnv:
         self.physics = Physics(
             self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, max_constraints_per_env=44
         )
-        self.index = self.compiled.robot
+        self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)
 
     @property
