@@ -22,7 +22,7 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax import walk_policy
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
 from mqe_jax.physics import Physics
 from mqe_jax.robots import go1
 from mqe_jax.robots.index import RobotIndex
@@ -48,7 +48,7 @@ COMMAND_RANGES = {
 def check_mode(mode: str) -> str:
     """Returns the mode, or raises a ValueError that names the allowed ones."""
     if mode not in MODES:
-        raise ValueError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
+        raise InputError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
     return mode
 
 
@@ -57,9 +57,9 @@ def check_commands(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name not in COMMAND_RANGES:
             allowed = ", ".join(COMMAND_RANGES)
-            raise ValueError(f"commands: unknown command {name!r}{nearest(name, COMMAND_RANGES)}; allowed: {allowed}")
+            raise InputError(f"commands: unknown command {name!r}{nearest(name, COMMAND_RANGES)}; allowed: {allowed}")
     if not names or len(set(names)) != len(names):
-        raise ValueError(f"commands: {tuple(names)} must name at least one command, none twice")
+        raise InputError(f"commands: {tuple(names)} must name at least one command, none twice")
     return tuple(names)
 
 

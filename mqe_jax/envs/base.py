@@ -217,9 +217,7 @@ class QuadrupedEnv:
         """Returns the observation's blocks by name (A, width)."""
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
 
-    def rewards(
-        self, state: State, robot_state: RobotState, collision: jax.Array
-    ) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         """Returns the unweighted reward terms, () or (A,), and the task's own fields after the step.
 
         Args:
