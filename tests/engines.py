@@ -18,7 +18,7 @@ import numpy as np
 
 from mqe_jax.envs import TASKS, State, VectorEnv, make
 from mqe_jax.physics import STATE_FIELDS
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import PLANNERS, scripted_policy
 
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
@@ -52,7 +52,7 @@ def played(task: str, worlds: int) -> dict[str, np.ndarray]:
     Of each world's first `PLAY` steps the one is taken in which objects move fastest and robots touch most.
     """
     env: Any = make(task, impl="c", num_envs=worlds)
-    worlds_env, plan = VectorEnv(env, worlds), jax.vmap(PLANNERS.get(task, ahead))
+    worlds_env, plan = VectorEnv(env, worlds), jax.vmap(scripted_policy(env) if task in PLANNERS else ahead)
     robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 

@@ -14,7 +14,7 @@ import pytest
 from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import scripted_policy
 from mqe_jax.walk_policy import default_commands
 from tests.states import observation, placed, still, with_object
 
@@ -363,7 +363,7 @@ def test_wrong_numbers_of_robots_are_named() -> None:
 def test_the_planner_dribbles_to_the_goal() -> None:
     """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --planner scripted` measures many."""
     worlds = make("go1football-1vs1", impl="c", num_envs=4)
-    plan = jax.vmap(PLANNERS[worlds.name])
+    plan = jax.vmap(scripted_policy(worlds))
 
     def step(state: State, _: None) -> tuple[State, jax.Array]:
         state = jax.vmap(worlds.step)(state, plan(state.obs).at[:, 1].set(0.0))

@@ -16,7 +16,7 @@ from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import flock
 from mqe_jax.objects import Ball, Box, Sheep
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import scripted_policy
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import SpawnArea, Plane, Track
 from tests.states import with_object
@@ -210,7 +210,7 @@ def test_the_planner_wins(task: str, share: float) -> None:
     from mqe_jax.train.evaluate import evaluate
 
     worlds = VectorEnv(make(task, impl="c", num_envs=16), 16)
-    plan = jax.vmap(PLANNERS[task])
+    plan = jax.vmap(scripted_policy(worlds.env))
     result = evaluate(worlds, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
     assert result.to_dict()["success_rate"] >= share
 
