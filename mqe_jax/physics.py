@@ -128,10 +128,15 @@ class Physics:
         """
         as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
         return self._template.replace(
-            qpos=as_float(qpos), qvel=as_float(qvel), mocap_pos=as_float(mocap_pos), ctrl=as_float(ctrl),
-            qacc_warmstart=jnp.zeros(self.model.nv), xfrc_applied=jnp.zeros((self.model.nbody, 6)),
-            sensordata=jnp.zeros(self.model.nsensordata), time=jnp.zeros(()),
-        )  # fmt: skip
+            qpos=as_float(qpos),
+            qvel=as_float(qvel),
+            mocap_pos=as_float(mocap_pos),
+            ctrl=as_float(ctrl),
+            qacc_warmstart=jnp.zeros(self.model.nv),
+            xfrc_applied=jnp.zeros((self.model.nbody, 6)),
+            sensordata=jnp.zeros(self.model.nsensordata),
+            time=jnp.zeros(()),
+        )
 
     def step(
         self,
@@ -212,14 +217,25 @@ class _CEngine:
             return self._call(names, forced, substeps, qpos, *rest)
 
         row = jax.pure_callback(
-            call, out, data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, *mocap, *forces,
-            *(fields[name] for name in names), vmap_method="broadcast_all",
-        )  # fmt: skip
+            call,
+            out,
+            data.qpos,
+            data.qvel,
+            data.qacc_warmstart,
+            data.ctrl,
+            *mocap,
+            *forces,
+            *(fields[name] for name in names),
+            vmap_method="broadcast_all",
+        )
         qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
         return data.replace(
-            qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, sensordata=sensordata,
+            qpos=qpos,
+            qvel=qvel,
+            qacc_warmstart=warmstart,
+            sensordata=sensordata,
             time=data.time + substeps * self._model.opt.timestep,
-        )  # fmt: skip
+        )
 
     def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
         qpos, *rest = (np.asarray(array) for array in arrays)

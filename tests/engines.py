@@ -142,9 +142,12 @@ def crowd(task: str, worlds: int = 4096, steps: int = 1000) -> dict[str, Any]:
     state = jax.jit(worlds_env.reset)(jax.random.PRNGKey(0))
     overflow, diverged, finite = run(state, jax.random.split(jax.random.PRNGKey(1), steps))[1]
     return {
-        "worlds": worlds, "steps": steps, "overflows": int(np.sum(np.asarray(overflow))),
-        "diverged": int(np.sum(np.asarray(diverged))), "finite": bool(np.all(np.asarray(finite))),
-    }  # fmt: skip
+        "worlds": worlds,
+        "steps": steps,
+        "overflows": int(np.sum(np.asarray(overflow))),
+        "diverged": int(np.sum(np.asarray(diverged))),
+        "finite": bool(np.all(np.asarray(finite))),
+    }
 
 
 def main(what: str, folder: str, engine: str, *tasks: str) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
-from mqe_jax.robots import go1
+from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 
@@ -28,7 +28,7 @@ def placed(
     index, position = env.index, jnp.asarray(position, jnp.float32)
     turn = euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
     qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))
-    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
+    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(env.robot.default_joints))
     for name, coordinates in (objects or {}).items():
         qpos = qpos.at[env.objects[name].qpos].set(jnp.asarray(coordinates, jnp.float32))
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
@@ -41,7 +41,7 @@ def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0
 
 def robot_state(position: Any, **euler: Any) -> RobotState:
     """What is read off two robots at positions (2, 3), m, which stand still with the default joints; see `angles`."""
-    joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
+    joints = jnp.tile(jnp.asarray(GO1.default_joints, jnp.float32), (2, 1))
     none = jnp.zeros((2, 3))
     return RobotState(
         jnp.asarray(position), euler_to_quaternion(angles(**euler)), none, none, joints, jnp.zeros((2, 12)),

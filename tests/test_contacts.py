@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import TASKS, make
-from mqe_jax.robots import go1
 
 # What a crowd stands around or upon, and how far from its middle, m.
 REACH = {
-    "box": 0.7, "ball": 0.3, "sheep4": 0.3, "sheep0": 0.3, "cylinder": 1.35, "door": 0.35, "seesaw": 0.3,
-    "platform0": 0.3, "platform": 0.3,
-}  # fmt: skip
+    "box": 0.7,
+    "ball": 0.3,
+    "sheep4": 0.3,
+    "sheep0": 0.3,
+    "cylinder": 1.35,
+    "door": 0.35,
+    "seesaw": 0.3,
+    "platform0": 0.3,
+    "platform": 0.3,
+}
 
 
 @pytest.mark.parametrize("task", list(TASKS))
@@ -46,7 +52,7 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     data.qpos[index.base_qpos[:, 2]] = place[2]
     contacts, rows, touched = [], [], 0
     for _ in range(100):
-        data.ctrl[index.actuator] = go1.DEFAULT_JOINTS + 0.4 * random.standard_normal((robots, 12))
+        data.ctrl[index.actuator] = env.robot.default_joints + 0.4 * random.standard_normal((robots, 12))
         mujoco.mj_step(model, data, 4)
         contacts.append(data.ncon)
         rows.append(data.nefc)

@@ -15,7 +15,6 @@ from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import scripted_policy
-from mqe_jax.walk_policy import default_commands
 from tests.states import observation, placed, still, with_object
 
 NO = jnp.array(False)
@@ -331,7 +330,7 @@ def test_an_idle_defender_is_told_to_stand(attack: Any, fresh: Any) -> None:
     state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
     idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
     robots = attack.read(state.data)
-    rest = default_commands()
+    rest = idle.controller.default_commands
     np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
     told = np.asarray(attack.npc_commands(state, robots))[0]
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.

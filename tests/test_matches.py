@@ -15,7 +15,7 @@ from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.objects import Cylinder, Door
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import SpawnArea, Plane, Track
+from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import observation, placed, still, terms_of
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]

@@ -18,7 +18,7 @@ from mqe_jax.npc import flock
 from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import scripted_policy
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import SpawnArea, Plane, Track
+from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import with_object
 
 STEP = 0.02

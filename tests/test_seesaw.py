@@ -18,7 +18,7 @@ from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import SpawnArea, Plane, Track
+from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import angles, placed, robot_state
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]

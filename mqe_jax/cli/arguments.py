@@ -74,6 +74,13 @@ Control = Annotated[
         "Default: command, or what the run was trained with.",
     ),
 ]
+Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
+TaskRobot = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or what the run was trained with."
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -126,6 +133,7 @@ class Train:
     """Go on from the newest checkpoint in the run folder, as if never stopped."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     set: Set = field(default_factory=list)
 
     def settings(self) -> dict[str, str]:
@@ -151,6 +159,7 @@ class Eval:
     """Worlds stepped together."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     seed: Seed = 0
     deterministic: bool = False
     """Act with the policy's mean instead of drawing from it."""
@@ -192,6 +201,7 @@ class Render:
     """Frames per second. Default: 25 for .mp4, 12.5 for .gif."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     seed: Seed = 0
     sample: bool = False
     """Draw actions from the policy instead of taking its mean."""
@@ -216,6 +226,7 @@ class Bench:
     """Timed calls, of which the median counts."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     seed: Seed = 0
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Append the figures as a row to this file."""
@@ -256,6 +267,7 @@ class WalkTrain:
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Stop after so long, with everything saved, s."""
     impl: Impl = "auto"
+    robot: Robot = "go1"
     seed: Seed = 1
 
     def run(self) -> dict[str, Any] | None:
@@ -274,6 +286,7 @@ class WalkEval:
     scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
     """Scenario to measure, such as flat, kicks or slope_up; may be repeated. Default: all."""
     impl: Impl = "auto"
+    robot: Robot = "go1"
     seed: Seed = 0
 
     def run(self) -> dict[str, Any] | None:

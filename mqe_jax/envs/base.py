@@ -30,7 +30,6 @@ from mqe_jax.envs.randomization import RandomizedParams, Randomizer
 from mqe_jax.envs.reward import weigh
 from mqe_jax.errors import InputError
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, build_model, compile_scene
@@ -94,6 +93,7 @@ class QuadrupedEnv:
         impl: physics engine: 'jax', 'warp' or 'c'.
         control: action mode: 'command', 'position' or 'torque'.
         num_agents: number of controlled robots A.
+        robot: all robots of the task.
         dt: environment step, s: the physics step times the substeps.
         compiled: the compiled scene.
         index: index tables of the robots.
@@ -122,12 +122,14 @@ class QuadrupedEnv:
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs} must be at least 1")
         self.num_agents = self.params.num_agents
+        self.robot = robots.get(self.params.robot)
         scene = self.scene()
         network = self.params.actuator_network if control != "torque" else None
         # NPC robots follow joint targets in every mode.
         torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
         self._scene = dataclasses.replace(
             scene,
+            robot=self.robot,
             friction=self.params.friction,
             solver_iterations=self.params.solver_iterations,
             torque_robots=torque_robots,
@@ -153,6 +155,7 @@ class QuadrupedEnv:
             )
         self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
         self.privileged = PrivilegedObservation(
+            self.robot,
             self.compiled.model,
             self.index,
             num_anchors=len(self.compiled.layout.anchors),
@@ -161,13 +164,14 @@ class QuadrupedEnv:
         )
         self.controller = Controller(
             mode=control,
+            robot=self.robot,
             physics=self.physics,
             index=self.index,
             num_agents=self.num_agents,
-            walk_params=walk_policy.load_params(self.params.walk_policy) if walks else None,
+            walk_params=walk_policy.load_params(self.robot, self.params.walk_policy) if walks else None,
             actuator_params=load_actuator_network(network) if network else None,
             commands=self.params.commands,
-            default_commands=walk_policy.default_commands(self.params.gait),
+            default_commands=walk_policy.default_commands(self.robot, self.params.gait),
             lag=self.params.randomization.action_lag,
         )
 
@@ -430,8 +434,8 @@ class QuadrupedEnv:
         pose = self.spawn(spawn_key)
         joint_key, velocity_key = jax.random.split(body_key)
         low, high = params.spawn_joint_scale
-        joints = go1.DEFAULT_JOINTS * jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
-        joints = jnp.clip(joints, go1.JOINT_LOWER, go1.JOINT_UPPER)
+        factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
+        joints = jnp.clip(self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper)
         speed = params.spawn_velocity
         velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
         level = jnp.zeros(len(pose))

@@ -63,7 +63,7 @@ class BridgeParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.top)
+        check_above(self.spawn_height, self.top, self.robot)
         first, second = self.platform_x
         if second - first <= self.platform[0]:
             fail("platform_x", self.platform_x, f"more than a platform's length, {self.platform[0]}, apart")

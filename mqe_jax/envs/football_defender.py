@@ -17,7 +17,7 @@ from mqe_jax.envs.params import TaskParams
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
 from mqe_jax.settings import record
-from mqe_jax.walk_policy import command_index, default_commands
+from mqe_jax.walk_policy import command_index
 
 
 @record
@@ -78,7 +78,7 @@ class Go1FootballDefender(Football):
 
     def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array:
         """Walk commands of the defender (1, 15)."""
-        commands = jnp.asarray(default_commands(self.params.gait))
+        commands = jnp.asarray(self.controller.default_commands)
         if not self.params.defender_idle:
             move = defend(
                 robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])

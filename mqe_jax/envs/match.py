@@ -17,8 +17,8 @@ import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.robots.go1 import NUM_JOINTS
 from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import NUM_JOINTS
 
 # Sign of a command under reflection.
 _MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}

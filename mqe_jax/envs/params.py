@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from mqe_jax import robots
 from mqe_jax.control import check_commands
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, Range, fail, record
-
-CLEARANCE = 0.3  # m, from the ground to the trunk of a standing robot
 
 
 @record
@@ -16,6 +15,7 @@ class TaskParams:
 
     Attributes:
         num_agents: number of controlled robots.
+        robot: name of the robot, such as go1 or go2 (`mqe_jax.robots`).
         episode_length: time limit, s.
         spawn_height: of the trunks, m.
         spawn_noise: half-width of the uniform noise on the spawn position in x and y, m.
@@ -45,6 +45,7 @@ class TaskParams:
     """
 
     num_agents: PositiveInt = 2
+    robot: str = "go1"
     episode_length: Positive = 10.0
     spawn_height: Positive = 0.42
     spawn_noise: NonNegative = 0.1
@@ -70,17 +71,18 @@ class TaskParams:
 
     def __post_init__(self) -> None:
         check_commands(self.commands)
+        robots.get(self.robot)
         if self.min_height >= self.max_height:
             fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
 
 
-def check_above(spawn_height: float, top: float) -> None:
-    """Checks that the spawn height clears the supporting surface at height `top` (m).
+def check_above(spawn_height: float, top: float, robot: str) -> None:
+    """Checks that the spawn height clears the supporting surface at height `top` (m) for a standing robot.
 
     Raises:
         InputError: if it does not.
     """
-    least = top + CLEARANCE
+    least = top + robots.get(robot).stand_height
     if spawn_height < least:
         raise InputError(f"spawn_height: {spawn_height} must be at least {least:.2f}, as the ground is at {top}")
 

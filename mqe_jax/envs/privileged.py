@@ -10,8 +10,8 @@ from mujoco import mjx
 
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.randomization import RandomizedParams
-from mqe_jax.robots import go1
 from mqe_jax.robots.index import RobotIndex, RobotState
+from mqe_jax.robots.robot import Robot
 from mqe_jax.walk_policy import WalkMemory
 
 _ROBOT = (
@@ -31,6 +31,7 @@ class PrivilegedObservation:
     ranges.
 
     Args:
+        robot: all robots of the task.
         model: the compiled model.
         index: its robots.
         num_anchors: G.
@@ -42,9 +43,17 @@ class PrivilegedObservation:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, index: RobotIndex, *, num_anchors: int, gait: bool, contact_forces: bool
+        self,
+        robot: Robot,
+        model: mujoco.MjModel,
+        index: RobotIndex,
+        *,
+        num_anchors: int,
+        gait: bool,
+        contact_forces: bool,
     ) -> None:
         count = index.num_robots
+        self._default_joints = robot.default_joints
         self._foot_force = index.foot_force if contact_forces else None
         self._qpos = np.setdiff1d(np.arange(model.nq), np.concatenate([index.base_qpos, index.joint_qpos], axis=1))
         self._qvel = np.setdiff1d(np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1))
@@ -86,7 +95,7 @@ class PrivilegedObservation:
                 robot_state.quaternion,
                 robot_state.linear_velocity_w,
                 robot_state.angular_velocity_b,
-                robot_state.joint_position - go1.DEFAULT_JOINTS,
+                robot_state.joint_position - self._default_joints,
                 robot_state.joint_velocity,
             ],
             axis=-1,

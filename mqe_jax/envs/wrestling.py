@@ -60,7 +60,7 @@ class WrestlingParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.platform_top)
+        check_above(self.spawn_height, self.platform_top, self.robot)
 
 
 class Go1Wrestling(Duel):

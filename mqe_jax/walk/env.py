@@ -19,9 +19,9 @@ from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -40,7 +40,6 @@ class WalkTask:
         rewards: weights.
         episode_length: time limit, s.
         command_period: a new command, slope and force are drawn this often, s; 0 keeps the first.
-        body_height: of the trunk's origin at zero height command, m.
         max_vx, max_vy, max_yaw: ranges of the velocity commands, m/s, m/s, rad/s.
         slope: greatest slope, rad.
         force: greatest sustained horizontal force on the trunk, N.
@@ -53,7 +52,6 @@ class WalkTask:
     rewards: WalkRewards = WalkRewards()
     episode_length: float = 20.0
     command_period: float = 8.0
-    body_height: float = 0.30
     max_vx: float = 1.2
     max_vy: float = 0.7
     max_yaw: float = 1.2
@@ -150,15 +148,19 @@ class WalkState:
 
 
 class WalkEnv:
-    """One Go1 that follows commands on a slope under forces; batch with `jax.vmap`."""
+    """One robot that follows commands on a slope under forces; batch with `jax.vmap`."""
 
-    def __init__(self, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
+    def __init__(self, robot: Robot, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
+        self.robot = robot
         self.task = task or WalkTask()
         scene = Scene(
-            Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1,
-            contacts=Contacts(ground=("trunk", "foot"), wall=(), robot=(), object=()), foot_sensors=True,
+            Track(blocks=(Plane(4.0),), walled=False, num_robots=1),
+            num_robots=1,
+            robot=robot,
+            contacts=Contacts(ground=("trunk", "foot"), wall=(), robot=(), object=()),
+            foot_sensors=True,
             solver_iterations=self.task.solver_iterations,
-        )  # fmt: skip
+        )
         self.compiled = compile_scene(scene)
         self.physics = Physics(
             self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, max_constraints_per_env=44
@@ -192,12 +194,20 @@ class WalkEnv:
         gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.64, 0.28, 0.04, 0.04])))]
         varied = chance(0.35)
         vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
-        default = walk_policy.COMMAND_DEFAULT
+        default = walk_policy.default_commands(self.robot)
+        width, length = self.robot.walk.stance_width, self.robot.walk.stance_length
         rest = [
-            vary(-0.12, 0.06, default[3]), vary(2.0, 4.0, default[4]), *gait, default[8], vary(0.03, 0.16, default[9]),
-            vary(-0.25, 0.25, default[10]), vary(-0.1, 0.1, default[11]), vary(0.2, 0.35, default[12]),
-            vary(0.36, 0.44, default[13]), default[14],
-        ]  # fmt: skip
+            vary(-0.12, 0.06, default[3]),
+            vary(2.0, 4.0, default[4]),
+            *gait,
+            default[8],
+            vary(0.03, 0.16, default[9]),
+            vary(-0.25, 0.25, default[10]),
+            vary(-0.1, 0.1, default[11]),
+            vary(width - 0.05, width + 0.1, default[12]),
+            vary(length - 0.068, length + 0.012, default[13]),
+            default[14],
+        ]
         angle = uniform(-jnp.pi, jnp.pi)
         slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * level
         direction = uniform(-jnp.pi, jnp.pi)
@@ -213,14 +223,14 @@ class WalkEnv:
         """Draws one world's robot: the model's own, or a randomised one."""
         if not self.task.randomize:
             one, zero = jnp.ones(()), jnp.zeros(())
-            return Body(one, zero, jnp.zeros(3), one, jnp.zeros(go1.NUM_JOINTS))
+            return Body(one, zero, jnp.zeros(3), one, jnp.zeros(NUM_JOINTS))
         f, p, c, s, o = jax.random.split(key, 5)
         return Body(
             friction=jax.random.uniform(f, (), minval=0.35, maxval=1.8),
             payload=jax.random.uniform(p, (), minval=-1.0, maxval=2.5),
             com=jax.random.uniform(c, (3,), minval=-1.0, maxval=1.0) * jnp.array([0.03, 0.02, 0.02]),
             strength=jax.random.uniform(s, (), minval=0.9, maxval=1.1),
-            motor_offset=jax.random.uniform(o, (go1.NUM_JOINTS,), minval=-0.02, maxval=0.02),
+            motor_offset=jax.random.uniform(o, (NUM_JOINTS,), minval=-0.02, maxval=0.02),
         )
 
     # -- reset and step -----------------------------------------------------------------------------------------
@@ -243,25 +253,38 @@ class WalkEnv:
         yaw = jax.random.uniform(a, (), minval=-jnp.pi, maxval=jnp.pi)
         # A given condition is a measurement: start along +x so that slopes and headings mean what they say.
         yaw = jnp.where(self.task.command_period > 0, yaw, 0.0)
-        joints = go1.DEFAULT_JOINTS * jax.random.uniform(b, (go1.NUM_JOINTS,), minval=0.7, maxval=1.3)
-        height = jax.random.uniform(c, (), minval=0.33, maxval=0.42)
+        joints = self.robot.default_joints * jax.random.uniform(b, (NUM_JOINTS,), minval=0.7, maxval=1.3)
+        stand = self.robot.stand_height
+        height = jax.random.uniform(c, (), minval=stand + 0.03, maxval=stand + 0.12)
         quaternion = euler_to_quaternion(jnp.stack([jnp.zeros(()), jnp.zeros(()), yaw]))
         qpos = jnp.zeros(model.nq).at[index.joint_qpos[0]].set(joints)
         qpos = qpos.at[index.base_qpos[0]].set(jnp.concatenate([jnp.stack([0.0, 0.0, height]), quaternion]))
         speed = jax.random.uniform(d, (6,), minval=-0.5, maxval=0.5)
         qvel = jnp.zeros(model.nv).at[index.base_qvel[0]].set(speed)
-        ctrl = jnp.zeros(model.nu).at[index.actuator[0]].set(go1.DEFAULT_JOINTS)
+        ctrl = jnp.zeros(model.nu).at[index.actuator[0]].set(self.robot.default_joints)
         data = self.physics.init(qpos, qvel, jnp.zeros((0, 3)), ctrl)
-        zero, zeros = jnp.zeros(()), jnp.zeros(go1.NUM_JOINTS)
+        zero, zeros = jnp.zeros(()), jnp.zeros(NUM_JOINTS)
         memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), zeros, zeros, zero)
         state = WalkState(
-            data=data, obs=jnp.zeros(walk_policy.OBSERVATION_SIZE), privileged_obs=zero, reward=zero,
+            data=data,
+            obs=jnp.zeros(walk_policy.OBSERVATION_SIZE),
+            privileged_obs=zero,
+            reward=zero,
             latent_target=jnp.stack([body.friction - 1.0, body.payload / 2.0]),
-            terminated=jnp.zeros((), bool), truncated=jnp.zeros((), bool), metrics=_zero_metrics(self.task.rewards),
-            condition=condition, slope=condition.slope, force=condition.force, body=body, memory=memory,
-            mean_error=jnp.zeros(3), step=jnp.asarray(step, jnp.int32), age=jnp.zeros((), jnp.int32), level=level,
+            terminated=jnp.zeros((), bool),
+            truncated=jnp.zeros((), bool),
+            metrics=_zero_metrics(self.task.rewards),
+            condition=condition,
+            slope=condition.slope,
+            force=condition.force,
+            body=body,
+            memory=memory,
+            mean_error=jnp.zeros(3),
+            step=jnp.asarray(step, jnp.int32),
+            age=jnp.zeros((), jnp.int32),
+            level=level,
             key=next_key,
-        )  # fmt: skip
+        )
         return self._observed(state, noise_key)
 
     def step(self, state: WalkState, action: jax.Array) -> WalkState:
@@ -269,9 +292,9 @@ class WalkEnv:
         task, index = self.task, self.index
         key, kick_key, kick_time, kick_size, condition_key, noise_key = jax.random.split(state.key, 6)
         action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
-        target = walk_policy.joint_targets(action)
-        previous_target = walk_policy.joint_targets(state.memory.action)
-        before_target = walk_policy.joint_targets(state.memory.previous_action)
+        target = walk_policy.joint_targets(self.robot, action)
+        previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
+        before_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
 
         # Forces follow their condition within about half a second.
         slope = state.slope + jnp.clip(state.condition.slope - state.slope, -0.02, 0.02)
@@ -302,20 +325,31 @@ class WalkEnv:
         memory = WalkMemory(state.memory.history, action, state.memory.action, gait)
 
         inputs = RewardInputs(
-            robot_state=robot_state, commands=commands, error=error, mean_error=mean_error, gait=gait, target=target,
-            previous_target=previous_target, before_target=before_target, body_height=task.body_height,
-            foot_force=self.foot_force(data), strength=state.body.strength,
-        )  # fmt: skip
+            robot=self.robot,
+            robot_state=robot_state,
+            commands=commands,
+            error=error,
+            mean_error=mean_error,
+            gait=gait,
+            target=target,
+            previous_target=previous_target,
+            before_target=before_target,
+            foot_force=self.foot_force(data),
+            strength=state.body.strength,
+        )
         terms = reward_terms(inputs)
         reward, weighted = combine(terms, task.rewards)
 
         up = rotate_inverse(robot_state.quaternion, jnp.array([0.0, 0.0, 1.0]))[0]
+        low = robot_state.position_w[0, 2] < self.robot.walk.min_trunk_height
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        fallen = (robot_state.trunk_force[0] > 1.0) | (up[2] < 0.5) | (robot_state.position_w[0, 2] < 0.1) | ~finite
+        fallen = (robot_state.trunk_force[0] > 1.0) | (up[2] < 0.5) | low | ~finite
         step, age = state.step + 1, state.age + 1
         metrics = {f"reward/{name}": value for name, value in weighted.items()} | {
-            "error_vx": jnp.square(error[0]), "error_vy": jnp.square(error[1]), "error_yaw": jnp.square(error[2]),
-        }  # fmt: skip
+            "error_vx": jnp.square(error[0]),
+            "error_vy": jnp.square(error[1]),
+            "error_yaw": jnp.square(error[2]),
+        }
         condition = state.condition
         if task.command_period > 0:
             renewed = step % round(task.command_period / DT) == 0
@@ -323,10 +357,21 @@ class WalkEnv:
             condition = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, condition)
             mean_error = jnp.where(renewed, 0.0, mean_error)
         state = dataclasses.replace(
-            state, data=data, reward=jnp.where(finite, reward, 0.0), terminated=fallen,
-            truncated=~fallen & (step >= round(task.episode_length / DT)), metrics=metrics, condition=condition,
-            slope=slope, force=force, memory=memory, mean_error=mean_error, step=step, age=age, key=key,
-        )  # fmt: skip
+            state,
+            data=data,
+            reward=jnp.where(finite, reward, 0.0),
+            terminated=fallen,
+            truncated=~fallen & (step >= round(task.episode_length / DT)),
+            metrics=metrics,
+            condition=condition,
+            slope=slope,
+            force=force,
+            memory=memory,
+            mean_error=mean_error,
+            step=step,
+            age=age,
+            key=key,
+        )
         return self._observed(state, noise_key)
 
     # -- robot state --------------------------------------------------------------------------------------------
@@ -350,9 +395,12 @@ class WalkEnv:
         gain = jnp.asarray(model.actuator_gainprm, jnp.float32) * body.strength
         bias = jnp.asarray(model.actuator_biasprm, jnp.float32) * body.strength
         return {
-            "geom_friction": friction, "body_mass": mass, "body_ipos": com, "actuator_gainprm": gain,
+            "geom_friction": friction,
+            "body_mass": mass,
+            "body_ipos": com,
+            "actuator_gainprm": gain,
             "actuator_biasprm": bias,
-        }  # fmt: skip
+        }
 
     def _forces(self, data: mjx.Data, body: Body, slope: jax.Array, force: jax.Array) -> jax.Array:
         """External forces on all bodies (nbody, 6): gravity's turn by the slope, and the force on the trunk."""
@@ -371,29 +419,43 @@ class WalkEnv:
         quaternion = robot_state.quaternion[0]
         gravity = rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
         joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
-        clean = walk_policy.observe(state.memory, state.condition.commands, gravity, joint_position, joint_velocity)
+        clean = walk_policy.observe(
+            self.robot, state.memory, state.condition.commands, gravity, joint_position, joint_velocity
+        )
         obs = clean
         if self.task.randomize:
             a, b, c = jax.random.split(key, 3)
             obs = walk_policy.observe(
-                state.memory, state.condition.commands,
+                self.robot,
+                state.memory,
+                state.condition.commands,
                 gravity + 0.02 * jax.random.normal(a, (3,)),
-                joint_position + 0.005 * jax.random.normal(b, (go1.NUM_JOINTS,)),
-                joint_velocity + 0.5 * jax.random.normal(c, (go1.NUM_JOINTS,)),
-            )  # fmt: skip
+                joint_position + 0.005 * jax.random.normal(b, (NUM_JOINTS,)),
+                joint_velocity + 0.5 * jax.random.normal(c, (NUM_JOINTS,)),
+            )
         velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
-        feet = robots.foot_positions(joint_position)
+        feet = robots.foot_positions(self.robot, joint_position)
         foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
         phases = walk_policy.foot_phases(state.memory.gait, state.condition.commands)
         body = state.body
-        privileged = jnp.concatenate([
-            clean, 2.0 * velocity, 0.25 * robot_state.angular_velocity_b[0], up,
-            5.0 * robot_state.position_w[0, 2:] - 1.5, 10.0 * foot_height, jnp.cos(2 * jnp.pi * phases),
-            jnp.tanh(self.foot_force(state.data) / 50.0), 2.0 * state.mean_error, state.force / 20.0,
-            state.slope * 4.0, body.com * 20.0,
-            jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
-        ])  # fmt: skip
+        privileged = jnp.concatenate(
+            [
+                clean,
+                2.0 * velocity,
+                0.25 * robot_state.angular_velocity_b[0],
+                up,
+                5.0 * robot_state.position_w[0, 2:] - 5.0 * self.robot.stand_height,
+                10.0 * foot_height,
+                jnp.cos(2 * jnp.pi * phases),
+                jnp.tanh(self.foot_force(state.data) / 50.0),
+                2.0 * state.mean_error,
+                state.force / 20.0,
+                state.slope * 4.0,
+                body.com * 20.0,
+                jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
+            ]
+        )
         obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))
         privileged = jnp.nan_to_num(jnp.clip(privileged, -100.0, 100.0))
         return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
@@ -404,9 +466,7 @@ class WalkEnv:
         key, reset_key = jax.random.split(state.key)
         fresh = self.reset(reset_key, None, state.level)
         data = self.physics.merge(done, fresh.data, state.data)
-        keep = {
-            name: getattr(state, name) for name in ("reward", "terminated", "truncated", "metrics", "level")
-        }  # fmt: skip
+        keep = {name: getattr(state, name) for name in ("reward", "terminated", "truncated", "metrics", "level")}
         others = [field.name for field in dataclasses.fields(state) if field.name not in ("data", "key", *keep)]
         pick = lambda new, old: jnp.where(done, new, old)  # noqa: E731
         merged = {name: jax.tree.map(pick, getattr(fresh, name), getattr(state, name)) for name in others}

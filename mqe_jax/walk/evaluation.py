@@ -12,6 +12,7 @@ import numpy as np
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.errors import nearest
+from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
 from mqe_jax.walk.env import Condition, WalkEnv, WalkTask
 
@@ -58,24 +59,26 @@ SCENARIOS = {
 }
 
 
-def make_env(impl: str, episodes: int) -> WalkEnv:
+def make_env(robot: Robot, impl: str, episodes: int) -> WalkEnv:
     """Makes the walking environment as it is for measuring: nothing randomised, commands kept."""
     task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
-    return WalkEnv(task, impl=impl, num_envs=episodes)
+    return WalkEnv(robot, task, impl=impl, num_envs=episodes)
 
 
-def conditions(scenario: Scenario, key: jax.Array, episodes: int) -> Condition:
+def conditions(robot: Robot, scenario: Scenario, key: jax.Array, episodes: int) -> Condition:
     """Draws what every episode asks; leading axis `episodes`."""
     span = jnp.array([1.0, 0.6, 1.0])
     velocity = jax.random.uniform(key, (episodes, 3), minval=-span, maxval=span)
     if scenario.velocity is not None:
         velocity = jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
-    rest = walk_policy.default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
+    rest = walk_policy.default_commands(robot, scenario.gait, gait_frequency=scenario.frequency)[3:]
     full = lambda values: jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))  # noqa: E731
     return Condition(
         commands=jnp.concatenate([velocity, full(rest)], axis=1),
-        slope=full((scenario.slope, 0.0)), force=full(scenario.force), kick=full(scenario.kick),
-    )  # fmt: skip
+        slope=full((scenario.slope, 0.0)),
+        force=full(scenario.force),
+        kick=full(scenario.kick),
+    )
 
 
 def measure(
@@ -100,12 +103,18 @@ def measure(
             gravity = state.obs[:3]
             commands = state.condition.commands
             _, memory = walk_policy.walk(
-                params, memory, commands, gravity, robot_state.joint_position[0], robot_state.joint_velocity[0]
+                env.robot,
+                params,
+                memory,
+                commands,
+                gravity,
+                robot_state.joint_position[0],
+                robot_state.joint_velocity[0],
             )
             state = env.step(state, memory.action)
             robot_state = env.read(state.data)
             quaternion = robot_state.quaternion[0]
-            feet = robots.foot_positions(robot_state.joint_position[0])
+            feet = robots.foot_positions(env.robot, robot_state.joint_position[0])
             height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
             squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
             speed = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])[0]
@@ -120,7 +129,7 @@ def measure(
         memory = jax.vmap(lambda _: walk_policy.initial_memory())(keys)
         return jax.lax.scan(advance, (state, memory), None, steps)[1]
 
-    asked = conditions(scenario, condition_key, episodes)
+    asked = conditions(env.robot, scenario, condition_key, episodes)
     squares, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), asked))
     alive = ~np.logical_or.accumulate(fallen, axis=0)
     counted = alive.copy()
@@ -128,10 +137,12 @@ def measure(
     rms = np.sqrt((squares * counted[..., None]).sum((0, 1)) / max(counted.sum(), 1))
     upright = alive[-1]
     figures = {
-        "rms_vx": float(rms[0]), "rms_vy": float(rms[1]), "rms_yaw": float(rms[2]),
+        "rms_vx": float(rms[0]),
+        "rms_vy": float(rms[1]),
+        "rms_yaw": float(rms[2]),
         "fall_rate": float(1.0 - upright.mean()),
         "speed": float((speed * counted).sum() / max(counted.sum(), 1)),
-    }  # fmt: skip
+    }
     if upright.any():
         travelled = np.linalg.norm(position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1)[upright]
         figures |= {"drift": float(travelled.mean()), "drift_p95": float(np.percentile(travelled, 95))}
@@ -150,9 +161,15 @@ def _frequency(height: np.ndarray) -> float:
 
 
 def evaluate_walk(
-    params: walk_policy.Params, *, impl: str = "auto", episodes: int = 1000, seed: int = 0,
-    scenarios: Sequence[str] | None = None, report: Callable[[str, dict[str, float]], None] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    robot: Robot,
+    params: walk_policy.Params,
+    *,
+    impl: str = "auto",
+    episodes: int = 1000,
+    seed: int = 0,
+    scenarios: Sequence[str] | None = None,
+    report: Callable[[str, dict[str, float]], None] | None = None,
+) -> dict[str, Any]:
     """Measures a walk policy in the named scenarios (all of `SCENARIOS` if None).
 
     Returns:
@@ -169,7 +186,7 @@ def evaluate_walk(
             raise ValueError(
                 f"scenario: unknown name {name!r}{nearest(name, SCENARIOS)}; allowed: {', '.join(SCENARIOS)}"
             )
-    env = make_env(impl, episodes)
+    env = make_env(robot, impl, episodes)
     results = {}
     for name in names:
         results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
@@ -178,6 +195,9 @@ def evaluate_walk(
     top = results.get("flat", {})
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
-        "impl": env.physics.impl, "episodes": episodes, **{key: top[key] for key in keys if key in top},
+        "robot": robot.name,
+        "impl": env.physics.impl,
+        "episodes": episodes,
+        **{key: top[key] for key in keys if key in top},
         "scenarios": results,
-    }  # fmt: skip
+    }

@@ -7,13 +7,14 @@ of the negative ones.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 
 from mqe_jax import robots, walk_policy
-from mqe_jax.robots import go1
 from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 
 
@@ -46,6 +47,7 @@ class WalkRewards:
 class RewardInputs:
     """What the reward terms are functions of; see `WalkState` for shapes and units."""
 
+    robot: Robot
     robot_state: RobotState
     commands: jax.Array
     error: jax.Array
@@ -54,7 +56,6 @@ class RewardInputs:
     target: jax.Array
     previous_target: jax.Array
     before_target: jax.Array
-    body_height: float
     foot_force: jax.Array
     strength: jax.Array
 
@@ -67,7 +68,7 @@ def desired_contact(phases: jax.Array, width: float = 0.07) -> jax.Array:
 
 def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     """Computes every term (), named as its weight in `WalkRewards`."""
-    robot_state, commands = inputs.robot_state, inputs.commands
+    robot, robot_state, commands = inputs.robot, inputs.robot_state, inputs.commands
     quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
     joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
     phases = walk_policy.foot_phases(inputs.gait, commands)
@@ -75,7 +76,8 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
 
-    feet, feet_velocity = jax.jvp(robots.foot_positions, (joint_position,), (joint_velocity,))
+    locate_feet = functools.partial(robots.foot_positions, robot)
+    feet, feet_velocity = jax.jvp(locate_feet, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
     turn = jnp.broadcast_to(quaternion, (4, 4))
     feet_w, feet_velocity = rotate(turn, feet), rotate(turn, feet_velocity)
@@ -93,17 +95,17 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)
     place = stance + shift[:, None] * speed * 0.5 / commands[4]
     swing = 1.0 - jnp.abs(1.0 - 2.0 * jnp.clip(2.0 * phases - 1.0, 0.0, 1.0))
-    wanted_height = commands[9] * swing + go1.FOOT_RADIUS
+    wanted_height = commands[9] * swing + robot.foot_radius
 
     up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
     tilt = euler_to_quaternion(jnp.stack([commands[11], commands[10], jnp.zeros(())]))
     wanted_up = rotate_inverse(tilt, jnp.array([0.0, 0.0, 1.0]))
-    torque = inputs.strength * (go1.KP * (inputs.target - joint_position) - go1.KD * joint_velocity)
-    torque = jnp.clip(torque, -go1.TORQUE_LIMIT, go1.TORQUE_LIMIT)
-    margin = 0.05 * (go1.JOINT_UPPER - go1.JOINT_LOWER)
-    beyond = jnp.maximum(joint_position - go1.JOINT_UPPER + margin, 0)
-    beyond += jnp.maximum(go1.JOINT_LOWER + margin - joint_position, 0)
-    knees = rotate(turn, robots.knee_positions(joint_position))[:, 2] + height
+    torque = inputs.strength * (robot.kp * (inputs.target - joint_position) - robot.kd * joint_velocity)
+    torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
+    margin = 0.05 * (robot.joint_upper - robot.joint_lower)
+    beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
+    beyond += jnp.maximum(robot.joint_lower + margin - joint_position, 0)
+    knees = rotate(turn, robots.knee_positions(robot, joint_position))[:, 2] + height
     on_ground = inputs.foot_force > 1.0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {
@@ -113,7 +115,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "track_mean_yaw": jnp.exp(-jnp.square(inputs.mean_error[2]) / 0.04),
         "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
         "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
-        "body_height": jnp.square(height - inputs.body_height - commands[3]),
+        "body_height": jnp.square(height - robot.stand_height - commands[3]),
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
         "raibert": jnp.sum(jnp.square(feet_heading - place)),
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
@@ -123,7 +125,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
-        "low_knee": jnp.sum(jnp.maximum(0.06 - knees, 0.0) > 0).astype(jnp.float32),
+        "low_knee": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(jnp.float32),
         "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import walk_policy
-from mqe_jax.robots.go1 import NUM_JOINTS
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.train import nn
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
@@ -29,6 +29,7 @@ from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 class WalkWorld(Protocol):
     """What the trainer needs of the walking environment; see `mqe_jax.walk.env.WalkEnv`."""
 
+    robot: Robot
     privileged_size: int
 
     def reset(self, key: jax.Array, condition: Any = None, level: Any = 1.0, step: Any = 0) -> Any: ...
@@ -154,12 +155,20 @@ def make_iteration(
             next_state = step(state, action)
             # The critic has no history, so the value of the state reached is known before a reset replaces it.
             record = {
-                "obs": state.obs, "privileged": state.privileged_obs, "age": state.age, "action": action,
-                "mean": mean, "log_prob": jnp.sum(log_prob(action, mean, params["log_std"]), -1),
-                "next_privileged": next_state.privileged_obs, "reward": next_state.reward,
-                "terminated": next_state.terminated, "truncated": next_state.truncated,
-                "latent_target": state.latent_target, "length": next_state.age, "metrics": next_state.metrics,
-            }  # fmt: skip
+                "obs": state.obs,
+                "privileged": state.privileged_obs,
+                "age": state.age,
+                "action": action,
+                "mean": mean,
+                "log_prob": jnp.sum(log_prob(action, mean, params["log_std"]), -1),
+                "next_privileged": next_state.privileged_obs,
+                "reward": next_state.reward,
+                "terminated": next_state.terminated,
+                "truncated": next_state.truncated,
+                "latent_target": state.latent_target,
+                "length": next_state.age,
+                "metrics": next_state.metrics,
+            }
             next_state = autoreset(next_state)
             fresh = (next_state.age == 0)[:, None, None]
             history = jnp.concatenate([jnp.where(fresh, 0.0, history[:, 1:]), next_state.obs[:, None]], axis=1)
@@ -228,10 +237,13 @@ def make_iteration(
         ended = jnp.sum(done)
         metrics = {name: jnp.mean(values) for name, values in {**info, **records["metrics"]}.items()}
         metrics |= {
-            "reward": jnp.mean(records["reward"]), "rate": rate, "std": jnp.mean(jnp.exp(params["log_std"])),
-            "fall_per_20s": jnp.mean(records["terminated"]) * 1000.0, "level": level,
+            "reward": jnp.mean(records["reward"]),
+            "rate": rate,
+            "std": jnp.mean(jnp.exp(params["log_std"])),
+            "fall_per_20s": jnp.mean(records["terminated"]) * 1000.0,
+            "level": level,
             "episode_length": jnp.sum(records["length"] * done) / jnp.maximum(ended, 1),
-        }  # fmt: skip
+        }
         learner = WalkLearner(params, optimizer_state, rate, learner.iteration + 1, key)
         return learner, state, history, metrics
 
@@ -299,7 +311,7 @@ def train_walk(
                 if report is not None:
                     report(iteration, row)
             if iteration % save_every == 0 or last:
-                about = {"config": dataclasses.asdict(config), "iteration": iteration}
+                about = {"robot": env.robot.name, "config": dataclasses.asdict(config), "iteration": iteration}
                 checkpoint.save_checkpoint(run_dir, learner, iteration, about, keep=2)
                 walk_policy.save_params(learner.params["policy"], run_dir / "walk.safetensors", about)
             if last:
