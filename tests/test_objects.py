@@ -19,19 +19,19 @@ from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import scripted_policy
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import with_object
+from tests.states import made, with_object
 
 STEP = 0.02
 
 
 @pytest.fixture(scope="module")
 def box_env() -> QuadrupedEnv:
-    return make("go1pushbox", impl="c", control="position")
+    return made("go1pushbox")
 
 
 @pytest.fixture(scope="module")
 def herd() -> Any:
-    return make("go1sheep-hard", impl="c", control="position")
+    return made("go1sheep-hard")
 
 
 def plain(*objects: objects.Object) -> Any:
@@ -90,19 +90,27 @@ def test_one_sheep_flees_from_a_dog_at_08_m_and_not_at_2_m() -> None:
 def test_the_law_of_the_flock_by_hand() -> None:
     """One sheep at rest 0.5 m from a dog: q = 0.25, 0.2 * 0.5 / 0.25^1.4 = 0.6964 m/s, less 0.0981 m/s of friction."""
     velocity = flock(
-        jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)), jnp.array([[0.5, 0.0]]),
-        restlessness=0.0, step=STEP,
-    )  # fmt: skip
+        jax.random.PRNGKey(0),
+        jnp.array([[1.0, 0.0]]),
+        jnp.zeros((1, 2)),
+        jnp.array([[0.5, 0.0]]),
+        restlessness=0.0,
+        step=STEP,
+    )
     np.testing.assert_allclose(velocity, [[0.2 * 0.5 / 0.25**1.4 - 0.0981, 0.0]], atol=1e-4)
     fast = flock(
-        jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)), jnp.array([[0.9, 0.0]]),
-        restlessness=0.0, step=STEP,
-    )  # fmt: skip
+        jax.random.PRNGKey(0),
+        jnp.array([[1.0, 0.0]]),
+        jnp.zeros((1, 2)),
+        jnp.array([[0.9, 0.0]]),
+        restlessness=0.0,
+        step=STEP,
+    )
     np.testing.assert_allclose(fast, [[2.0 - 0.0981, 0.0]], atol=1e-4)  # the top speed
 
 
 def test_a_sheep_by_itself_wanders() -> None:
-    restlessness = make("go1sheep-easy", impl="c", control="position").params.restlessness
+    restlessness = made("go1sheep-easy").params.restlessness
     track = [run_flock([[0.0, 0.0]], [[-20.0, 0.0]], 750, restlessness, seed)[:, 0] for seed in range(8)]
     ways = [np.linalg.norm(way[-1] - way[0]) for way in track]
     assert 0.03 < np.mean(ways) < 1.0
@@ -163,9 +171,9 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
     reward, _ = weigh(box_env.rewards(behind, robots, no)[0], box_env.params.rewards, 2)
     np.testing.assert_allclose(reward, [10 * 0.05 + 1] * 2, atol=1e-4)
     assert float(box_env.outcome(behind, robots, no)["success"]) == 1
-    # 4.47 m is where the box was last; it is told how far that is from where it started.
+    # The box was last at 4.47 m; its displacement counts from its initial position.
     start = dataclasses.replace(behind, task=dataclasses.replace(behind.task, start=jnp.float32(2.2)))
-    assert float(box_env.outcome(start, robots, no)["success/way"]) == pytest.approx(2.27, abs=1e-4)
+    assert float(box_env.outcome(start, robots, no)["success/distance"]) == pytest.approx(2.27, abs=1e-4)
 
 
 def test_pushbox_observation(box_env: Any) -> None:
@@ -179,7 +187,7 @@ def test_pushbox_observation(box_env: Any) -> None:
 
 
 def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
-    easy: Any = make("go1sheep-easy", impl="c", control="position")
+    easy = made("go1sheep-easy")
     state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[5.0, 0.3]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.array([4.98])))
     state = with_object(easy, state, "sheep0", [5.01, 0.3])
@@ -209,9 +217,9 @@ def test_the_planner_wins(task: str, share: float) -> None:
     """Through the walk policy, over a few episodes; `mqe eval TASK --planner scripted` measures many."""
     from mqe_jax.train.evaluate import evaluate
 
-    worlds = VectorEnv(make(task, impl="c", num_envs=16), 16)
-    plan = jax.vmap(scripted_policy(worlds.env))
-    result = evaluate(worlds, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
+    batch = VectorEnv(make(task, impl="c", num_envs=16), 16)
+    plan = jax.vmap(scripted_policy(batch.env))
+    result = evaluate(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
     assert result.to_dict()["success_rate"] >= share
 
 
@@ -227,5 +235,5 @@ def test_two_robots_push_the_box_clearly_faster_than_one() -> None:
     from pathlib import Path
 
     pushed = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "push_box_alone.py"))["pushed"]
-    alone, together = pushed(1, worlds=8), pushed(2, worlds=8)
+    alone, together = pushed(1, num_envs=8), pushed(2, num_envs=8)
     assert 0.1 < alone < 0.7 * together
