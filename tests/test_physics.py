@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import jax
@@ -20,8 +19,6 @@ from mqe_jax.terrain import Plane, Track
 
 NEEDS_GPU = pytest.mark.gpu
 IMPLS = ["c", "jax", pytest.param("warp", marks=NEEDS_GPU)]
-# The acceptance run is MQE_SOAK=64x2000; by default a short one.
-SOAK = tuple(int(n) for n in os.environ.get("MQE_SOAK", "8x60").split("x"))
 
 
 @pytest.fixture(scope="module")
@@ -81,15 +78,23 @@ def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
     return position, np.asarray(state.anchors)
 
 
-@pytest.mark.parametrize("impl", IMPLS)
-def test_random_actions_break_nothing(impl: str) -> None:
+@pytest.mark.parametrize(
+    ("impl", "num_envs", "steps"),
+    [
+        ("c", 8, 60),
+        ("jax", 2, 20),
+        pytest.param("warp", 8, 60, marks=NEEDS_GPU),
+        *(pytest.param(impl, 64, 2000, marks=pytest.mark.soak) for impl in ("c", "jax")),
+        pytest.param("warp", 64, 2000, marks=[NEEDS_GPU, pytest.mark.soak]),
+    ],
+)
+def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> None:
     """No NaN, and no robot passes through a wall or the floor, under full-range joint targets."""
-    worlds, steps = SOAK if impl != "jax" or "MQE_SOAK" in os.environ else (2, 20)
-    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=worlds)
-    vector = VectorEnv(env, worlds)
+    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=num_envs)
+    vector = VectorEnv(env, num_envs)
 
     def advance(state: Any, key: jax.Array) -> tuple[Any, Any]:
-        action = jax.random.uniform(key, (worlds, 2, 12), minval=-1.0, maxval=1.0)
+        action = jax.random.uniform(key, (num_envs, 2, 12), minval=-1.0, maxval=1.0)
         state = vector.step(state, action)
         position = state.data.qpos[:, env.index.base_qpos[:, :3]]
         overflow = jnp.any(jax.vmap(vector.env.physics.overflow)(state.data))
