@@ -177,7 +177,7 @@ class Controller:
         return rest
 
     def reset(self) -> ControlState:
-        """Returns the control state of a fresh world."""
+        """Returns the controller state after a reset."""
         robots = self.index.num_robots
         walk = None
         if self.walk_params is not None:

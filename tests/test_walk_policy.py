@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import pathlib
 import pickle
@@ -13,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import control, walk_policy
+from mqe_jax import control, robots, walk_policy
+from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
-from mqe_jax.walk import convert
+from mqe_jax.walk import convert, training
 from mqe_jax.walk.env import WalkEnv, WalkTask, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.training import windows
@@ -214,18 +216,41 @@ def test_memory_shifts_and_advances() -> None:
 def test_windows_are_the_histories_of_the_rollout() -> None:
     """The 30-step windows gathered from single observations equal the histories kept step by step."""
     random = np.random.default_rng(0)
-    steps, worlds = 40, 3
-    obs = random.normal(size=(steps, worlds, 70)).astype(np.float32)
-    age = np.arange(steps)[:, None] + np.zeros((1, worlds), int)
-    age[10:, 1] = np.arange(steps - 10)  # world 1 is reset at step 10
-    history, kept = np.zeros((worlds, 30, 70), np.float32), []
+    steps, envs = 40, 3
+    obs = random.normal(size=(steps, envs, 70)).astype(np.float32)
+    age = np.arange(steps)[:, None] + np.zeros((1, envs), int)
+    age[10:, 1] = np.arange(steps - 10)  # environment 1 is reset at step 10
+    history, kept = np.zeros((envs, 30, 70), np.float32), []
     for t in range(steps):
         history = np.concatenate([np.where(age[t][:, None, None] == 0, 0, history[:, 1:]), obs[t][:, None]], axis=1)
         kept.append(history)
-    buffer = jnp.concatenate([jnp.zeros((29, worlds, 70)), jnp.asarray(obs)])
-    t, n = np.meshgrid(np.arange(steps), np.arange(worlds), indexing="ij")
+    buffer = jnp.concatenate([jnp.zeros((29, envs, 70)), jnp.asarray(obs)])
+    t, n = np.meshgrid(np.arange(steps), np.arange(envs), indexing="ij")
     found = windows(buffer, jnp.asarray(age), jnp.asarray(t.ravel()), jnp.asarray(n.ravel()))
-    np.testing.assert_array_equal(found, np.stack(kept).reshape(steps * worlds, -1))
+    np.testing.assert_array_equal(found, np.stack(kept).reshape(steps * envs, -1))
+
+
+def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pathlib.Path) -> None:
+    """Weights, learning rate, iteration and key are exact, Adam's second moments to 8 bits; at most 16 MB a file."""
+    config = training.WalkConfig()
+    learner = training.init_learner(jax.random.PRNGKey(0), config, 110)
+    square = jax.tree.map(lambda x: jnp.square(x) + 1e-7, learner.params)
+    learner = dataclasses.replace(
+        learner,
+        optimizer=learner.optimizer._replace(square=square, updates=jnp.int32(40)),
+        learning_rate=jnp.float32(3e-4),
+        iteration=jnp.int32(7),
+    )
+    path = training.save(tmp_path, learner, GO1, config)
+    assert path.stat().st_size < 16e6
+    fresh = training.init_learner(jax.random.PRNGKey(1), config, 110)
+    found = training.restore(tmp_path, fresh, GO1)
+    jax.tree.map(np.testing.assert_array_equal, found.params, learner.params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1 / 128), found.optimizer.square, square)
+    assert int(found.optimizer.updates) == 40 and int(found.iteration) == 7
+    assert float(found.learning_rate) == pytest.approx(3e-4)
+    with pytest.raises(InputError, match=r"trained on go1; resume it with --robot go1, not go2"):
+        training.restore(tmp_path, fresh, robots.get("go2"))
 
 
 def test_command_actions_are_the_papers() -> None:

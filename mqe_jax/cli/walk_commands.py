@@ -27,7 +27,7 @@ def walk_train(arguments: WalkTrain) -> None:
     config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
 
     def report(iteration: int, row: dict[str, float]) -> None:
-        shown = ("reward", "episode_length", "kl", "level")
+        shown = ("reward", "episode_length", "kl", "difficulty")
         numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
         say(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
 

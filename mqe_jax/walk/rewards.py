@@ -1,4 +1,4 @@
-"""The rewards by which the walk policy is trained.
+"""Rewards of the walk policy's training.
 
 They follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238): positive terms times the exponential of the sum
 of the negative ones.
@@ -20,7 +20,11 @@ from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, r
 
 @dataclasses.dataclass(frozen=True)
 class WalkRewards:
-    """Weights of the reward terms; the first four are positive terms, the others go into the exponent."""
+    """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
+
+    `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground that happens at the knee, so it is
+    read from the knee's height (`WalkSettings.min_knee_height`), at no cost for contact sensors.
+    """
 
     track_velocity: float = 0.6
     track_mean_velocity: float = 0.7
@@ -38,14 +42,14 @@ class WalkRewards:
     torque: float = -1e-4
     joint_velocity: float = -1e-4
     joint_limit: float = -10.0
-    low_knee: float = -5.0
+    limb_contact: float = -5.0
     vertical_speed: float = -0.02
     roll_pitch_rate: float = -0.001
 
 
 @dataclasses.dataclass(frozen=True)
 class RewardInputs:
-    """What the reward terms are functions of; see `WalkState` for shapes and units."""
+    """Inputs of the reward terms; shapes and units as in `WalkState`."""
 
     robot: Robot
     robot_state: RobotState
@@ -61,13 +65,13 @@ class RewardInputs:
 
 
 def desired_contact(phases: jax.Array, width: float = 0.07) -> jax.Array:
-    """Returns how much each foot should be on the ground, in [0, 1], from its phase (4,): smooth at the switches."""
+    """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off and touch-down."""
     cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=width)  # noqa: E731
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
 
 
 def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
-    """Computes every term (), named as its weight in `WalkRewards`."""
+    """Computes all terms (), named as their weights in `WalkRewards`."""
     robot, robot_state, commands = inputs.robot, inputs.robot_state, inputs.commands
     quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
     joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
@@ -86,7 +90,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     feet_heading = jnp.stack([cos * feet_w[:, 0] + sin * feet_w[:, 1], -sin * feet_w[:, 0] + cos * feet_w[:, 1]], -1)
 
-    # Where the gait wants the feet: the stance corners, shifted by half a stance's travel over the cycle.
+    # Raibert heuristic: stance corners, shifted by half of the distance travelled during stance.
     stance = jnp.stack(
         [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]],
         -1,
@@ -125,7 +129,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
-        "low_knee": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(jnp.float32),
+        "limb_contact": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(jnp.float32),
         "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }
