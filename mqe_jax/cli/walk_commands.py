@@ -13,6 +13,7 @@ from mqe_jax.train.checkpoint import latest
 
 def walk_train(arguments: WalkTrain) -> None:
     """Trains the walk policy into the run folder."""
+    from mqe_jax import robots
     from mqe_jax.walk import training as walk
     from mqe_jax.walk.env import WalkEnv
 
@@ -22,11 +23,11 @@ def walk_train(arguments: WalkTrain) -> None:
     check_folder(arguments.run_dir)
     if latest(arguments.run_dir) is not None and not arguments.resume:
         raise ValueError(f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder")
-    env: Any = WalkEnv(impl=arguments.impl, num_envs=arguments.num_envs)
+    env: Any = WalkEnv(robots.get(arguments.robot), impl=arguments.impl, num_envs=arguments.num_envs)
     config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
 
     def report(iteration: int, row: dict[str, float]) -> None:
-        shown = ("reward", "episode_length", "kl", "level")
+        shown = ("reward", "episode_length", "kl", "difficulty")
         numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
         say(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
 
@@ -43,14 +44,16 @@ def walk_train(arguments: WalkTrain) -> None:
 
 def walk_eval(arguments: WalkEval) -> dict[str, Any]:
     """Measures the walk policy and prints a table, or gives the object for `--json`."""
-    from mqe_jax import walk_policy
+    from mqe_jax import robots, walk_policy
     from mqe_jax.walk.evaluation import evaluate_walk
 
     def report(name: str, figures: Mapping[str, float]) -> None:
         say(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
 
+    robot = robots.get(arguments.robot)
     result = evaluate_walk(
-        walk_policy.load_params(arguments.weights),
+        robot,
+        walk_policy.load_params(robot, arguments.weights),
         impl=arguments.impl,
         episodes=arguments.episodes,
         seed=arguments.seed,
