@@ -1,4 +1,4 @@
-"""Files and folders: writing whole, and checks before any work."""
+"""Files and folders: atomic writes, checks before any work, locks."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import os
 import tempfile
 from pathlib import Path
 
+from mqe_jax.errors import InputError
+
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file whole: under a temporary name in the same folder, flushed to disk, then renamed."""
+    """Writes a file atomically: under a temporary name in the same folder, flushed to disk, then renamed."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -23,10 +25,10 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuses a folder that cannot be written, before any work."""
+    """Creates a folder, and raises an InputError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise ValueError(f"run_dir: {folder} cannot be written ({error.strerror or error})") from None
+        raise InputError(f"run_dir: {folder} cannot be written ({error.strerror or error})") from None

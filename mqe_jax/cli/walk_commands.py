@@ -7,6 +7,7 @@ from typing import Any
 
 from mqe_jax.cli.arguments import WalkConvert, WalkEval, WalkTrain
 from mqe_jax.cli.output import print_table, say
+from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder
 from mqe_jax.train.checkpoint import latest
 
@@ -19,10 +20,10 @@ def walk_train(arguments: WalkTrain) -> None:
 
     for name in ("num_envs", "iterations"):
         if getattr(arguments, name) < 1:
-            raise ValueError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
+            raise InputError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
     check_folder(arguments.run_dir)
     if latest(arguments.run_dir) is not None and not arguments.resume:
-        raise ValueError(f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder")
+        raise InputError(f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder")
     env: Any = WalkEnv(robots.get(arguments.robot), impl=arguments.impl, num_envs=arguments.num_envs)
     config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
 
@@ -71,10 +72,10 @@ def walk_convert(arguments: WalkConvert) -> None:
     from mqe_jax.walk import convert
 
     if arguments.output.suffix != ".safetensors":
-        raise ValueError(f"output: {str(arguments.output)!r} is not allowed; it must end in .safetensors")
+        raise InputError(f"output: {str(arguments.output)!r} is not allowed; it must end in .safetensors")
     for path in (arguments.adaptation, arguments.body):
         if not path.is_file():
-            raise ValueError(f"{path}: no such file; it must be a TorchScript checkpoint")
+            raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
     params = convert.convert(arguments.adaptation, arguments.body)
     walk_policy.save_params(params, arguments.output, {"robot": robots.get(arguments.robot).name})
     say(f"mqe: wrote {arguments.output}")
