@@ -340,10 +340,10 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
     robots = attack.read(state.data)
     rest = idle.controller.default_commands
     np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
-    told = np.asarray(attack.npc_commands(state, robots))[0]
+    commands = np.asarray(attack.npc_commands(state, robots))[0]
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
-    np.testing.assert_allclose(told[:2], [0.5, 0.5], atol=1e-6)
-    np.testing.assert_array_equal(told[3:], rest[3:])
+    np.testing.assert_allclose(commands[:2], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(commands[3:], rest[3:])
 
 
 def test_the_defender_stands_while_the_agents_give_torques() -> None:
