@@ -18,7 +18,7 @@ from mqe_jax.envs import TASKS, QuadrupedEnv, Randomization, State, VectorEnv, m
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
-from tests.states import made, placed, robot_state
+from tests.states import initial, made, placed, robot_state
 
 Array = jax.Array
 
@@ -30,7 +30,7 @@ def gate() -> QuadrupedEnv:
 
 @pytest.fixture(scope="module")
 def fresh(gate: QuadrupedEnv) -> State:
-    return jax.jit(gate.reset)(jax.random.PRNGKey(0))
+    return initial(gate)
 
 
 @pytest.fixture(scope="module")
@@ -392,7 +392,7 @@ def test_the_privileged_observation_contains_the_randomised_physics_and_gait_pha
             action_lag=3,
         ),
     )
-    state = env.reset(jax.random.PRNGKey(0))
+    state = initial(env)
     step = jax.jit(env.step)
     for _ in range(60):  # 1.2 s: the robots have landed, and the gait of 3 Hz is at 0.6 of a cycle
         state = step(state, jnp.zeros((2, 3)))

@@ -15,7 +15,7 @@ from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import scripted_policy
-from tests.states import made, observation, placed, stepper, still, with_object
+from tests.states import initial, made, observation, placed, stepper, still, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -349,7 +349,7 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
 def test_the_defender_stands_while_the_agents_give_torques() -> None:
     """It follows joint targets of the walk policy, whatever an agent's action means."""
     env: Any = make("go1football-defender", impl="c", control="torque")
-    state = standing(env, env.reset(jax.random.PRNGKey(0)), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+    state = standing(env, initial(env), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
     np.testing.assert_allclose(env.controller.neutral[:2], 0)
     step = jax.jit(env.step)
     for _ in range(50):
