@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from mqe_jax.errors import InputError
@@ -32,3 +35,21 @@ def check_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise InputError(f"run_dir: {folder} cannot be written ({error.strerror or error})") from None
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Holds a lock on a folder; it ends with the process, however that ends.
+
+    Raises:
+        InputError: where another process (or this one) already holds it.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"run_dir: {folder} is in use by another training") from None
+        yield
+    finally:
+        os.close(handle)

@@ -15,6 +15,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
 
 
@@ -79,6 +80,20 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     assert float(metrics["episode_length"]) == 4.0
 
 
+def test_joint_values_of_a_match_are_per_team() -> None:
+    """In a zero-sum match the values of the two teams are opposite; averaged over both they would be 0."""
+    env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, teams=((1,), (0,)))
+    config = small(ppo={"ratio": "joint", "value": "joint", "gamma": 0.5}, network__critic_input="observations")
+    state, metrics = learn(env, config, 40)
+    network = make_learner(env, config).network
+    obs = state.rollout.env_state.obs[None]
+    value, _ = network.value(state.params, (), jnp.zeros((1, 32), bool), obs, jnp.zeros((1, 32, 5)))
+    value = value_denormalize(state.value_normalizer, value)[0]
+    assert value.shape == (32, 2)
+    assert float(value[:, 0].min()) > 0.5 and float(value[:, 1].max()) < -0.5
+    assert np.isfinite(float(metrics["loss/policy"]))
+
+
 def test_memory_carries_a_sign_through_an_episode() -> None:
     env = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=32)
     config = small(network__recurrent=True, network__chunk_length=4, stagger_episodes=True)
@@ -107,7 +122,7 @@ class OnePass(NamedTuple):
 
 @pytest.fixture(scope="module")
 def one_pass() -> OnePass:
-    """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
+    """Runs updates of one epoch over one batch, with memory; odd environments have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
     learner = make_learner(
         env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
@@ -136,11 +151,13 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
 
-def test_success_is_averaged_over_episode_ends(one_pass: OnePass) -> None:
-    """Even worlds end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
+def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) -> None:
+    """Even environments end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
     metrics = one_pass.metrics[0]
     assert float(metrics["episodes"]) == 2 * 4 + 2 * 2
     assert float(metrics["success"]) == pytest.approx(2 / 3)
+    assert float(metrics["team0/win"]) == pytest.approx(2 / 3)
+    assert float(metrics["episode_return"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
     assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
 
 

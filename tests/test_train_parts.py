@@ -78,9 +78,13 @@ def test_gaussian_density_entropy_and_divergence() -> None:
 def test_ratio_functions_by_hand() -> None:
     new = jnp.array([[0.1, 0.2], [0.3, 0.4]])  # 2 agents, 2 dimensions
     old = jnp.zeros((2, 2))
-    np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
-    np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
-    np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
+    both, rivals = ((0, 1),), ((1,), (0,))
+    np.testing.assert_allclose(loss.ratio_per_agent(new, old, both), [[0.3], [0.7]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_per_dimension(new, old, both), new)
+    np.testing.assert_allclose(loss.ratio_joint(new, old, both), [[1.0]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_joint(new, old, rivals), [[0.7], [0.3]], rtol=1e-6)
+    np.testing.assert_allclose(loss.team_mean(new[:, 0], both), [0.2], rtol=1e-6)
+    np.testing.assert_allclose(loss.team_mean(new[:, 0], rivals), [0.3, 0.1], rtol=1e-6)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from mqe_jax.cli.arguments import FIRST_STEPS, Command, parse
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, NonFiniteError
 
 
 @contextlib.contextmanager
@@ -42,9 +42,10 @@ def _run(command: Command) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs `mqe` and returns the exit code: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C.
+    """Runs `mqe` and returns the exit code.
 
-    Any exception but InputError and OSError is a defect and keeps its traceback.
+    0; 1 for a training that became non-finite and 2 for bad input (InputError, OSError), with one line on standard
+    error; 130 for Ctrl-C. Any other exception is a defect and keeps its traceback.
     """
     as_program = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -65,4 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (InputError, OSError) as error:
         print(f"mqe: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except NonFiniteError as error:
+        print(f"mqe: {error}", file=sys.stderr)
+        return 1
     return 0

@@ -8,8 +8,8 @@ from typing import Any
 from mqe_jax.cli.arguments import WalkConvert, WalkEval, WalkTrain
 from mqe_jax.cli.output import print_table, say
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder
-from mqe_jax.train.checkpoint import latest
+from mqe_jax.files import locked
+from mqe_jax.train.checkpoint import prepare_folder
 
 
 def walk_train(arguments: WalkTrain) -> None:
@@ -21,9 +21,7 @@ def walk_train(arguments: WalkTrain) -> None:
     for name in ("num_envs", "iterations"):
         if getattr(arguments, name) < 1:
             raise InputError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
-    check_folder(arguments.run_dir)
-    if latest(arguments.run_dir) is not None and not arguments.resume:
-        raise InputError(f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder")
+    prepare_folder(arguments.run_dir, arguments.resume, ("metrics.csv", "walk.safetensors"))
     env: Any = WalkEnv(robots.get(arguments.robot), impl=arguments.impl, num_envs=arguments.num_envs)
     config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
 
@@ -32,14 +30,15 @@ def walk_train(arguments: WalkTrain) -> None:
         numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
         say(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
 
-    walk.train_walk(
-        env,
-        config,
-        arguments.run_dir,
-        resume=arguments.resume,
-        max_seconds=arguments.max_seconds,
-        report=report,
-    )
+    with locked(arguments.run_dir):
+        walk.train_walk(
+            env,
+            config,
+            arguments.run_dir,
+            resume=arguments.resume,
+            max_seconds=arguments.max_seconds,
+            report=report,
+        )
     say(f"mqe: {arguments.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
+from mqe_jax.train.loss import RATIOS, clipped_surrogate, team_mean, value_loss
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
     ValueStatistics,
@@ -30,7 +31,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, Transition, VectorEnv
+from mqe_jax.train.types import Batch, Params, Teams, Transition, VectorEnv, teams_of
 
 Metrics = dict[str, jax.Array]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -66,13 +67,14 @@ class Learner(NamedTuple):
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     """Returns the sizes that a network is built for."""
     agents = env.num_agents
+    teams = teams_of(env)
     return EnvDims(
         agents=agents,
         observation=env.observation_size,
         privileged=env.privileged_observation_size,
         action=env.action_size,
-        teams=(tuple(range(agents)),),
-        values=1 if config.ppo.value == "joint" else agents,
+        teams=teams,
+        values=len(teams) if config.ppo.value == "joint" else agents,
     )
 
 
@@ -89,7 +91,8 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
         fail("curriculum.assistance", assistance, f"0: the state of the environment {env.name} has no such field")
     if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
         fail("stagger_episodes", True, f"false: the environment {env.name} has no max_episode_steps")
-    network = config.network.build(env_dims(env, config))
+    dims = env_dims(env, config)
+    network = config.network.build(dims)
     _check_divisible(config, network)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
@@ -113,6 +116,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
                     memory=network.initial_memory(env.num_envs),
                     is_first=jnp.ones((env.num_envs,), bool),
                     episode_steps=jnp.zeros((env.num_envs,), jnp.int32),
+                    episode_return=jnp.zeros((env.num_envs,)),
                 ),
                 key=key,
                 updates=jnp.zeros((), jnp.int32),
@@ -136,9 +140,9 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
         )
-        batch, value_normalizer, batch_metrics = _prepare(network, config, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(network, config, dims.teams, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
-            network, optimizer, config, state, value_normalizer, batch, epoch_key
+            network, optimizer, config, dims.teams, state, value_normalizer, batch, epoch_key
         )
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
@@ -192,7 +196,7 @@ def _strongly_typed(state: TrainState) -> TrainState:
 
 
 def _prepare(
-    network: Network, config: TrainConfig, state: TrainState, transitions: Transition
+    network: Network, config: TrainConfig, teams: Teams, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and cuts it into chunks (L, C, ...).
 
@@ -219,7 +223,7 @@ def _prepare(
     value, next_value = value_denormalize(value_normalizer, pair)
     reward = transitions.reward
     if config.ppo.value == "joint":
-        reward = jnp.mean(reward, axis=-1, keepdims=True)
+        reward = team_mean(reward, teams)
     progress = state.updates.astype(jnp.float32) / config.num_updates
     curriculum = config.curriculum
     kept = curriculum.failure_bootstrap * jnp.maximum(1.0 - progress / curriculum.failure_bootstrap_until, 0.0)
@@ -275,6 +279,7 @@ def _loss(
     params: Params,
     network: Network,
     config: TrainConfig,
+    teams: Teams,
     value_normalizer: ValueStatistics,
     entropy_coef: jax.Array,
     batch: Batch,
@@ -282,13 +287,16 @@ def _loss(
     """Returns the PPO loss () of a minibatch and its parts."""
     ppo = config.ppo
     now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
-    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
-    surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
+    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob, teams)
+    advantage = batch.advantage
+    if ppo.value == "joint" and ppo.ratio != "joint":  # each agent's ratio with its team's advantage
+        advantage = advantage[..., _team_of(teams)]
+    surrogate = clipped_surrogate(log_ratio, advantage[..., None], ppo.clip, ppo.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
     critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
     mean_entropy = jnp.mean(now.entropy)
-    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
+    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob, teams)
     metrics = {
         "loss/policy": policy_loss,
         "loss/value": critic_loss,
@@ -297,6 +305,12 @@ def _loss(
         "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32)),
     }
     return policy_loss + ppo.value_coef * critic_loss - entropy_coef * mean_entropy, metrics
+
+
+def _team_of(teams: Teams) -> np.ndarray:
+    """Returns the index of each agent's team (A,)."""
+    team_of = {agent: index for index, team in enumerate(teams) for agent in team}
+    return np.array([team_of[agent] for agent in range(len(team_of))])
 
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
@@ -309,6 +323,7 @@ def _learn(
     network: Network,
     optimizer: Optimizer,
     config: TrainConfig,
+    teams: Teams,
     state: TrainState,
     value_normalizer: ValueStatistics,
     batch: Batch,
@@ -325,7 +340,7 @@ def _learn(
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
         gradient, metrics = jax.grad(_loss, has_aux=True)(
-            params, network, config, value_normalizer, entropy_coef, minibatch
+            params, network, config, teams, value_normalizer, entropy_coef, minibatch
         )
         if config.optimizer.target_kl is not None:
             learning_rate = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)

@@ -12,13 +12,17 @@ Params = dict[str, Any]
 Memory = Any
 """Recurrent state: a pytree of arrays with leading axis N, or an empty one for networks without memory."""
 
+Teams = tuple[tuple[int, ...], ...]
+"""Agents of each team; every agent is in one."""
+
 
 class EnvState(Protocol):
     """The fields of a batched environment state that the learner reads; N environments of A agents.
 
     obs (N, A, O) is the input of the next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the
     state reached by the step, before any reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool;
-    metrics maps names to (N,), and every name is present from the reset on.
+    metrics maps names to (N,), and every name is present from the reset on. Metrics are averaged over steps, except
+    for outcomes of episodes (see `is_outcome`) and the counts `diverged` and `overflow`.
     """
 
     @property
@@ -43,7 +47,10 @@ class VectorEnv(Protocol):
     """N environments with automatic reset; `reset` and `step` are pure and may be jitted.
 
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with the fields
-    of `EnvState`.
+    of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to what it allows.
+
+    Optional attributes: `teams` (tuple of tuples of agents; one team by default): joint ratios and joint values are
+    per team. `max_episode_steps` (int), which `stagger_episodes` needs.
     """
 
     @property
@@ -60,6 +67,16 @@ class VectorEnv(Protocol):
     def action_size(self) -> int: ...
     def reset(self, key: jax.Array) -> Any: ...
     def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
+def teams_of(env: VectorEnv) -> Teams:
+    """Returns the environment's teams; one of all agents where it names none."""
+    return tuple(map(tuple, getattr(env, "teams", (range(env.num_agents),))))
+
+
+def is_outcome(metric: str) -> bool:
+    """Returns whether a metric describes an episode and counts on its last step, such as `success` or `team0/win`."""
+    return metric.startswith(("success", "team"))
 
 
 class NetworkMemory(NamedTuple):
