@@ -171,10 +171,23 @@ class Physics:
         return second.replace(**merged)
 
     def overflow(self, data: mjx.Data) -> jax.Array:
-        """Returns whether Warp dropped contacts or constraints in the last step () bool; false on other engines."""
-        if self.impl != "warp":
-            return jnp.zeros((), bool)
-        return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+        """Returns whether contacts or constraints may have been dropped in the last physics step () bool.
+
+        On Warp the engine's own flags; on MJX-JAX whether the capped contact list is full. The C engine has no cap.
+        """
+        if self.impl == "warp":
+            return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+        if self.impl == "jax":
+            contact = data._impl.contact
+            if len(contact.dist) == _contact_cap(self.model):
+                return jnp.all(contact.dist < contact.includemargin)
+        return jnp.zeros((), bool)
+
+
+def _contact_cap(model: mujoco.MjModel) -> int:
+    """Returns the maximum number of contacts that MJX-JAX keeps, -1 without a cap."""
+    names = [model.numeric(i).name for i in range(model.nnumeric)]
+    return int(model.numeric("max_contact_points").data[0]) if "max_contact_points" in names else -1
 
 
 # Warp's flags for a solver that used all its iterations: expected with few iterations, and no overflow.

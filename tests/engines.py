@@ -18,7 +18,7 @@ import numpy as np
 
 from mqe_jax.envs import TASKS, State, VectorEnv, make
 from mqe_jax.physics import STATE_FIELDS
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import PLANNERS, scripted_policy
 
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
@@ -52,7 +52,7 @@ def played(task: str, num_envs: int) -> dict[str, np.ndarray]:
     Of each environment's first `PLAY` steps, the one in which objects move fastest and robots touch most.
     """
     env: Any = make(task, impl="c", num_envs=num_envs)
-    vector_env, plan = VectorEnv(env, num_envs), jax.vmap(PLANNERS.get(task, ahead))
+    vector_env, plan = VectorEnv(env, num_envs), jax.vmap(scripted_policy(env) if task in PLANNERS else ahead)
     robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 

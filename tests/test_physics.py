@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import jax
@@ -20,8 +19,6 @@ from mqe_jax.terrain import Plane, Track
 
 NEEDS_GPU = pytest.mark.gpu
 IMPLS = ["c", "jax", pytest.param("warp", marks=NEEDS_GPU)]
-# The acceptance run is MQE_SOAK=64x2000; by default a short one.
-SOAK = tuple(int(n) for n in os.environ.get("MQE_SOAK", "8x60").split("x"))
 
 
 @pytest.fixture(scope="module")
@@ -78,13 +75,21 @@ def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> N
 def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
     """Trunk x, y, z of all robots (N, A, 3) and gate centres (N, 1, 2)."""
     position = np.asarray(state.data.qpos)[:, env.index.base_qpos[:, :3]]
-    return position, np.asarray(state.gates)
+    return position, np.asarray(state.anchors)
 
 
-@pytest.mark.parametrize("impl", IMPLS)
-def test_random_actions_break_nothing(impl: str) -> None:
+@pytest.mark.parametrize(
+    ("impl", "num_envs", "steps"),
+    [
+        ("c", 8, 60),
+        ("jax", 2, 20),
+        pytest.param("warp", 8, 60, marks=NEEDS_GPU),
+        *(pytest.param(impl, 64, 2000, marks=pytest.mark.soak) for impl in ("c", "jax")),
+        pytest.param("warp", 64, 2000, marks=[NEEDS_GPU, pytest.mark.soak]),
+    ],
+)
+def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> None:
     """No NaN, and no robot passes through a wall or the floor, under full-range joint targets."""
-    num_envs, steps = SOAK if impl != "jax" or "MQE_SOAK" in os.environ else (2, 20)
     env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=num_envs)
     vector = VectorEnv(env, num_envs)
 
@@ -125,7 +130,7 @@ def test_gate_stands_where_each_environment_drew_it() -> None:
     """Walls stand where each environment's gate was drawn, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
-    gap = states.gates[:, 0]
+    gap = states.anchors[:, 0]
     assert len(np.unique(np.asarray(gap[:, 0]))) == 3
     assert np.all(np.abs(np.asarray(gap) - [3.5, 0.0]) <= 0.5)
     right, left = states.data.mocap_pos[:, 0], states.data.mocap_pos[:, 1]

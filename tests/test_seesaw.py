@@ -18,8 +18,8 @@ from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import angles, placed, robot_state
+from mqe_jax.terrain import Plane, SpawnArea, Track
+from tests.states import angles, initial, made, placed, robot_state, stepper
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
@@ -27,17 +27,17 @@ WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
 
 @pytest.fixture(scope="module")
 def env() -> Any:
-    return make("go1seesaw", impl="c", control="position")
+    return made("go1seesaw")
 
 
 @pytest.fixture(scope="module")
 def step(env: Any) -> Any:
-    return jax.jit(env.step)
+    return stepper(env.name)
 
 
 @pytest.fixture(scope="module")
 def fresh(env: Any) -> State:
-    return jax.jit(env.reset)(jax.random.PRNGKey(0))
+    return initial(env)
 
 
 def on_plank(x: float, height: float = 0.31) -> list[float]:
@@ -73,7 +73,9 @@ def test_the_scene_is_as_listed(env: Any) -> None:
 def test_what_turns_has_its_centre_of_mass_in_its_hinge(env: Any) -> None:
     scenes = [(env.compiled, "seesaw", 100.0)]
     door = Door("door", position=(2.6, 0.3))
-    scenes.append((compile_scene(Scene(Track((Init(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0))
+    scenes.append(
+        (compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0)
+    )
     for compiled, name, mass in scenes:
         model, body = compiled.model, compiled.objects[name].body
         assert model.body_mass[body] == mass
@@ -107,8 +109,10 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
     assert float(reward(up, yes)[0]) == pytest.approx(11.465 - 2, abs=1e-4)
     # Before the platform, or too low: nothing for success. Both on it: twice.
     for position, count in (
-        ([[7.68, 0, 1.3], [3.9, 0, 0.4]], 0), ([[7.8, 0, 1.15], [3.9, 0, 0.4]], 0), ([[7.8, 0, 1.3]] * 2, 2)
-    ):  # fmt: skip
+        ([[7.68, 0, 1.3], [3.9, 0, 0.4]], 0),
+        ([[7.8, 0, 1.15], [3.9, 0, 0.4]], 0),
+        ([[7.8, 0, 1.3]] * 2, 2),
+    ):
         assert float(reward(robot_state(position))[1][0]["success"]) == count
     # A fall, by roll and by nothing less.
     assert float(reward(robot_state(SPAWN, roll=(0.0, 0.81)))[1][0]["fall"]) == 1
@@ -154,7 +158,7 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
 
 def plank() -> Any:
     scene = compile_scene(
-        Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
+        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
     )
     return scene.model, scene.objects["seesaw"]
 
@@ -206,13 +210,15 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
 
 
 def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
-    """Through the walk policy, in a few worlds; examples/seesaw_alone.py measures many."""
+    """Through the walk policy, in a few environments; examples/seesaw_alone.py measures many."""
     env, count = make("go1seesaw", impl="c", num_envs=20), 10
     partner = (jnp.arange(2 * count) < count)[:, None, None]
+    layout = env.observation_layout
 
     def one_step(carry: Any, _: None) -> Any:
         state, over, won = carry
-        action = jnp.where(partner, jax.vmap(plan_seesaw)(state.obs), jax.vmap(plan_seesaw_alone)(state.obs))
+        blocks = layout.split(state.obs)
+        action = jnp.where(partner, jax.vmap(plan_seesaw)(blocks), jax.vmap(plan_seesaw_alone)(blocks))
         state = jax.vmap(env.step)(state, action)
         ends = (state.terminated | state.truncated) & ~over
         return (state, over | ends, won | (ends & (state.metrics["success"] > 0))), None

@@ -11,29 +11,25 @@ import probes
 import pytest
 from probes import Probe
 
+from mqe_jax.errors import InputError
+from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
 
 
 def small(**values: Any) -> TrainConfig:
-    """Returns settings that learn a probe in seconds."""
-    return TrainConfig(
-        **{
-            "num_envs": 32,
-            "total_steps": 100_000,
-            "rollout_steps": 8,
-            "epochs": 4,
-            "minibatches": 2,
-            "learning_rate": 1e-2,
-            "entropy_coef": 0.0,
-            "hidden_sizes": (16,),
-            "gru_size": 8,
-            "recurrent": False,
-            "log_std_init": -1.0,
-            **values,
-        }
-    )
+    """Returns settings that learn a probe in seconds; a double underscore is a dot: `ppo__clip=0.1`."""
+    settings = {
+        "num_envs": 32,
+        "total_steps": 100_000,
+        "rollout_steps": 8,
+        "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
+        "optimizer.learning_rate": 1e-2,
+        "network": {"hidden_sizes": (16,), "gru_size": 8, "recurrent": False, "log_std_init": -1.0},
+    }
+    return override(build(TrainConfig, settings), {name.replace("__", "."): value for name, value in values.items()})
 
 
 def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -49,7 +45,7 @@ def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState
 
 def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
     env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, even_truncate=True)
-    config = small(gamma=0.8, value_clip=None, value_norm_decay=0.9)
+    config = small(ppo__gamma=0.8, ppo__value_clip=None, normalization__value_decay=0.9)
     state, _ = learn(env, config, 60)
     network = make_learner(env, config).network
     seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
@@ -66,15 +62,12 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
 
 VARIANTS = {
     "mappo": {},
-    "jrpo": {"ratio": "joint", "value": "joint", "critic_input": "observations"},
+    "jrpo": {"ppo": {"ratio": "joint", "value": "joint"}, "network__critic_input": "observations"},
     "ippo": {
-        "share_policy": False,
-        "critic_input": "own",
-        "ratio": "dimension",
-        "dual_clip": 3.0,
-        "target_kl": 0.02,
-        "normalize_observations": True,
-        "action_mean": "tanh",
+        "network": {"share_policy": False, "critic_input": "own", "action_mean": "tanh"},
+        "ppo": {"ratio": "dimension", "dual_clip": 3.0},
+        "optimizer__target_kl": 0.02,
+        "normalization__observations": True,
     },
 }
 
@@ -87,9 +80,23 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     assert float(metrics["episode_length"]) == 4.0
 
 
+def test_joint_values_of_a_match_are_per_team() -> None:
+    """In a zero-sum match the values of the two teams are opposite; averaged over both they would be 0."""
+    env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, teams=((1,), (0,)))
+    config = small(ppo={"ratio": "joint", "value": "joint", "gamma": 0.5}, network__critic_input="observations")
+    state, metrics = learn(env, config, 40)
+    network = make_learner(env, config).network
+    obs = state.rollout.env_state.obs[None]
+    value, _ = network.value(state.params, (), jnp.zeros((1, 32), bool), obs, jnp.zeros((1, 32, 5)))
+    value = value_denormalize(state.value_normalizer, value)[0]
+    assert value.shape == (32, 2)
+    assert float(value[:, 0].min()) > 0.5 and float(value[:, 1].max()) < -0.5
+    assert np.isfinite(float(metrics["loss/policy"]))
+
+
 def test_memory_carries_a_sign_through_an_episode() -> None:
     env = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=32)
-    config = small(recurrent=True, chunk_length=4, stagger_episodes=True)
+    config = small(network__recurrent=True, network__chunk_length=4, stagger_episodes=True)
     _, metrics = learn(env, config, 50)
     assert float(metrics["average_step_reward"]) > -0.06  # without memory at best -0.19
 
@@ -115,9 +122,11 @@ class OnePass(NamedTuple):
 
 @pytest.fixture(scope="module")
 def one_pass() -> OnePass:
-    """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
+    """Runs updates of one epoch over one batch, with memory; odd environments have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
-    learner = make_learner(env, small(num_envs=4, recurrent=True, chunk_length=4, epochs=1, minibatches=1))
+    learner = make_learner(
+        env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
+    )
     update = jax.jit(learner.update)
     states, all_metrics, traces = [jax.jit(learner.init)(jax.random.PRNGKey(0))], [], []
     for _ in range(3):
@@ -142,15 +151,24 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
 
-def test_success_is_averaged_over_episode_ends(one_pass: OnePass) -> None:
-    """Even worlds end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
+def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) -> None:
+    """Even environments end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
     metrics = one_pass.metrics[0]
     assert float(metrics["episodes"]) == 2 * 4 + 2 * 2
     assert float(metrics["success"]) == pytest.approx(2 / 3)
+    assert float(metrics["team0/win"]) == pytest.approx(2 / 3)
+    assert float(metrics["episode_return"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
     assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
 
 
 def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    with pytest.raises(ValueError, match="num_envs: 32; the environment given has 4"):
-        make_learner(env, small())
+    for values, message in (
+        ({}, "num_envs: 32 is not allowed; it must be 4"),
+        ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
+        ({"num_envs": 4, "network": {"recurrent": True, "chunk_length": 3}}, "rollout_steps: 8 .* chunk_length"),
+        ({"num_envs": 4, "curriculum__assistance": 1.0}, "curriculum.assistance: 1.0 is not allowed"),
+        ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
+    ):
+        with pytest.raises(InputError, match=f"^{message}"):
+            make_learner(env, small(**values))

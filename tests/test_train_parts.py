@@ -27,23 +27,23 @@ KEY = jax.random.PRNGKey(0)
 
 def test_gae_by_hand_with_termination_truncation_and_going_on() -> None:
     gamma, lam = 0.5, 0.5
-    # three worlds: the step at t = 1 terminates, truncates, goes on
+    # three environments: the step at t = 1 terminates, truncates, goes on
     reward = jnp.ones((3, 3))
     value = jnp.full((3, 3), 2.0)
     next_value = jnp.full((3, 3), 4.0)
     terminated = jnp.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]], bool)
     done = jnp.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]], bool)
-    advantage, target = gae(reward, value, next_value, terminated, done, gamma=gamma, lam=lam)
+    advantage, target = gae(reward, value, next_value, terminated, done, gamma=gamma, gae_lambda=lam)
     # delta = 1 + 0.5 x 4 - 2 = 1, or 1 - 2 = -1 where terminated; trace decays by 0.25
     expected = [[1 - 0.25, 1 + 0.25, 1 + 0.25 * 1.25], [-1, 1, 1.25], [1, 1, 1]]
     np.testing.assert_allclose(advantage, expected, rtol=1e-6)
     np.testing.assert_allclose(target, advantage + 2.0)
 
 
-def test_gae_broadcasts_world_flags_over_agents() -> None:
+def test_gae_broadcasts_flags_over_agents() -> None:
     shape = (4, 3, 2)
     done = jnp.zeros((4, 3), bool).at[1].set(True)
-    advantage, _ = gae(jnp.ones(shape), jnp.zeros(shape), jnp.ones(shape), done, done, gamma=0.9, lam=1.0)
+    advantage, _ = gae(jnp.ones(shape), jnp.zeros(shape), jnp.ones(shape), done, done, gamma=0.9, gae_lambda=1.0)
     assert advantage.shape == shape
     np.testing.assert_allclose(advantage[1], 1.0)
 
@@ -78,9 +78,13 @@ def test_gaussian_density_entropy_and_divergence() -> None:
 def test_ratio_functions_by_hand() -> None:
     new = jnp.array([[0.1, 0.2], [0.3, 0.4]])  # 2 agents, 2 dimensions
     old = jnp.zeros((2, 2))
-    np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
-    np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
-    np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
+    both, rivals = ((0, 1),), ((1,), (0,))
+    np.testing.assert_allclose(loss.ratio_per_agent(new, old, both), [[0.3], [0.7]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_per_dimension(new, old, both), new)
+    np.testing.assert_allclose(loss.ratio_joint(new, old, both), [[1.0]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_joint(new, old, rivals), [[0.7], [0.3]], rtol=1e-6)
+    np.testing.assert_allclose(loss.team_mean(new[:, 0], both), [0.2], rtol=1e-6)
+    np.testing.assert_allclose(loss.team_mean(new[:, 0], rivals), [0.3, 0.1], rtol=1e-6)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import csv
+import dataclasses
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,12 +19,14 @@ from jax.experimental.compilation_cache import compilation_cache
 from probes import Probe
 from safetensors.numpy import save_file
 
+from mqe_jax.errors import InputError, NonFiniteError
+from mqe_jax.settings import build, override
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train.checkpoint import latest, list_checkpoints, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.policy import load_policy
+from mqe_jax.train.policy import load_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -33,15 +37,13 @@ def settings(**values: Any) -> TrainConfig:
         "num_envs": 4,
         "total_steps": 5 * 16,
         "rollout_steps": 4,
-        "epochs": 2,
-        "minibatches": 2,
-        "hidden_sizes": (4,),
-        "gru_size": 4,
-        "normalize_observations": True,
-        "learning_rate_schedule": "linear",
-        "checkpoint_every": 2,
+        "ppo": {"epochs": 2, "minibatches": 2},
+        "network": {"hidden_sizes": (4,), "gru_size": 4},
+        "normalization": {"observations": True},
+        "optimizer": {"schedule": "linear"},
+        "checkpoint": {"every": 2},
     }
-    return TrainConfig(**{**defaults, **values})
+    return override(build(TrainConfig, defaults), {name.replace("__", "."): value for name, value in values.items()})
 
 
 def rows(run_dir: Path) -> list[dict[str, str]]:
@@ -129,9 +131,81 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
     assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
     with pytest.raises(ValueError, match="already holds a run"):
         train(PROBE, settings(), run_dir)
-    with pytest.raises(ValueError, match=r"gamma: 0\.5 differs from the run"):
-        train(PROBE, settings(gamma=0.5), run_dir, resume=True)
+    with pytest.raises(ValueError, match=r"ppo.gamma: 0\.5 differs from the run"):
+        train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     assert load_run_config(run_dir) == settings()
+
+
+@pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml"])
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: bool, tmp_path: Path) -> None:
+    (tmp_path / left).write_text("a user's work")
+    with pytest.raises(InputError, match=f"{left}.*name another folder"):
+        train(PROBE, settings(), tmp_path, resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == [left]
+    assert (tmp_path / left).read_text() == "a user's work"
+
+
+def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None:
+    def again(state: TrainState, row: dict[str, float]) -> None:
+        for resume in (False, True):
+            with pytest.raises(InputError, match=r"already holds a run|in use by another training"):
+                train(PROBE, settings(), tmp_path, resume=resume)
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(PROBE, settings(), tmp_path, on_update=again)
+
+
+def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path) -> None:
+    def kill(state: TrainState, row: dict[str, float]) -> None:
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(PROBE, settings(), tmp_path, on_update=kill)
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["step_000000000000.safetensors"]
+    train(PROBE, settings(), tmp_path, resume=True)
+    assert len(rows(tmp_path)) == 5
+
+
+def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays NaN where an action is above 3 standard deviations or so."""
+    return jnp.where(action[:, 0, 0] > 2.0, jnp.nan, 0.0)
+
+
+def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path) -> None:
+    env = Probe(probes.show_hidden_first, pay_nan_later, num_envs=4)
+    with pytest.raises(NonFiniteError, match=r"update \d+ \(\d+ environment steps\) made loss/"):
+        train(env, settings(total_steps=100 * 16, network={"recurrent": False, "log_std_init": -0.5}), tmp_path)
+    logged = rows(tmp_path)
+    assert len(logged) >= 1 and all(row["loss/value"] != "nan" for row in logged)
+    newest = latest(tmp_path)
+    assert newest is not None and int(newest.stem.removeprefix("step_")) <= int(logged[-1]["env_steps"])
+    load_policy(tmp_path)
+
+
+def spoil(path: Path, kind: str) -> None:
+    """Writes NaN into the first weight of a saved file."""
+    arrays, metadata = checkpoints._read(path, kind)
+    arrays[next(name for name in arrays if name.endswith("weight"))][0] = np.nan
+    save_tree(path, arrays, metadata, kind=kind)
+
+
+def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(straight[0], run_dir)
+    newest = latest(run_dir)
+    assert newest is not None
+    spoil(newest, "checkpoint")
+    spoil(run_dir / "policy.safetensors", "policy")
+    with pytest.raises(InputError, match=r"policy.safetensors: .*weight holds NaN"):
+        load_policy(run_dir)
+    with pytest.raises(InputError, match=r"step_000000000080.safetensors: .*weight holds NaN"):
+        train(PROBE, settings(), run_dir, resume=True)
+    policy = load_policy(straight[0])
+    broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))
+    with pytest.raises(NonFiniteError):
+        save_policy(tmp_path, broken)
 
 
 def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path: Path) -> None:
@@ -155,7 +229,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
         policy.act(np.zeros((3, 3, 2)), memory)
     result = evaluate(PROBE, policy.act, 8, jax.random.PRNGKey(0), memory=policy.initial_memory(4))
-    assert result.episodes == 8 and result.mean_length == 4.0
+    assert result.episodes == 8 and result.episode_length == 4.0
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
@@ -199,7 +273,7 @@ def test_old_checkpoints_and_left_overs_go(tmp_path: Path) -> None:
 def damage_nothing_but_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoints, "VERSION", 99)
     save_tree(path, TREE, {}, kind="checkpoint")
-    monkeypatch.setattr(checkpoints, "VERSION", 1)
+    monkeypatch.setattr(checkpoints, "VERSION", 2)
 
 
 def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +300,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     save_file({"a": np.zeros(3)}, path)
     assert "not a file of this package" in error_of()
     damage_nothing_but_version(path, monkeypatch)
-    assert "version 99; version 1 is needed" in error_of()
+    assert "version 99; version 2 is needed" in error_of()
     path.write_bytes(whole)
     assert "a has shape (2, 3); (2, 4) is needed" in error_of({**TREE, "a": jnp.zeros((2, 4))})
     assert "a has dtype float32; int32" in error_of({**TREE, "a": jnp.zeros((2, 3), jnp.int32)})
@@ -234,7 +308,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "holds c/0" in error_of({k: v for k, v in TREE.items() if k != "c"})
 
 
-def test_evaluation_counts_the_first_episodes_of_every_world() -> None:
+def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     """Short episodes (2 steps, successes) do not crowd out long ones (30 steps)."""
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30)
 
@@ -242,10 +316,11 @@ def test_evaluation_counts_the_first_episodes_of_every_world() -> None:
         return jnp.zeros((4, 2, 1)), memory + 1
 
     result = evaluate(env, act, 10, jax.random.PRNGKey(0), memory=jnp.zeros((4,)), block=7)
-    # 10 episodes over 4 worlds: 3, 3, 2, 2
+    # 10 episodes over 4 environments: 3, 3, 2, 2
     assert result.episodes == 10
     assert result.success_rate == pytest.approx(5 / 10)
-    assert result.mean_length == pytest.approx((5 * 2 + 5 * 30) / 10)
+    assert result.episode_length == pytest.approx((5 * 2 + 5 * 30) / 10)
+    assert result.episode_return == pytest.approx((5 * 2 + 5 * 30) / 10)  # 1 a step
     assert result.average_step_reward == pytest.approx(1.0)
     assert result.terms == {"pay": pytest.approx(1.0)}
     assert result.to_dict()["diverged"] == 0

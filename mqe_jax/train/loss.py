@@ -7,6 +7,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.train.types import Teams
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -60,21 +63,21 @@ def value_loss(
 ) -> jax.Array:
     """Returns the value loss per element: Huber (or half the square), clipped around `old_value`.
 
-    With `clip`, the larger of the loss of `value` and of `value` kept within `old_value` +- clip.
+    With `clip`, the larger of the losses of `value` and of `value` clipped to `old_value` +- clip.
     Shapes: all the same. Source: Yu et al., arXiv 2103.01955.
     """
 
     def loss(error: jax.Array) -> jax.Array:
         return 0.5 * jnp.square(error) if huber_delta is None else huber(error, huber_delta)
 
-    free = loss(value - target)
+    unclipped = loss(value - target)
     if clip is None:
-        return free
-    kept = old_value + jnp.clip(value - old_value, -clip, clip)
-    return jnp.maximum(free, loss(kept - target))
+        return unclipped
+    clipped = old_value + jnp.clip(value - old_value, -clip, clip)
+    return jnp.maximum(unclipped, loss(clipped - target))
 
 
-def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
+def ratio_per_agent(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
     """Returns one log-ratio per agent from log-densities per dimension: (..., A, D) -> (..., A, 1).
 
     Source: MAPPO, Yu et al., arXiv 2103.01955.
@@ -82,22 +85,28 @@ def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
     return jnp.sum(new - old, axis=-1, keepdims=True)
 
 
-def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
-    """Returns one log-ratio per action dimension, as OpenRL clips them: (..., A, D) -> (..., A, D)."""
+def ratio_per_dimension(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
+    """Returns one log-ratio per action dimension, as OpenRL does: (..., A, D) -> (..., A, D)."""
     return new - old
 
 
-def ratio_joint(new: jax.Array, old: jax.Array) -> jax.Array:
-    """Returns the log of the product of all agents' ratios: (..., A, D) -> (..., 1, 1).
+def ratio_joint(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
+    """Returns the log of the product of the ratios of each team's agents: (..., A, D) -> (..., teams, 1).
 
     Source: JRPO, PPO on the joint policy of a team.
     """
-    return jnp.sum(new - old, axis=(-2, -1), keepdims=True)
+    per_agent = jnp.sum(new - old, axis=-1)
+    return jnp.stack([jnp.sum(per_agent[..., np.array(team)], axis=-1) for team in teams], axis=-1)[..., None]
 
 
-RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+RATIOS: dict[str, Callable[[jax.Array, jax.Array, Teams], jax.Array]] = {
     "agent": ratio_per_agent,
     "dimension": ratio_per_dimension,
     "joint": ratio_joint,
 }
-"""What PPO clips, by the name that the settings give it."""
+"""Log-ratio functions by the name of `ppo.ratio`."""
+
+
+def team_mean(x: jax.Array, teams: Teams) -> jax.Array:
+    """Returns the mean over each team's agents: (..., A) -> (..., teams)."""
+    return jnp.stack([jnp.mean(x[..., np.array(team)], axis=-1) for team in teams], axis=-1)

@@ -196,7 +196,7 @@ def make_iteration(
             records["terminated"],
             done,
             gamma=config.gamma,
-            lam=config.gae_lambda,
+            gae_lambda=config.gae_lambda,
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
         old_log_std = learner.params["log_std"]
