@@ -50,14 +50,26 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
     network = make_learner(env, config).network
     seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
     value, _ = network.value(state.params, (), jnp.zeros((4, 2), bool), jnp.zeros((4, 2, 2, 7)), seen)
-    mean = state.value_normalizer.mean / state.value_normalizer.weight
-    square = state.value_normalizer.square / state.value_normalizer.weight
-    value = value * jnp.sqrt(square - mean**2) + mean
+    value = value_denormalize(state.value_normalizer, value)
     for agent in range(2):
         forever = np.full(4, 1 / (1 - 0.8))
         ending = [(1 - 0.8 ** (4 - s)) / (1 - 0.8) for s in range(4)]
         np.testing.assert_allclose(value[:, 0, agent], forever, atol=0.3)
         np.testing.assert_allclose(value[:, 1, agent], ending, atol=0.3)
+
+
+def test_small_rewards_are_learnt_as_large_ones() -> None:
+    """The same training at rewards of 1 and of 0.001: the same values up to the scale."""
+    values = []
+    for scale in (1.0, 1e-3):
+        env = Probe(probes.show_hidden, lambda h, a, s=scale: s * h, num_envs=16)
+        state, metrics = learn(env, small(num_envs=16, ppo__epochs=1), 30)
+        value, _ = make_learner(env, small(num_envs=16)).network.value(
+            state.params, (), jnp.zeros((1, 2), bool), jnp.zeros((1, 2, 2, 3)), jnp.array([[[1.0], [-1.0]]])
+        )
+        values.append(value_denormalize(state.value_normalizer, value[0]) / scale)
+        assert float(metrics["explained_variance"]) > 0.5
+    np.testing.assert_allclose(values[0], values[1], rtol=0.02)
 
 
 VARIANTS = {

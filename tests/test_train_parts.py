@@ -99,12 +99,22 @@ def test_running_statistics_merge_as_one_batch() -> None:
     np.testing.assert_allclose(running_normalize(constant, jnp.array([7.0])), [0.0], atol=1e-4)
 
 
-def test_value_statistics_are_debiased_and_invertible() -> None:
-    target = jnp.array([1.0, 3.0])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_value_statistics_are_debiased_and_invertible_at_any_scale(scale: float) -> None:
+    target = scale * jnp.array([1.0, 3.0])
     statistics = value_update(value_init(), target, 0.99)
     np.testing.assert_allclose(value_normalize(statistics, target), [-1.0, 1.0], rtol=1e-3)
-    np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target)
-    np.testing.assert_allclose(value_normalize(value_init(), target), target)
+    np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target, rtol=1e-6)
+
+
+def test_value_statistics_at_their_limits() -> None:
+    target = jnp.array([1.0, 3.0])
+    np.testing.assert_array_equal(value_normalize(value_init(enabled=False), target), target)
+    np.testing.assert_array_equal(value_denormalize(value_init(enabled=False), target), target)
+    np.testing.assert_array_equal(value_denormalize(value_init(), target), 0.0)
+    for constant in (0.0, 5.0):
+        statistics = value_update(value_init(), jnp.full((3,), constant), 0.99)
+        assert float(jnp.abs(value_normalize(statistics, jnp.float32(constant)))) < 0.1
 
 
 def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:

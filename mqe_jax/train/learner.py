@@ -109,7 +109,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
                 obs_normalizer=ObservationNormalizer(
                     running_init(env.observation_size), running_init(env.privileged_observation_size)
                 ),
-                value_normalizer=value_init(),
+                value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
                 rollout=RolloutState(
                     env_state=env_state,
