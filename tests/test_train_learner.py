@@ -184,3 +184,60 @@ def test_settings_must_fit_the_environment() -> None:
     ):
         with pytest.raises(InputError, match=f"^{message}"):
             make_learner(env, small(**values))
+
+
+class WrongSize(Probe):
+    @property
+    def observation_size(self) -> int:
+        return 7
+
+
+def test_a_wrong_observation_size_is_named() -> None:
+    env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
+    with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); its sizes say \(4, 2, 7\)"):
+        make_learner(env, small(num_envs=4))
+
+
+class Tuple(NamedTuple):
+    """A state that is a NamedTuple, without anything privileged; integer rewards, and a term of the score."""
+
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    step: jax.Array
+
+
+class Foreign:
+    """One agent; ends after 4 steps; nothing but its clock is observed."""
+
+    name, num_envs, num_agents, action_size = "foreign", 4, 1, 1
+    observation_size, privileged_observation_size, max_episode_steps = 1, 0, 4
+
+    def _state(self, step: jax.Array, done: jax.Array) -> Tuple:
+        obs, nothing = step[:, None, None].astype(jnp.float32), jnp.zeros((4, 0))
+        reward = jnp.ones((4, 1), jnp.int32)
+        return Tuple(obs, nothing, obs, nothing, reward, done, jnp.zeros(4, bool), {}, step)
+
+    def reset(self, key: jax.Array) -> Tuple:
+        return self._state(jnp.zeros(4, jnp.int32), jnp.zeros(4, bool))
+
+    def step(self, state: Tuple, action: jax.Array) -> Tuple:
+        step = state.step + 1
+        return self._state(jnp.where(step >= 4, 0, step), step >= 4)
+
+
+def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered() -> None:
+    config = small(num_envs=4, stagger_episodes=True, network__critic_input="observations", ppo__epochs=1)
+    config = override(config, {"normalization.observations": True})
+    config = override(config, {"curriculum.failure_bootstrap": 0.5})
+    state = make_learner(Foreign(), config).init(jax.random.PRNGKey(1))
+    assert len(np.unique(state.rollout.env_state.step)) > 1
+    _, metrics = learn(Foreign(), config, 1)
+    assert all(np.isfinite(float(value)) for value in metrics.values())
+    with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
+        make_learner(Foreign(), small(num_envs=4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -30,7 +31,7 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
 
     Source: Chan, Golub and LeVeque 1979, the parallel form of Welford's algorithm.
     """
-    batch = batch.reshape(-1, batch.shape[-1])
+    batch = batch.reshape(math.prod(batch.shape[:-1]), batch.shape[-1])
     batch_samples = jnp.float32(batch.shape[0])
     batch_mean = jnp.mean(batch, axis=0)
     batch_variance = jnp.mean(jnp.square(batch - batch_mean), axis=0)
