@@ -50,14 +50,26 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
     network = make_learner(env, config).network
     seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
     value, _ = network.value(state.params, (), jnp.zeros((4, 2), bool), jnp.zeros((4, 2, 2, 7)), seen)
-    mean = state.value_normalizer.mean / state.value_normalizer.weight
-    square = state.value_normalizer.square / state.value_normalizer.weight
-    value = value * jnp.sqrt(square - mean**2) + mean
+    value = value_denormalize(state.value_normalizer, value)
     for agent in range(2):
         forever = np.full(4, 1 / (1 - 0.8))
         ending = [(1 - 0.8 ** (4 - s)) / (1 - 0.8) for s in range(4)]
         np.testing.assert_allclose(value[:, 0, agent], forever, atol=0.3)
         np.testing.assert_allclose(value[:, 1, agent], ending, atol=0.3)
+
+
+def test_small_rewards_are_learnt_as_large_ones() -> None:
+    """The same training at rewards of 1 and of 0.001: the same values up to the scale."""
+    values = []
+    for scale in (1.0, 1e-3):
+        env = Probe(probes.show_hidden, lambda h, a, s=scale: s * h, num_envs=16)
+        state, metrics = learn(env, small(num_envs=16, ppo__epochs=1), 30)
+        value, _ = make_learner(env, small(num_envs=16)).network.value(
+            state.params, (), jnp.zeros((1, 2), bool), jnp.zeros((1, 2, 2, 3)), jnp.array([[[1.0], [-1.0]]])
+        )
+        values.append(value_denormalize(state.value_normalizer, value[0]) / scale)
+        assert float(metrics["explained_variance"]) > 0.5
+    np.testing.assert_allclose(values[0], values[1], rtol=0.02)
 
 
 VARIANTS = {
@@ -172,3 +184,60 @@ def test_settings_must_fit_the_environment() -> None:
     ):
         with pytest.raises(InputError, match=f"^{message}"):
             make_learner(env, small(**values))
+
+
+class WrongSize(Probe):
+    @property
+    def observation_size(self) -> int:
+        return 7
+
+
+def test_a_wrong_observation_size_is_named() -> None:
+    env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
+    with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); its sizes say \(4, 2, 7\)"):
+        make_learner(env, small(num_envs=4))
+
+
+class Tuple(NamedTuple):
+    """A state that is a NamedTuple, without anything privileged; integer rewards, and a term of the score."""
+
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    step: jax.Array
+
+
+class Foreign:
+    """One agent; ends after 4 steps; nothing but its clock is observed."""
+
+    name, num_envs, num_agents, action_size = "foreign", 4, 1, 1
+    observation_size, privileged_observation_size, max_episode_steps = 1, 0, 4
+
+    def _state(self, step: jax.Array, done: jax.Array) -> Tuple:
+        obs, nothing = step[:, None, None].astype(jnp.float32), jnp.zeros((4, 0))
+        reward = jnp.ones((4, 1), jnp.int32)
+        return Tuple(obs, nothing, obs, nothing, reward, done, jnp.zeros(4, bool), {}, step)
+
+    def reset(self, key: jax.Array) -> Tuple:
+        return self._state(jnp.zeros(4, jnp.int32), jnp.zeros(4, bool))
+
+    def step(self, state: Tuple, action: jax.Array) -> Tuple:
+        step = state.step + 1
+        return self._state(jnp.where(step >= 4, 0, step), step >= 4)
+
+
+def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered() -> None:
+    config = small(num_envs=4, stagger_episodes=True, network__critic_input="observations", ppo__epochs=1)
+    config = override(config, {"normalization.observations": True})
+    config = override(config, {"curriculum.failure_bootstrap": 0.5})
+    state = make_learner(Foreign(), config).init(jax.random.PRNGKey(1))
+    assert len(np.unique(state.rollout.env_state.step)) > 1
+    _, metrics = learn(Foreign(), config, 1)
+    assert all(np.isfinite(float(value)) for value in metrics.values())
+    with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
+        make_learner(Foreign(), small(num_envs=4))

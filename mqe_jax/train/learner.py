@@ -6,7 +6,6 @@ differ in the ratio that PPO clips, the kind of value, and the network; all thre
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
@@ -31,7 +31,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, Teams, Transition, VectorEnv, teams_of
+from mqe_jax.train.types import Batch, Params, Teams, Transition, VectorEnv, replace_fields, teams_of
 
 Metrics = dict[str, jax.Array]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -84,13 +84,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     Raises:
         InputError: where the settings do not fit the environment.
     """
-    if env.num_envs != config.num_envs:
-        fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
-    assistance = config.curriculum.assistance
-    if assistance and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "assistance"):
-        fail("curriculum.assistance", assistance, f"0: the state of the environment {env.name} has no such field")
-    if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
-        fail("stagger_episodes", True, f"false: the environment {env.name} has no max_episode_steps")
+    _check_environment(env, config)
     dims = env_dims(env, config)
     network = config.network.build(dims)
     _check_divisible(config, network)
@@ -109,7 +103,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
                 obs_normalizer=ObservationNormalizer(
                     running_init(env.observation_size), running_init(env.privileged_observation_size)
                 ),
-                value_normalizer=value_init(),
+                value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
                 rollout=RolloutState(
                     env_state=env_state,
@@ -166,6 +160,32 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     return Learner(init, update, network)
 
 
+def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
+    """Checks the shapes of the environment's state, and that it has what the settings need."""
+    if env.num_envs != config.num_envs:
+        fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
+    expected = {
+        "obs": (count, agents, env.observation_size),
+        "final_obs": (count, agents, env.observation_size),
+        "privileged_obs": (count, privileged),
+        "final_privileged_obs": (count, privileged),
+        "reward": (count, agents),
+        "terminated": (count,),
+        "truncated": (count,),
+    }
+    for name, shape in expected.items():
+        found = getattr(state, name).shape
+        if found != shape:
+            raise InputError(f"env: {name} of {env.name} has shape {found}; its sizes say {shape}")
+    assistance = config.curriculum.assistance
+    if assistance and not hasattr(state, "assistance"):
+        fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
+    if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
+        fail("stagger_episodes", True, f"false: {env.name} lacks max_episode_steps or its state a field step")
+
+
 def _check_divisible(config: TrainConfig, network: Network) -> None:
     """Checks that rollouts split into chunks, and these into minibatches."""
     if config.rollout_steps % network.chunk_length:
@@ -179,7 +199,7 @@ def _check_divisible(config: TrainConfig, network: Network) -> None:
 
 def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
     """Sets the assistance of every environment, which takes effect with its next episode."""
-    env_state = dataclasses.replace(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
+    env_state = replace_fields(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
     return state._replace(env_state=env_state)
 
 
@@ -187,7 +207,7 @@ def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
     """Sets every environment's clock to a random step, so that the first episodes end at different steps."""
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
     step = jax.random.randint(key, env_state.step.shape, 0, limit, env_state.step.dtype)
-    return dataclasses.replace(env_state, step=step)
+    return replace_fields(env_state, step=step)
 
 
 def _strongly_typed(state: TrainState) -> TrainState:
@@ -264,8 +284,9 @@ def _prepare(
 
 def _chunks(x: jax.Array, length: int) -> jax.Array:
     """Cuts time into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
-    x = x.reshape(x.shape[0] // length, length, *x.shape[1:])
-    return jnp.swapaxes(x, 0, 1).reshape(length, -1, *x.shape[3:])
+    parts, envs = x.shape[0] // length, x.shape[1]
+    x = x.reshape(parts, length, *x.shape[1:])
+    return jnp.swapaxes(x, 0, 1).reshape(length, parts * envs, *x.shape[3:])
 
 
 def _take(batch: Batch, index: jax.Array) -> Batch:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import jax
+
+from mqe_jax.errors import InputError
 
 PyTree = Any
 Params = dict[str, Any]
@@ -50,7 +53,8 @@ class VectorEnv(Protocol):
     of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to what it allows.
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default): joint ratios and joint values are
-    per team. `max_episode_steps` (int), which `stagger_episodes` needs.
+    per team. `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
+    which `curriculum.assistance` sets (see `replace_fields`).
     """
 
     @property
@@ -67,6 +71,21 @@ class VectorEnv(Protocol):
     def action_size(self) -> int: ...
     def reset(self, key: jax.Array) -> Any: ...
     def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
+def replace_fields(state: Any, **fields: jax.Array) -> Any:
+    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or with a `replace` of its own.
+
+    Raises:
+        InputError: for another kind of state.
+    """
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        return dataclasses.replace(state, **fields)
+    for method in ("_replace", "replace"):
+        if hasattr(state, method):
+            return getattr(state, method)(**fields)
+    kind = type(state).__name__
+    raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
 
 
 def teams_of(env: VectorEnv) -> Teams:
