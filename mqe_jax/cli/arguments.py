@@ -223,7 +223,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class WalkTrain:
-    """Train the walk policy's weights from scratch (GPU)."""
+    """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
     """Folder of the run: weights, curve, checkpoints."""
@@ -235,6 +235,12 @@ class WalkTrain:
     """PPO updates of 24 steps."""
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time limit, after which the training stops with everything saved, s."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to fine-tune, also of another robot. Default: from scratch."""
+    initial_std: float = 1.0
+    """Standard deviation of the actions at the start."""
+    curriculum: int = 400
+    """Iterations over which slopes, forces and kicks grow to their full size."""
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1
