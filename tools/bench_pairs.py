@@ -82,7 +82,6 @@ class Worker:
             env=os.environ | {"PYTHONPATH": path, "MQE_BENCH_FD": str(write)},
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
             pass_fds=(write,),
             text=True,
         )
