@@ -32,7 +32,7 @@ First steps:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "bench", "demo", "walk")
+COMMANDS = ("tasks", "train", "eval", "render", "replay", "bench", "demo", "walk")
 Repeated = tyro.conf.UseAppendAction
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
@@ -82,6 +82,16 @@ TaskRobot = Annotated[
 ]
 
 
+DumpDiverged = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="FOLDER",
+        help="Record the last 64 steps of environments whose physics diverges there (see `mqe replay`). "
+        "Keeps the states of two rollouts in memory.",
+    ),
+]
+
+
 @dataclass(frozen=True)
 class Tasks:
     """List the tasks with their agents, observation and action sizes, and time limits."""
@@ -109,6 +119,7 @@ class Train:
     control: Control = None
     robot: TaskRobot = None
     set: Set = field(default_factory=list)
+    dump_diverged: DumpDiverged = None
     settings: Annotated[Any, tyro.conf.Suppress] = None
 
     def run(self) -> dict[str, Any] | None:
@@ -140,6 +151,7 @@ class Eval:
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Folder of the run whose policy is used. Default: the run given."""
     set: Set = field(default_factory=list)
+    dump_diverged: DumpDiverged = None
 
     def run(self) -> dict[str, Any] | None:
         return _commands().evaluate(self)
@@ -178,6 +190,22 @@ class Render:
 
     def run(self) -> dict[str, Any] | None:
         return _commands().render(self)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Step a recording of a divergence again, and render it on request."""
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """Recording that `--dump-diverged` wrote (.npz)."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """Clip or picture to write: .mp4, .gif or .png."""
+    impl: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Engine: jax, warp or c. Default: the recorded one."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any] | None:
+        return _commands().replay(self)
 
 
 @dataclass(frozen=True)
@@ -312,6 +340,7 @@ def _parser(wanted: Sequence[str]) -> Any:
         Annotated[train, subcommand("train", description=Train.__doc__)],
         Annotated[Eval, subcommand("eval")],
         Annotated[Render, subcommand("render")],
+        Annotated[Replay, subcommand("replay")],
         Annotated[Bench, subcommand("bench")],
         Annotated[Demo, subcommand("demo")],
         Annotated[Walk, subcommand("walk")],

@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
-from mqe_jax.train.types import Memory, VectorEnv, teams_of
+from mqe_jax.train.types import Memory, PyTree, Recorder, Trace, VectorEnv, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable by JAX."""
@@ -62,6 +62,7 @@ def evaluate(
     memory: Memory = (),
     block: int = 50,
     max_steps: int = 1_000_000,
+    recorder: Recorder | None = None,
 ) -> EvalResult:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
@@ -76,6 +77,7 @@ def evaluate(
         memory: of `act` at an episode's start, leading axis N.
         block: steps per compiled call.
         max_steps: limit on the steps of an environment.
+        recorder: gets all steps, block by block.
 
     Raises:
         InputError: for `episodes` < 1, or where the environments do not finish within `max_steps`.
@@ -86,9 +88,12 @@ def evaluate(
     quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
     reset_key, key = jax.random.split(key)
     progress = jax.jit(lambda k: _begin(env, k, memory))(reset_key)
-    run = jax.jit(lambda p, k: _run_block(env, act, p, k, memory, jnp.asarray(quota), block))
+    snapshot = None if recorder is None else recorder.snapshot
+    run = jax.jit(lambda p, k: _run_block(env, act, p, k, memory, jnp.asarray(quota), block, snapshot))
     for done_steps in range(0, max_steps, block):
-        progress = run(progress, jax.random.fold_in(key, done_steps))
+        progress, trace = run(progress, jax.random.fold_in(key, done_steps))
+        if recorder is not None:
+            recorder.add(trace)
         if np.all(np.asarray(progress.finished) >= quota):
             return _result(env.name, episodes, progress)
     raise InputError(f"episodes: {episodes} episodes of {env.name} are not finished after {max_steps} steps")
@@ -109,14 +114,16 @@ def _run_block(
     initial_memory: Memory,
     quota: jax.Array,
     block: int,
-) -> _Progress:
+    snapshot: Callable[[Any], PyTree] | None,
+) -> tuple[_Progress, Any]:
     own = np.array(teams_of(env)[0])
 
-    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
+    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, Any]:
         action, memory = act(p.env_state.obs, p.memory, step_key)
         state = env.step(p.env_state, action)
         done = state.terminated | state.truncated
         counted = p.finished < quota
+        trace = () if snapshot is None else Trace(snapshot(p.env_state), action, state.metrics["diverged"])
 
         def restart(now: jax.Array, at_start: jax.Array) -> jax.Array:
             return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), at_start, now)
@@ -133,11 +140,10 @@ def _run_block(
                 step_sums=step_sums,
                 end_sums=end_sums,
             ),
-            None,
+            trace,
         )
 
-    progress, _ = jax.lax.scan(one_step, progress, jax.random.split(key, block))
-    return progress
+    return jax.lax.scan(one_step, progress, jax.random.split(key, block))
 
 
 def _result(task: str, episodes: int, progress: _Progress) -> EvalResult:

@@ -28,7 +28,7 @@ from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, CsvLog, ProgressLog, TensorBoardLog
 from mqe_jax.train.policy import POLICY_FILE, policy_of, save_policy
-from mqe_jax.train.types import VectorEnv
+from mqe_jax.train.types import Recorder, VectorEnv
 
 CONFIG_FILE = "config.yaml"
 
@@ -44,6 +44,7 @@ def train(
     run_dir: str | Path,
     resume: bool = False,
     on_update: OnUpdate | None = None,
+    recorder: Recorder | None = None,
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state.
 
@@ -53,6 +54,7 @@ def train(
         run_dir: folder for config.yaml, metrics.csv, tensorboard/, checkpoints/ and policy.safetensors.
         resume: continues a run in the folder exactly from its newest checkpoint; an empty folder starts a new run.
         on_update: called after every update with the state and its row of metrics.csv.
+        recorder: gets the steps of every rollout in which an environment diverged, and of the one before.
 
     Raises:
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
@@ -61,10 +63,10 @@ def train(
             on disk are those from before.
     """
     run_dir = Path(run_dir)
-    learner = make_learner(env, config)
+    learner = make_learner(env, config, None if recorder is None else recorder.snapshot)
     checkpoint = prepare_folder(run_dir, resume, (CONFIG_FILE, CSV_FILE, POLICY_FILE))
     with locked(run_dir):
-        return _train(env, learner, config, run_dir, checkpoint, on_update)
+        return _train(env, learner, config, run_dir, checkpoint, on_update, recorder)
 
 
 def _train(
@@ -74,6 +76,7 @@ def _train(
     run_dir: Path,
     checkpoint: Path | None,
     on_update: OnUpdate | None,
+    recorder: Recorder | None,
 ) -> TrainState:
     """Runs the updates that are left; the folder has been checked and locked."""
     state, seconds = _first_state(env, learner, config, checkpoint)
@@ -100,6 +103,8 @@ def _train(
             while env_steps < total_steps:
                 update_start = time.perf_counter()
                 after, metrics = update(state)
+                if recorder is not None:
+                    recorder.add(metrics.pop("trace"))
                 row = _row(after, jax.device_get(metrics), config, start_time, update_start)
                 _check_finite(after, row, run_dir)
                 for log in (csv_log, tensorboard_log, progress_log):

@@ -73,6 +73,25 @@ class VectorEnv(Protocol):
     def step(self, state: Any, action: jax.Array) -> Any: ...
 
 
+class Trace(NamedTuple):
+    """Consecutive steps of all environments, kept where divergences are recorded (T, N, ...)."""
+
+    snapshot: PyTree  # of the states before the actions
+    action: jax.Array  # (T, N, A, D), as the environment got it
+    diverged: jax.Array  # (T, N), the metric after the action
+
+
+class Recorder(Protocol):
+    """Records the steps that led to a divergence.
+
+    `snapshot(env_state)` returns what to keep of a state (N, ...), inside compiled code; `add(trace)` gets the steps
+    since the last call, and writes those of environments that diverged.
+    """
+
+    def snapshot(self, env_state: Any) -> PyTree: ...
+    def add(self, trace: Trace) -> None: ...
+
+
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
     """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or with a `replace` of its own.
 
