@@ -1,4 +1,4 @@
-"""Scripted policy of Traverse Bridge: along the centre line of the bridge, then past the opponent at its end."""
+"""Scripted policy of Traverse Bridge: push the opponent back from the end of the bridge, then walk beside it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ import jax.numpy as jnp
 
 from mqe_jax.planners.steering import Observation, go_to, pose
 
-_BRIDGE_END = 6.75  # m, x
-_GOAL = jnp.array([7.65, 0.75])  # m, on the far platform, beside its centre
+_LEAD = 1.0  # m, distance of the goal ahead of the robot, for full speed while it pushes
+_NEAR = 1.0  # m, distance of the opponent ahead within which the robot aims at its middle, so as not to slip past it
+_MAX_AIM = 0.1  # m, y; the feet are 0.15 m from the robot's middle, the bridge's edges 0.35 m
+_OFF_BRIDGE = 7.25  # m, x, beyond which the hind feet are on the far platform
+_REST = (7.6, 0.6)  # m, x and |y| of the goal on the far platform, on the side away from the opponent
 
 
 def plan_bridge(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3), each in its own frame."""
-    position, yaw = pose(obs["base"])
-    middle = jnp.stack([jnp.minimum(position[:, 0] + 1.0, 7.05), jnp.zeros(2)], axis=-1)
-    return go_to(position, yaw, jnp.where(position[:, :1] > _BRIDGE_END, _GOAL, middle))
+    (position, yaw), opponent = pose(obs["base"]), obs["opponent"][:, :2]
+    x, y = position.T
+    middle = jnp.where(opponent[:, 0] - x < _NEAR, jnp.clip(opponent[:, 1], -_MAX_AIM, _MAX_AIM), 0.0)
+    beside = jnp.where(y > opponent[:, 1], _REST[1], -_REST[1])
+    goal_x = jnp.where(x < _REST[0] - 0.1, x + _LEAD, _REST[0])
+    goal_y = jnp.where(x > _OFF_BRIDGE, beside, middle)
+    return go_to(position, yaw, jnp.stack([goal_x, goal_y], axis=-1))

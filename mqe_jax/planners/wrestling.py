@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from mqe_jax.planners.steering import Observation, go_to, pose
 
 _CENTER = jnp.array([3.1, 0.0])  # m, of the ring
-_AHEAD = 0.1  # m, forward offset of the contact point (the shoulders) from the trunk's centre
-_TURNED = 0.06  # rad, rotation of the pushing side towards the opponent; other values slip
+_AHEAD = 0.05  # m, forward offset of the contact point (the side between the legs) from the trunk's centre
 _STAND_OFF = 0.65  # m, distance from the opponent until the robot is side on
 _EDGE = (1.5, 1.64)  # m, range of the distance from the centre at which the robot turns back; grows with the opponent's
 
@@ -20,7 +19,7 @@ def plan_wrestling(obs: Observation) -> jax.Array:
     far = jnp.linalg.norm(opponent - _CENTER, axis=-1)
     outward = (opponent - _CENTER) / jnp.maximum(far, 1e-3)[:, None]
     left = jnp.stack([-outward[:, 1], outward[:, 0]], axis=-1)
-    heading = jnp.arctan2(left[:, 1], left[:, 0]) + _TURNED
+    heading = jnp.arctan2(left[:, 1], left[:, 0])
     apart = position - opponent
     along, across = jnp.sum(apart * outward, axis=-1), jnp.sum(apart * left, axis=-1) + _AHEAD
     side_on = (jnp.abs(jnp.sin(yaw - heading)) < 0.4) & (jnp.abs(across) < 0.12)
