@@ -1,12 +1,19 @@
-"""Errors of bad input, with the nearest allowed name."""
+"""The error of bad input, and suggestions of the nearest allowed name."""
 
 from __future__ import annotations
 
 import difflib
-from typing import Any
+from collections.abc import Iterable
 
 
-def nearest(word: str, known: Any) -> str:
+class InputError(ValueError):
+    """Bad input from a user: arguments, settings or files. The command line prints it as one line, exit code 2.
+
+    Any other exception is a defect of the program and keeps its traceback.
+    """
+
+
+def nearest(word: object, known: Iterable[object]) -> str:
     """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
     match = difflib.get_close_matches(str(word), [str(name) for name in known], 1, 0.5)
     return f" (did you mean {match[0]!r}?)" if match else ""

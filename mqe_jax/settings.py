@@ -1,0 +1,352 @@
+"""Typed, validated records of settings, built from keyword arguments, mappings, dotted names or YAML.
+
+A record is a frozen dataclass whose fields carry their types and bounds once, as annotations:
+
+    @record
+    class Ppo:
+        clip: Positive = 0.2
+        \"\"\"Half width of the clipping interval of the ratio.\"\"\"
+
+Fields are given by keyword. Every way of making a record, `Ppo(clip=0.1)` included, validates it, and raises an
+`InputError` of one line: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
+
+Numbers are finite unless a field is `AnyFloat`; booleans are not numbers; numpy scalars and strings such as "7e-4"
+(which YAML does not read as a number) are; "none" means None for an optional field.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, dataclass_transform
+
+import pydantic
+import yaml
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+from pydantic_core import ErrorDetails
+
+from mqe_jax.errors import InputError, nearest
+
+T = TypeVar("T")
+
+_CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Allowed:
+    """Annotation that says in words what a field allows, where its type and bounds alone do not."""
+
+    text: str
+
+
+def _not_nan(value: float) -> float:
+    if value != value:
+        raise ValueError("NaN")
+    return value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError("lowest first")
+    return value
+
+
+Positive = Annotated[float, Gt(0)]
+NonNegative = Annotated[float, Ge(0)]
+Fraction = Annotated[float, Ge(0), Le(1)]
+AnyFloat = Annotated[
+    float, pydantic.Field(allow_inf_nan=True), pydantic.AfterValidator(_not_nan), Allowed("a number, infinity included")
+]
+PositiveInt = Annotated[int, Gt(0)]
+NonNegativeInt = Annotated[int, Ge(0)]
+Range = Annotated[
+    tuple[float, float], pydantic.AfterValidator(_ordered), Allowed("two numbers (lowest, highest), in this order")
+]
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
+def record(cls: type[T]) -> type[T]:
+    """Makes a class a frozen, keyword-only dataclass that validates its fields.
+
+    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; nested
+    records get their path put before it. A subclass of a record must be decorated too.
+    """
+    hints = typing.get_type_hints(cls, include_extras=True)
+    cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
+    made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
+    init = made.__init__
+
+    @functools.wraps(init)
+    def checked_init(self: Any, **values: Any) -> None:
+        try:
+            init(self, **values)
+        except pydantic.ValidationError as error:
+            raise _one_line(made, values, error) from None
+
+    made.__init__ = checked_init
+    return typing.cast(type[T], made)
+
+
+def is_record(kind: object) -> bool:
+    """Returns whether a type (or an instance's type) was made by `record`."""
+    return dataclasses.is_dataclass(kind) and pydantic.dataclasses.is_pydantic_dataclass(
+        kind if isinstance(kind, type) else type(kind)
+    )
+
+
+def fail(name: str, value: object, allowed: str) -> NoReturn:
+    """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must be ...`."""
+    raise InputError(f"{name}: {value!r} is not allowed; it must be {allowed}")
+
+
+def build(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Builds a record from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
+
+    Raises:
+        InputError: for a value that is not allowed or an unknown name, with the nearest known one.
+    """
+    return kind(**_nested(kind, values))
+
+
+def override(settings: T, changes: Mapping[str, Any]) -> T:
+    """Returns a record with fields replaced, given as in `build`.
+
+    A nested record with a `name` field (a choice among several records) is replaced as a whole where the changes
+    name another one; free mappings are merged.
+
+    Raises:
+        InputError: as `build`.
+    """
+    return type(settings)(**_merged(settings, _nested(type(settings), changes)))
+
+
+def to_mapping(settings: Any) -> dict[str, Any]:
+    """Returns a record as nested mappings, lists and scalars that YAML and JSON can hold.
+
+    Raises:
+        InputError: for a value in a free mapping that is none of these.
+    """
+    return {field.name: _plain(field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings)}
+
+
+def load_yaml(path: str | Path) -> dict[str, Any]:
+    """Reads names and values from a YAML file; an empty file holds none.
+
+    Raises:
+        InputError: naming the file, where it cannot be read or is not a mapping.
+    """
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: cannot be read as YAML settings ({reason})") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: holds {type(values).__name__}; it must be a mapping of settings to values")
+    return {str(name): value for name, value in values.items()}
+
+
+def hints_of(kind: Any) -> dict[str, Any]:
+    """Returns the annotated types of a record's fields by name."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def describe(hint: Any) -> str:
+    """Returns in words what a field of this annotated type allows, such as 'a number greater than 0'."""
+    metadata: tuple[Any, ...] = ()
+    if typing.get_origin(hint) is Annotated:
+        hint, *rest = typing.get_args(hint)
+        metadata = tuple(rest)
+    for mark in metadata:
+        if isinstance(mark, Allowed):
+            return mark.text
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        kinds = [describe(part) for part in parts if part is not types.NoneType]
+        return " or ".join(kinds) + (", or none" if types.NoneType in parts else "")
+    if origin is Literal:
+        return "one of " + ", ".join(repr(part) for part in parts)
+    if origin is tuple:
+        return _describe_tuple(parts, metadata)
+    if hint in (int, float):
+        bounds = _bounds(metadata)
+        return f"{'an integer' if hint is int else 'a number' if bounds else 'a finite number'}{bounds}"
+    if is_record(hint) or origin in (dict, Mapping):
+        return "a mapping of names to values"
+    return {bool: "true or false", str: "a string"}.get(hint, f"a {getattr(hint, '__name__', hint)}")
+
+
+def _describe_tuple(parts: tuple[Any, ...], metadata: tuple[Any, ...]) -> str:
+    item = describe(parts[0]).removeprefix("an ").removeprefix("a ")
+    for singular in ("finite number", "number", "integer", "string"):
+        item = item.replace(singular, singular + "s", 1) if item.startswith(singular) else item
+    if parts[-1] is not Ellipsis:
+        return f"a list of {len(parts)} {item}"
+    least = next((mark.min_length for mark in metadata if isinstance(mark, MinLen)), 0)
+    return f"a list of {'one or more ' if least == 1 else f'{least} or more ' if least else ''}{item}"
+
+
+def _bounds(metadata: tuple[Any, ...]) -> str:
+    low = next((mark for mark in metadata if isinstance(mark, Gt | Ge)), None)
+    high = next((mark for mark in metadata if isinstance(mark, Lt | Le)), None)
+    if isinstance(low, Ge) and isinstance(high, Le):
+        return f" between {low.ge} and {high.le}"
+    below = "" if low is None else f" greater than {low.gt}" if isinstance(low, Gt) else f" of at least {low.ge}"
+    above = "" if high is None else f" less than {high.lt}" if isinstance(high, Lt) else f" of at most {high.le}"
+    return below + (" and" if below and above else "") + above
+
+
+# -- conversion before pydantic's own validation ---------------------------------------------------------------------
+
+
+def _lenient(hint: Any) -> Any:
+    """Returns an annotated type that also takes what YAML and numpy give for it, and no boolean for a number."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is ClassVar or hint is ClassVar:
+        return hint
+    if origin is Annotated:  # conversions come last in the annotation, which is first in time
+        kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
+        return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
+    if origin in (typing.Union, types.UnionType):
+        union = typing.Union[tuple(_lenient(part) for part in parts)]  # noqa: UP007
+        return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
+    if origin is tuple:
+        inner = tuple(part if part is Ellipsis else _lenient(part) for part in parts)
+        return Annotated[tuple[inner], pydantic.BeforeValidator(_listed)]  # type: ignore[valid-type]
+    before = {float: _number, int: _integer, bool: _boolean}.get(hint)
+    return hint if before is None else Annotated[hint, pydantic.BeforeValidator(before)]
+
+
+def _none(value: Any) -> Any:
+    return None if isinstance(value, str) and value.lower() == "none" else value
+
+
+def _listed(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _scalar(value: Any) -> Any:
+    """Returns the Python number of a numpy or JAX scalar, and anything else as it is."""
+    return value.item() if hasattr(value, "item") and not getattr(value, "shape", ()) else value
+
+
+def _number(value: Any) -> Any:
+    value = _scalar(value)
+    if isinstance(value, bool):
+        raise ValueError("a boolean")
+    return float(value) if isinstance(value, str) else value
+
+
+def _integer(value: Any) -> Any:
+    value = _number(value)
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _boolean(value: Any) -> bool:
+    value = _scalar(value)
+    if not isinstance(value, bool):
+        raise ValueError("not a boolean")
+    return value
+
+
+# -- names and messages ----------------------------------------------------------------------------------------------
+
+
+def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values with dotted names resolved into mappings, and records among them as mappings where merged."""
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        name, dot, rest = str(key).partition(".")
+        if dot:
+            value = {rest: value}
+        if isinstance(nested.get(name), Mapping) and isinstance(value, Mapping):
+            value = {**nested[name], **value}
+        nested[name] = value
+    hints = hints_of(kind)
+    for name, value in nested.items():
+        inner = _record_in(hints.get(name))
+        if inner is not None and isinstance(value, Mapping):
+            nested[name] = _nested(inner, value)
+    return nested
+
+
+def _record_in(hint: Any) -> Any:
+    """Returns the record type within an annotated or optional type, or None."""
+    if is_record(hint):
+        return hint
+    return next((found for part in typing.get_args(hint) if (found := _record_in(part)) is not None), None)
+
+
+def _merged(settings: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a record's fields as keyword arguments, with the changes merged in."""
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    for name, change in changes.items():
+        now = values.get(name)
+        if isinstance(change, Mapping) and is_record(now):
+            renamed = "name" in change and change["name"] != getattr(now, "name", None)
+            change = dict(change) if renamed else _merged(now, _nested(type(now), change))
+        elif isinstance(change, Mapping) and isinstance(now, Mapping):
+            change = {**now, **change}
+        values[name] = change
+    return values
+
+
+def _plain(name: str, value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if is_record(value):
+        return {key: _plain(f"{name}.{key}", item) for key, item in to_mapping(value).items()}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(f"{name}.{key}", item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(f"{name}[{i}]", item) for i, item in enumerate(value)]
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    fail(name, value, "a number, a string, true, false, none, or lists and mappings of these")
+
+
+def _one_line(kind: Any, values: Any, error: pydantic.ValidationError) -> InputError:
+    """Returns the first error of a validation: path, value, and what is allowed."""
+    first: ErrorDetails = error.errors(include_url=False)[0]
+    path, where, value = _locate(kind, values, first)
+    raised = first.get("ctx", {}).get("error")
+    if isinstance(raised, InputError):
+        return InputError(".".join([*path, str(raised)]))
+    name = ".".join(path)
+    if first["type"] == "unexpected_keyword_argument":
+        known = list(hints_of(where))
+        unknown = str(first["loc"][-1])
+        return InputError(
+            f"{'.'.join([*path, unknown])}: unknown name (value {first['input']!r}){nearest(unknown, known)}; "
+            f"allowed: {', '.join(known)}"
+        )
+    if first["type"] == "missing":
+        return InputError(f"{name}: is missing; it must be {describe(where)}")
+    suggestion = nearest(value, typing.get_args(where)) if isinstance(value, str) else ""
+    return InputError(f"{name}: {value!r} is not allowed; it must be {describe(where)}{suggestion}")
+
+
+def _locate(kind: Any, values: Any, error: ErrorDetails) -> tuple[list[str], Any, Any]:
+    """Returns the path of the field at fault, its annotated type, and the value given for it."""
+    path: list[str] = []
+    where = kind
+    for part in error["loc"]:
+        inner = _record_in(where)
+        if inner is None:
+            break
+        hints = hints_of(inner)
+        if part in hints:
+            path.append(str(part))
+            where = hints[part]
+            values = values.get(part) if isinstance(values, Mapping) else getattr(values, str(part), None)
+        else:
+            where = inner
+    return path, where, values

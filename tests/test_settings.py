@@ -1,0 +1,161 @@
+"""Records of settings: what is accepted, and that every mistake is one line with the path, the value and the bounds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+from annotated_types import Gt, MinLen
+
+from mqe_jax.errors import InputError
+from mqe_jax.settings import (
+    AnyFloat,
+    Fraction,
+    Positive,
+    PositiveInt,
+    Range,
+    build,
+    describe,
+    fail,
+    hints_of,
+    load_yaml,
+    override,
+    record,
+    to_mapping,
+)
+
+
+@record
+class Inner:
+    clip: Positive = 0.2
+    dual: Annotated[float, Gt(1)] | None = None
+    gamma: Fraction = 0.99
+    kind: Literal["agent", "joint"] = "agent"
+
+    def __post_init__(self) -> None:
+        if self.clip > 5.0 and self.kind == "joint":
+            fail("clip", self.clip, "at most 5 when kind is 'joint'")
+
+
+@record
+class Outer:
+    count: PositiveInt = 3
+    flag: bool = True
+    sizes: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64,)
+    span: Range | None = None
+    plain: float = 1.0
+    limit: AnyFloat = 1.0
+    inner: Inner = Inner()
+    free: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@record
+class Derived(Outer):
+    count: PositiveInt = 5
+    label: str | None = None
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"count": np.int32(4)}, {"count": 4}),
+        ({"count": "1e3"}, {"count": 1000}),
+        ({"plain": "7e-4"}, {"plain": 7e-4}),
+        ({"plain": 2}, {"plain": 2.0}),
+        ({"flag": np.False_}, {"flag": False}),
+        ({"sizes": np.array([3, 4])}, {"sizes": (3, 4)}),
+        ({"span": [0, 1]}, {"span": (0.0, 1.0)}),
+        ({"span": "none", "label": "none"}, {"span": None, "label": None}),
+        ({"limit": float("inf")}, {"limit": float("inf")}),
+        ({"inner": {"clip": np.float32(0.5)}, "inner.gamma": 0.5}, {"inner": Inner(clip=0.5, gamma=0.5)}),
+        ({"free": {"a.b": 3}, "free.c.d": 4}, {"free": {"a.b": 3, "c.d": 4}}),
+    ],
+)
+def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
+    made = build(Derived, values)
+    assert {name: getattr(made, name) for name in expected} == expected
+    assert [type(getattr(made, name)) for name in expected] == [type(value) for value in expected.values()]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"count": 0}, "count: 0 is not allowed; it must be an integer greater than 0"),
+        ({"count": 1.5}, "count: 1.5 is not allowed; it must be an integer"),
+        ({"count": True}, "count: True is not allowed"),
+        ({"flag": 1}, "flag: 1 is not allowed; it must be true or false"),
+        ({"plain": float("nan")}, "plain: nan is not allowed; it must be a finite number"),
+        ({"plain": "inf"}, "plain: 'inf' is not allowed; it must be a finite number"),
+        ({"limit": float("nan")}, "limit: nan is not allowed; it must be a number, infinity included"),
+        ({"sizes": 64}, "sizes: 64 is not allowed; it must be a list of one or more integers greater than 0"),
+        ({"sizes": []}, "sizes: [] is not allowed"),
+        ({"sizes": [1, -1]}, "sizes: [1, -1] is not allowed"),
+        ({"span": (1, 0)}, "span: (1, 0) is not allowed; it must be two numbers (lowest, highest)"),
+        ({"label": 3}, "label: 3 is not allowed; it must be a string, or none"),
+        ({"free": 3}, "free: 3 is not allowed; it must be a mapping"),
+        ({"cuont": 3}, "cuont: unknown name (value 3) (did you mean 'count'?); allowed: count, flag"),
+        ({"inner": 3}, "inner: 3 is not allowed; it must be a mapping"),
+        ({"inner.clip": "much"}, "inner.clip: 'much' is not allowed; it must be a number greater than 0"),
+        ({"inner.dual": 1}, "inner.dual: 1 is not allowed; it must be a number greater than 1, or none"),
+        ({"inner.gamma": 1.1}, "inner.gamma: 1.1 is not allowed; it must be a number between 0 and 1"),
+        ({"inner.kind": "agnet"}, "inner.kind: 'agnet' is not allowed; it must be one of 'agent', 'joint' (did you"),
+        ({"inner": {"clp": 1}}, "inner.clp: unknown name (value 1) (did you mean 'clip'?)"),
+        ({"inner": {"clip": 6, "kind": "joint"}}, "inner.clip: 6.0 is not allowed; it must be at most 5 when"),
+    ],
+)
+@pytest.mark.parametrize("way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"])
+def test_refused_in_one_line(way: Callable[..., Any], values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as error:
+        way(Derived, values)
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def test_keywords_and_replacement_are_validated_too() -> None:
+    with pytest.raises(InputError, match=r"^clip: 0 is not allowed"):
+        Inner(clip=0)
+    with pytest.raises(InputError, match=r"^count: 0 is not allowed"):
+        dataclasses.replace(Outer(), count=0)
+
+
+def test_overriding_merges_nested_records_and_free_mappings() -> None:
+    first = build(Derived, {"inner.clip": 0.5, "free": {"a": 1}})
+    second = override(first, {"inner": {"gamma": 0.5}, "free.b": 2, "label": "x"})
+    assert second == Derived(inner=Inner(clip=0.5, gamma=0.5), free={"a": 1, "b": 2}, label="x")
+    assert first.free == {"a": 1}
+
+
+def test_to_a_mapping_and_back(tmp_path: Path) -> None:
+    made = Derived(sizes=(1, 2), inner=Inner(dual=3.0), free={"range": (0, np.float64(1.0))})
+    mapping = to_mapping(made)
+    assert mapping["free"] == {"range": [0, 1.0]}
+    assert mapping["inner"] == {"clip": 0.2, "dual": 3.0, "gamma": 0.99, "kind": "agent"}
+    assert to_mapping(build(Derived, mapping)) == mapping
+    with pytest.raises(InputError, match=r"^free\.x: <object"):
+        to_mapping(Outer(free={"x": object()}))
+
+
+def test_files(tmp_path: Path) -> None:
+    path = tmp_path / "file.yaml"
+    path.write_text("a: 1")
+    assert load_yaml(path) == {"a": 1}
+    path.write_text("")
+    assert load_yaml(path) == {}
+    for text, message in (("a: [", "file.yaml: cannot be read as YAML"), ("3", "file.yaml: holds int; it must be")):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message) as error:
+            load_yaml(path)
+        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match=r"missing\.yaml: cannot be read"):
+        load_yaml(tmp_path / "missing.yaml")
+
+
+def test_descriptions_of_fields() -> None:
+    words = {name: describe(hint) for name, hint in hints_of(Outer).items()}
+    assert words["count"] == "an integer greater than 0"
+    assert words["span"] == "two numbers (lowest, highest), in this order, or none"
+    assert describe(hints_of(Inner)["gamma"]) == "a number between 0 and 1"
