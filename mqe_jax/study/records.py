@@ -1,7 +1,7 @@
 """Raw data of a study: for each run a small CSV of its curve and a JSON of its evaluations.
 
-    FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    at most 100 rows, 10 columns, 6 digits
-    FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, evaluations during training, absolute metric
+FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    at most 100 rows, 10 columns, 6 digits
+FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, evaluations during training, absolute metric
 """
 
 from __future__ import annotations
