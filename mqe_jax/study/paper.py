@@ -44,7 +44,7 @@ VALUES: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 """Setting -> task -> algorithm -> average step reward. From scratch only the best algorithm's value is legible."""
 
 GATE_TERMS: Mapping[str, str] = {"reward/approach": "Distance to Target Reward", "reward/success": "Success Reward"}
-"""Reward terms of go1gate in the appendix figure (MAPPO, first 20 M steps, mean of 5 seeds), by column of metrics.csv."""
+"""Reward terms of go1gate in the appendix figure (MAPPO, first 20 M steps, mean of 5 seeds), by column name."""
 
 GATE_STEPS = 20_000_000
 """Environment steps of the appendix figure."""

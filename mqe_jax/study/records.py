@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -72,7 +73,7 @@ def thin(curve: Curve) -> Curve:
     names = [*(name for name in COLUMNS if name in curve), *terms][:MAX_COLUMNS]
     thinned: Curve = {}
     for name in names:
-        parts = [curve[name][a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        parts = [curve[name][a:b] for a, b in itertools.pairwise(ends)]
         at_end = name in ("env_steps", "seconds")
         thinned[name] = np.array([part[-1] if at_end else _mean(part) for part in parts])
     return thinned

@@ -70,7 +70,7 @@ def report(folder: Path) -> list[Path]:
 
 
 _EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% stratified bootstrap interval.
-`training`: average step reward over the last {_LAST:.0%} of the training's steps, as the paper's figure has it. `absolute`:
+`training`: average step reward over the last {_LAST:.0%} of the training's steps, as in the paper's figure. `absolute`:
 average step reward of the best checkpoint over the final evaluation's episodes, actions drawn; `success` likewise.
 `paper`: read off the paper's figure after 40 M steps (from scratch: the best algorithm's value)."""
 _SETTINGS = {paper.HIERARCHICAL: "walk policy", paper.SCRATCH: "from scratch"}
