@@ -32,7 +32,7 @@ class Probe:
     """N worlds with one random sign `hidden` per episode.
 
     `show(hidden (N,), step (N,)) -> (N, F)` is what agents see besides their id;
-    `pay(hidden, action (N, A, D)) -> (N,)` is the team's reward. Episodes of even worlds end after
+    `pay(hidden, action (N, A, D))` is the team's reward (N,), or each agent's own (N, A). Episodes of even worlds end after
     `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates` says whether
     that is a termination (with `even_truncate` only in odd worlds). The shorter kind is a success.
     """
@@ -87,6 +87,8 @@ class Probe:
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
         key, draw = jax.random.split(state.key)
         pay = self.pay(state.hidden, action)
+        own = jnp.broadcast_to(pay.reshape(self.num_envs, -1), (self.num_envs, self.num_agents))
+        pay = jnp.mean(own, axis=-1)
         step = state.step + 1
         odd = self.odd_episode_steps or self.max_episode_steps
         limit = jnp.where(jnp.arange(self.num_envs) % 2, odd, self.max_episode_steps)
@@ -105,7 +107,7 @@ class Probe:
             privileged_obs=privileged,
             final_obs=final_obs,
             final_privileged_obs=final_privileged,
-            reward=jnp.broadcast_to(pay[:, None], (self.num_envs, self.num_agents)),
+            reward=own,
             terminated=done & terminates,
             truncated=done & ~terminates,
             metrics={
@@ -149,3 +151,18 @@ def pay_sum_and_difference(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Pays most where agent 0 does half the sign and agent 1 the opposite: no agent's best act is its own."""
     first, second = action[:, 0, 0], action[:, 1, 0]
     return -jnp.square(first + second) - 0.25 * jnp.square(first - second - hidden)
+
+
+def pay_public_good(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays each agent 0.75 times the sum of all contributions in [-1, 1] less its own.
+
+    What an agent gives costs it a quarter and gains two of them a half: +0.5 each where both give all, -0.5 each where
+    each does what is best for itself.
+    """
+    given = jnp.clip(action[..., 0], -1.0, 1.0)
+    return 0.75 * jnp.sum(given, axis=-1, keepdims=True) - given
+
+
+def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays most where both agents do the same: -2 variances where they draw independently, -1 where one sees."""
+    return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
