@@ -10,7 +10,7 @@ from fake_env import FakeEnv, FakeVectorEnv
 from mqe_jax import cli
 from mqe_jax.cli import arguments, commands
 
-SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--minibatches", "1"]
+SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +58,9 @@ def test_every_training_setting_has_a_flag_with_its_meaning(capfd: pytest.Captur
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
     out = " ".join(capfd.readouterr().out.replace("│", " ").split())
-    assert "--gae-lambda" in out and "Decay of the advantage estimate's trace." in out
+    assert "--ppo.gae-lambda" in out and "Trace decay of generalised advantage estimation." in out
+    assert "a number between 0 and 1; default: 0.95" in out
+    assert "--network.hidden-sizes" in out and "--seed" in out
 
 
 def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
@@ -128,7 +130,9 @@ BAD = {
     "no run": (["eval", "."], ["config.yaml"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
     "config file": (["train", "fake", "--config", "none.yaml"], ["none.yaml"]),
-    "setting": (["train", "fake", "--gamma", "2"], ["gamma", "2", "between 0 and 1"]),
+    "setting": (["train", "fake", "--ppo.gamma", "2"], ["ppo.gamma", "2", "between 0 and 1"]),
+    "setting's type": (["train", "fake", "--ppo.clip", "much"], ["ppo.clip: 'much'", "a number greater than 0"]),
+    "network's setting": (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network.hidden_sizes: [8, 0]"]),
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .gif, .png"]),
     "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),

@@ -1,4 +1,4 @@
-"""Settings: every file loads, every mistake is named."""
+"""Training settings: every file loads, every mistake is named."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from mqe_jax.train.config import TrainConfig, config_from_mapping, config_to_mapping, load_config
+from mqe_jax.errors import InputError
+from mqe_jax.settings import build, override, to_mapping
+from mqe_jax.train.config import TrainConfig, load_config
 
 CONFIGS = Path(__file__).parent.parent / "configs"
+RESULTS = Path(__file__).parent.parent / "results"
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [*sorted(CONFIGS.glob("*.yaml")), *sorted(RESULTS.glob("gate/*/config.yaml"))], ids=str
+)
 def test_every_file_loads(path: Path) -> None:
     assert load_config(path).num_updates > 0
 
@@ -22,57 +28,38 @@ def test_the_papers_file_is_the_default() -> None:
 
 
 def test_there_and_back() -> None:
-    config = TrainConfig(hidden_sizes=(32, 16), env={"episode_length": 3})
-    assert config_from_mapping(config_to_mapping(config)) == config
-    assert config_to_mapping(TrainConfig(env={"range": (0, 1)}))["env"] == {"range": [0, 1]}
-    with pytest.raises(ValueError, match=r"env\.seed: .*object"):
-        config_to_mapping(TrainConfig(env={"seed": object()}))
+    config = build(TrainConfig, {"network.hidden_sizes": (32, 16), "ppo.dual_clip": 3, "env": {"episode_length": 3}})
+    text = yaml.safe_dump(to_mapping(config))
+    assert build(TrainConfig, yaml.safe_load(text)) == config
+    assert yaml.safe_load(text)["network"]["name"] == "actor_critic"
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"learning_rat": 1.0}, "learning_rat: unknown setting.*did you mean 'learning_rate'"),
-        ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be greater than 0"),
-        ({"num_envs": 1.5}, "num_envs: 1.5 .* a whole number"),
-        ({"num_envs": True}, "num_envs: True .* a whole number"),
-        ({"gamma": 1.1}, "gamma: 1.1 .* between 0 and 1"),
-        ({"gamma": "much"}, "gamma: 'much' .* a number"),
-        ({"gamma": float("nan")}, "gamma: nan .* a number"),
-        ({"ratio": "agnet"}, "ratio: 'agnet' .* did you mean 'agent'"),
-        ({"recurrent": 1}, "recurrent: 1 .* true or false"),
-        ({"hidden_sizes": 64}, "hidden_sizes: 64 .* a list"),
-        ({"hidden_sizes": []}, "hidden_sizes"),
-        ({"env": 3}, "env: 3 .* a mapping"),
-        ({"minibatches": 7}, "minibatches: 7 .* divisor"),
-        ({"chunk_length": 3}, "chunk_length: 3 .* divisor of rollout_steps"),
-        ({"ratio": "joint"}, "value: 'agent' .* 'joint' when ratio is 'joint'"),
-        ({"dual_clip": 0.5}, "dual_clip: 0.5 .* greater than 1"),
+        ({"ppo": {"gama": 1.0}}, "ppo.gama: unknown name .*did you mean 'gamma'"),
+        ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be an integer greater than 0"),
+        ({"ppo.ratio": "joint"}, "ppo.value: 'agent' .* 'joint' when ppo.ratio is 'joint'"),
+        ({"ppo.dual_clip": 0.5}, "ppo.dual_clip: 0.5 .* greater than 1"),
+        ({"network.hidden_sizes": []}, "network.hidden_sizes: .* one or more integers greater than 0"),
+        ({"network.hidden_size": 3}, "network.hidden_size: unknown name .* 'hidden_sizes'"),
+        ({"network.name": "actor_crtic"}, "network.name: 'actor_crtic' .* a registered network: .*actor_critic"),
+        ({"network.log_std_min": 1.0}, r"network.log_std_init: 0.0 .* at least log_std_min \(1.0\)"),
+        ({"network": 3}, "network: 3 is not allowed; it must be a mapping of a network's settings"),
     ],
 )
-def test_mistakes_name_field_value_and_what_is_allowed(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        config_from_mapping(values)
+@pytest.mark.parametrize("way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"])
+def test_mistakes_name_field_value_and_what_is_allowed(way: Any, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}"):
+        way(TrainConfig, values)
 
 
 def test_a_file_with_a_mistake_is_named(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
-    for text, message in (
-        ("gama: 1", "bad.yaml: gama: .*'gamma'"),
-        ("a: [", "bad.yaml: cannot"),
-        ("3", "mapping"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=message) as error:
-            load_config(path)
-        assert "\n" not in str(error.value)
-    with pytest.raises(ValueError, match=r"missing\.yaml"):
-        load_config(tmp_path / "missing.yaml")
-
-
-def test_numbers_and_overrides(tmp_path: Path) -> None:
-    path = tmp_path / "run.yaml"
-    path.write_text("learning_rate: 1e-3\ntotal_steps: 4e6\ndual_clip: none\nenv: {a: 1, b: 2}\n")
-    config = load_config(path, seed=4, env={"b": 3})
-    assert (config.learning_rate, config.total_steps, config.dual_clip) == (1e-3, 4_000_000, None)
-    assert (config.seed, dict(config.env)) == (4, {"a": 1, "b": 3})
+    path.write_text("ppo: {gama: 1}")
+    with pytest.raises(InputError, match=r"bad.yaml: ppo.gama: .*'gamma'"):
+        load_config(path)
+    path.write_text("env: {a: 1}")
+    with pytest.raises(InputError, match=r"^ppo.clip: 0 "):
+        load_config(path, {"ppo.clip": 0})
+    assert load_config(path, {"env": {"b": 2}}).env == {"a": 1, "b": 2}

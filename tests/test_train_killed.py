@@ -13,18 +13,18 @@ import numpy as np
 
 from mqe_jax.train.checkpoint import list_checkpoints
 
-STEPS, WORLDS, ROLLOUT = 12, 4, 8
+STEPS, ENVS, ROLLOUT = 12, 4, 8
 
 
 def start(run_dir: Path, *flags: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
-    command += ["--run-dir", str(run_dir), "--num-envs", str(WORLDS), "--rollout-steps", str(ROLLOUT)]
-    command += ["--total-steps", str(STEPS * WORLDS * ROLLOUT), "--minibatches", "2", "--checkpoint-every", "1"]
+    command += ["--run-dir", str(run_dir), "--num-envs", str(ENVS), "--rollout-steps", str(ROLLOUT)]
+    command += ["--total-steps", str(STEPS * ENVS * ROLLOUT), "--ppo.minibatches", "2", "--checkpoint.every", "1"]
     return subprocess.Popen([*command, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
 
 
 def newest(run_dir: Path) -> dict[str, np.ndarray]:
-    """Everything in the last checkpoint by name: parameters, optimiser, worlds, keys."""
+    """Everything in the last checkpoint by name: parameters, optimiser, environments, keys."""
     from safetensors.numpy import load_file
 
     return load_file(max(list_checkpoints(run_dir)))

@@ -11,29 +11,24 @@ import probes
 import pytest
 from probes import Probe
 
+from mqe_jax.errors import InputError
+from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.types import VectorEnv
 
 
 def small(**values: Any) -> TrainConfig:
-    """Returns settings that learn a probe in seconds."""
-    return TrainConfig(
-        **{
-            "num_envs": 32,
-            "total_steps": 100_000,
-            "rollout_steps": 8,
-            "epochs": 4,
-            "minibatches": 2,
-            "learning_rate": 1e-2,
-            "entropy_coef": 0.0,
-            "hidden_sizes": (16,),
-            "gru_size": 8,
-            "recurrent": False,
-            "log_std_init": -1.0,
-            **values,
-        }
-    )
+    """Returns settings that learn a probe in seconds; a double underscore is a dot: `ppo__clip=0.1`."""
+    settings = {
+        "num_envs": 32,
+        "total_steps": 100_000,
+        "rollout_steps": 8,
+        "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
+        "optimizer.learning_rate": 1e-2,
+        "network": {"hidden_sizes": (16,), "gru_size": 8, "recurrent": False, "log_std_init": -1.0},
+    }
+    return override(build(TrainConfig, settings), {name.replace("__", "."): value for name, value in values.items()})
 
 
 def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -49,7 +44,7 @@ def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState
 
 def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
     env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, even_truncate=True)
-    config = small(gamma=0.8, value_clip=None, value_norm_decay=0.9)
+    config = small(ppo__gamma=0.8, ppo__value_clip=None, normalization__value_decay=0.9)
     state, _ = learn(env, config, 60)
     network = make_learner(env, config).network
     seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
@@ -66,15 +61,12 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
 
 VARIANTS = {
     "mappo": {},
-    "jrpo": {"ratio": "joint", "value": "joint", "critic_input": "observations"},
+    "jrpo": {"ppo": {"ratio": "joint", "value": "joint"}, "network__critic_input": "observations"},
     "ippo": {
-        "share_policy": False,
-        "critic_input": "own",
-        "ratio": "dimension",
-        "dual_clip": 3.0,
-        "target_kl": 0.02,
-        "normalize_observations": True,
-        "action_mean": "tanh",
+        "network": {"share_policy": False, "critic_input": "own", "action_mean": "tanh"},
+        "ppo": {"ratio": "dimension", "dual_clip": 3.0},
+        "optimizer__target_kl": 0.02,
+        "normalization__observations": True,
     },
 }
 
@@ -89,7 +81,7 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
 
 def test_memory_carries_a_sign_through_an_episode() -> None:
     env = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=32)
-    config = small(recurrent=True, chunk_length=4, stagger_episodes=True)
+    config = small(network__recurrent=True, network__chunk_length=4, stagger_episodes=True)
     _, metrics = learn(env, config, 50)
     assert float(metrics["average_step_reward"]) > -0.06  # without memory at best -0.19
 
@@ -117,7 +109,9 @@ class OnePass(NamedTuple):
 def one_pass() -> OnePass:
     """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
-    learner = make_learner(env, small(num_envs=4, recurrent=True, chunk_length=4, epochs=1, minibatches=1))
+    learner = make_learner(
+        env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
+    )
     update = jax.jit(learner.update)
     states, all_metrics, traces = [jax.jit(learner.init)(jax.random.PRNGKey(0))], [], []
     for _ in range(3):
@@ -152,5 +146,12 @@ def test_success_is_averaged_over_episode_ends(one_pass: OnePass) -> None:
 
 def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    with pytest.raises(ValueError, match="num_envs: 32; the environment given has 4"):
-        make_learner(env, small())
+    for values, message in (
+        ({}, "num_envs: 32 is not allowed; it must be 4"),
+        ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
+        ({"num_envs": 4, "network": {"recurrent": True, "chunk_length": 3}}, "rollout_steps: 8 .* chunk_length"),
+        ({"num_envs": 4, "curriculum__assistance": 1.0}, "curriculum.assistance: 1.0 is not allowed"),
+        ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
+    ):
+        with pytest.raises(InputError, match=f"^{message}"):
+            make_learner(env, small(**values))

@@ -27,23 +27,23 @@ KEY = jax.random.PRNGKey(0)
 
 def test_gae_by_hand_with_termination_truncation_and_going_on() -> None:
     gamma, lam = 0.5, 0.5
-    # three worlds: the step at t = 1 terminates, truncates, goes on
+    # three environments: the step at t = 1 terminates, truncates, goes on
     reward = jnp.ones((3, 3))
     value = jnp.full((3, 3), 2.0)
     next_value = jnp.full((3, 3), 4.0)
     terminated = jnp.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]], bool)
     done = jnp.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]], bool)
-    advantage, target = gae(reward, value, next_value, terminated, done, gamma=gamma, lam=lam)
+    advantage, target = gae(reward, value, next_value, terminated, done, gamma=gamma, gae_lambda=lam)
     # delta = 1 + 0.5 x 4 - 2 = 1, or 1 - 2 = -1 where terminated; trace decays by 0.25
     expected = [[1 - 0.25, 1 + 0.25, 1 + 0.25 * 1.25], [-1, 1, 1.25], [1, 1, 1]]
     np.testing.assert_allclose(advantage, expected, rtol=1e-6)
     np.testing.assert_allclose(target, advantage + 2.0)
 
 
-def test_gae_broadcasts_world_flags_over_agents() -> None:
+def test_gae_broadcasts_flags_over_agents() -> None:
     shape = (4, 3, 2)
     done = jnp.zeros((4, 3), bool).at[1].set(True)
-    advantage, _ = gae(jnp.ones(shape), jnp.zeros(shape), jnp.ones(shape), done, done, gamma=0.9, lam=1.0)
+    advantage, _ = gae(jnp.ones(shape), jnp.zeros(shape), jnp.ones(shape), done, done, gamma=0.9, gae_lambda=1.0)
     assert advantage.shape == shape
     np.testing.assert_allclose(advantage[1], 1.0)
 

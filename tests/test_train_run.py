@@ -17,6 +17,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from probes import Probe
 from safetensors.numpy import save_file
 
+from mqe_jax.settings import build, override
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train.checkpoint import latest, list_checkpoints, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
@@ -33,15 +34,13 @@ def settings(**values: Any) -> TrainConfig:
         "num_envs": 4,
         "total_steps": 5 * 16,
         "rollout_steps": 4,
-        "epochs": 2,
-        "minibatches": 2,
-        "hidden_sizes": (4,),
-        "gru_size": 4,
-        "normalize_observations": True,
-        "learning_rate_schedule": "linear",
-        "checkpoint_every": 2,
+        "ppo": {"epochs": 2, "minibatches": 2},
+        "network": {"hidden_sizes": (4,), "gru_size": 4},
+        "normalization": {"observations": True},
+        "optimizer": {"schedule": "linear"},
+        "checkpoint": {"every": 2},
     }
-    return TrainConfig(**{**defaults, **values})
+    return override(build(TrainConfig, defaults), {name.replace("__", "."): value for name, value in values.items()})
 
 
 def rows(run_dir: Path) -> list[dict[str, str]]:
@@ -129,8 +128,8 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
     assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
     with pytest.raises(ValueError, match="already holds a run"):
         train(PROBE, settings(), run_dir)
-    with pytest.raises(ValueError, match=r"gamma: 0\.5 differs from the run"):
-        train(PROBE, settings(gamma=0.5), run_dir, resume=True)
+    with pytest.raises(ValueError, match=r"ppo.gamma: 0\.5 differs from the run"):
+        train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     assert load_run_config(run_dir) == settings()
 
 
@@ -199,7 +198,7 @@ def test_old_checkpoints_and_left_overs_go(tmp_path: Path) -> None:
 def damage_nothing_but_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoints, "VERSION", 99)
     save_tree(path, TREE, {}, kind="checkpoint")
-    monkeypatch.setattr(checkpoints, "VERSION", 1)
+    monkeypatch.setattr(checkpoints, "VERSION", 2)
 
 
 def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +225,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     save_file({"a": np.zeros(3)}, path)
     assert "not a file of this package" in error_of()
     damage_nothing_but_version(path, monkeypatch)
-    assert "version 99; version 1 is needed" in error_of()
+    assert "version 99; version 2 is needed" in error_of()
     path.write_bytes(whole)
     assert "a has shape (2, 3); (2, 4) is needed" in error_of({**TREE, "a": jnp.zeros((2, 4))})
     assert "a has dtype float32; int32" in error_of({**TREE, "a": jnp.zeros((2, 3), jnp.int32)})
@@ -234,7 +233,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "holds c/0" in error_of({k: v for k, v in TREE.items() if k != "c"})
 
 
-def test_evaluation_counts_the_first_episodes_of_every_world() -> None:
+def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     """Short episodes (2 steps, successes) do not crowd out long ones (30 steps)."""
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30)
 
@@ -242,7 +241,7 @@ def test_evaluation_counts_the_first_episodes_of_every_world() -> None:
         return jnp.zeros((4, 2, 1)), memory + 1
 
     result = evaluate(env, act, 10, jax.random.PRNGKey(0), memory=jnp.zeros((4,)), block=7)
-    # 10 episodes over 4 worlds: 3, 3, 2, 2
+    # 10 episodes over 4 environments: 3, 3, 2, 2
     assert result.episodes == 10
     assert result.success_rate == pytest.approx(5 / 10)
     assert result.mean_length == pytest.approx((5 * 2 + 5 * 30) / 10)

@@ -1,18 +1,15 @@
-"""Command line `mqe`: arguments and messages; the work is done in `mqe_jax.cli.commands`.
+"""Arguments of `mqe`; the commands are implemented in `mqe_jax.cli.commands`.
 
 Nothing heavy is imported before a command runs, so that `mqe --help` answers at once.
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
-import difflib
 import functools
 import importlib
 import io
-import itertools
 import operator
 import re
 from collections.abc import Sequence
@@ -22,32 +19,34 @@ from typing import Annotated, Any, Protocol
 
 import tyro
 
+from mqe_jax.errors import InputError, nearest
+
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 
-Do first:
-  mqe tasks                                   what there is
-  mqe render go1gate -o gate.gif              a picture of a task
+First steps:
+  mqe tasks                                   list the tasks
+  mqe render go1gate -o gate.gif              render a task
   mqe train go1gate --config demo             train two robots to pass a gate (minutes on a CPU)
-  mqe eval runs/go1gate                       how good it became
-  mqe render runs/go1gate -o gate.mp4         and what it looks like
+  mqe eval runs/go1gate                       evaluate the trained policy
+  mqe render runs/go1gate -o gate.mp4         render the trained policy
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
 COMMANDS = ("tasks", "train", "eval", "render", "bench", "demo", "walk")
 Repeated = tyro.conf.UseAppendAction
-MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
+MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
 class Command(Protocol):
-    """What a subcommand is: a record of arguments that can be run."""
+    """A subcommand: a record of arguments that can be run."""
 
     def run(self) -> dict[str, Any] | None:
-        """Does the work; returns the object that `--json` prints, if any."""
+        """Runs the command; returns the object that `--json` prints, if any."""
         ...
 
 
 def _commands(module: str = "commands") -> Any:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that warp-lang is missing
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note about a missing warp-lang
         return importlib.import_module(f"mqe_jax.cli.{module}")
 
 
@@ -64,8 +63,8 @@ Set = Annotated[
         help="Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML.",
     ),
 ]
-Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object on standard output and nothing else there.")]
-Seed = Annotated[int, tyro.conf.arg(help="Seed of everything random.")]
+Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
+Seed = Annotated[int, tyro.conf.arg(help="Random seed.")]
 Control = Annotated[
     str | None,
     tyro.conf.arg(
@@ -86,34 +85,9 @@ class Tasks:
         return _commands().tasks(self)
 
 
-def _setting_fields() -> list[tuple[str, Any, Any]]:
-    """Every training setting as an optional flag, its help taken from the line below the field."""
-    from mqe_jax.train import config
-
-    tree = ast.parse(Path(config.__file__).read_text(encoding="utf-8"))
-    body = next(n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == "TrainConfig")
-    meaning = {
-        at.target.id: text.value.value
-        for at, text in itertools.pairwise(body)
-        if isinstance(at, ast.AnnAssign)
-        and isinstance(at.target, ast.Name)
-        and isinstance(text, ast.Expr)
-        and isinstance(text.value, ast.Constant)
-    }
-    fields = []
-    for f in dataclasses.fields(config.TrainConfig):
-        if f.name in ("task", "env", "train_env"):
-            continue
-        default = "none" if f.default is None else f.default
-        help_text = f"{meaning.get(f.name, '')} Paper: {default}."
-        kind = Annotated[str | None, tyro.conf.arg(metavar="VALUE", help=help_text, help_behavior_hint="")]
-        fields.append((f.name, kind, field(default=None)))
-    return fields
-
-
 @dataclass(frozen=True)
 class Train:
-    """Train a team on a task, into a run folder. Settings: the configuration file, then the flags below."""
+    """Train a team on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
 
     task: tyro.conf.Positional[str]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
@@ -123,16 +97,11 @@ class Train:
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder of the run. Default: runs/TASK."""
     resume: bool = False
-    """Go on from the newest checkpoint in the run folder, as if never stopped."""
+    """Continue exactly from the newest checkpoint in the run folder."""
     impl: Impl = "auto"
     control: Control = None
     set: Set = field(default_factory=list)
-
-    def settings(self) -> dict[str, str]:
-        """The training settings given as flags, still as text."""
-        known = {f.name for f in dataclasses.fields(Train)}
-        given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in known}
-        return {name: value for name, value in given.items() if value is not None}
+    settings: Annotated[Any, tyro.conf.Suppress] = None
 
     def run(self) -> dict[str, Any] | None:
         return _commands().train(self)
@@ -140,27 +109,27 @@ class Train:
 
 @dataclass(frozen=True)
 class Eval:
-    """Measure a trained run, or a planner on a task, over whole episodes from fresh resets."""
+    """Evaluate a trained run, or a scripted policy on a task, over complete episodes from fresh resets."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN|TASK")]
     """Folder of a run, or id of a task (then with --planner or --policy)."""
     json: Json = False
     episodes: int = 512
-    """Episodes to count; every world counts its first ones, however long they are."""
+    """Number of evaluation episodes, split evenly over environments."""
     num_envs: int = 128
-    """Worlds stepped together."""
+    """Number of parallel environments."""
     impl: Impl = "auto"
     control: Control = None
     seed: Seed = 0
     deterministic: bool = False
-    """Act with the policy's mean instead of drawing from it."""
+    """Use the policy's mean actions instead of sampling."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Who acts in place of a trained policy: scripted (written by hand for the task), random, idle (zero
-    commands), forward (straight on at half speed). Default for a task: random."""
+    """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
+    (straight on at half speed). Default for a task: random."""
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Who plays team 1 of a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
+    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Folder of the run whose policy acts. Default: the run given."""
+    """Folder of the run whose policy is used. Default: the run given."""
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
@@ -169,23 +138,23 @@ class Eval:
 
 @dataclass(frozen=True)
 class Render:
-    """Draw an episode of a task or of a trained run into a .mp4, .gif or .png file."""
+    """Render an episode of a task or of a trained run to a .mp4, .gif or .png file."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
     """Id of a task, or folder of a run."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
-    """File to write; its suffix chooses the kind: .mp4, .gif or .png."""
+    """File to write: .mp4, .gif or .png."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Who acts in place of a trained policy: scripted (written by hand for the task), random, idle (zero
-    commands), forward (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
+    (straight on at half speed). Default for a task: scripted where there is one, else forward."""
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Who plays team 1 of a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
+    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Folder of the run whose policy acts. Default: the run given."""
+    """Folder of the run whose policy is used. Default: the run given."""
     best_of: int = 1
-    """Play this many episodes and draw the best one (success first, then reward)."""
+    """Number of episodes, of which the best is rendered (by success, then reward)."""
     seconds: float = 20.0
-    """Longest clip, s."""
+    """Maximum length of the clip, s."""
     width: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Picture width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .gif, 1280 for .png."""
     fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -194,7 +163,7 @@ class Render:
     control: Control = None
     seed: Seed = 0
     sample: bool = False
-    """Draw actions from the policy instead of taking its mean."""
+    """Sample actions from the policy instead of using its mean."""
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
@@ -209,11 +178,11 @@ class Bench:
     """Id of the task."""
     json: Json = False
     num_envs: int = 256
-    """Worlds stepped together."""
+    """Number of parallel environments."""
     steps: int = 50
     """Environment steps per timed call."""
     repeats: int = 5
-    """Timed calls, of which the median counts."""
+    """Number of timed calls; the median is reported."""
     impl: Impl = "auto"
     control: Control = None
     seed: Seed = 0
@@ -227,14 +196,14 @@ class Bench:
 
 @dataclass(frozen=True)
 class Demo:
-    """Train Narrow Gate from scratch on the CPU, measure before and after, leave curve and video."""
+    """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and video."""
 
     run_dir: Path = Path("runs/demo")
-    """Folder of the run; an interrupted demo goes on from there."""
+    """Folder of the run; an interrupted demo resumes from there."""
     config: str = "demo"
     """Settings, as in `mqe train --config`."""
     episodes: int = 256
-    """Episodes of each evaluation."""
+    """Number of episodes of each evaluation."""
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
@@ -248,13 +217,13 @@ class WalkTrain:
     run_dir: Path = Path("runs/walk")
     """Folder of the run: weights, curve, checkpoints."""
     resume: bool = False
-    """Go on from the newest checkpoint in the run folder."""
+    """Resume from the newest checkpoint in the run folder."""
     num_envs: int = 8192
-    """Worlds stepped together."""
+    """Number of parallel environments."""
     iterations: int = 1200
     """PPO updates of 24 steps."""
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Stop after so long, with everything saved, s."""
+    """Time limit, after which the training stops with everything saved, s."""
     impl: Impl = "auto"
     seed: Seed = 1
 
@@ -264,15 +233,15 @@ class WalkTrain:
 
 @dataclass(frozen=True)
 class WalkEval:
-    """Measure how well the walk policy follows commands and how often it falls."""
+    """Evaluate the walk policy: command tracking and falls."""
 
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Weights to measure. Default: those that ship."""
+    """Weights to evaluate. Default: the shipped ones."""
     json: Json = False
     episodes: int = 1000
-    """Episodes of each scenario, all side by side."""
+    """Number of episodes of each scenario, run in parallel."""
     scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
-    """Scenario to measure, such as flat, kicks or slope_up; may be repeated. Default: all."""
+    """Scenario, such as flat, kicks or slope_up; may be repeated. Default: all."""
     impl: Impl = "auto"
     seed: Seed = 0
 
@@ -297,7 +266,7 @@ class WalkConvert:
 
 @dataclass(frozen=True)
 class Walk:
-    """The walk policy under the planners: train it, measure it, convert official weights."""
+    """The low-level walk policy: train, evaluate, convert official weights."""
 
     action: (
         Annotated[WalkTrain, tyro.conf.subcommand("train")]
@@ -310,10 +279,12 @@ class Walk:
 
 
 def _parser(wanted: Sequence[str]) -> Any:
-    """The union of all subcommands; training's flags are only made where they can be asked for."""
+    """Returns the union of all subcommands; the flags of training settings only where `train` is wanted."""
     train: Any = Train
     if "train" in wanted[:1]:
-        train = dataclasses.make_dataclass("Train", _setting_fields(), bases=(Train,), frozen=True)
+        flags = importlib.import_module("mqe_jax.cli.flags").train_flags()
+        settings = ("settings", Annotated[flags, tyro.conf.arg(name="")], field(default=flags()))
+        train = dataclasses.make_dataclass("Train", [settings], bases=(Train,), frozen=True)
         train.__doc__ = Train.__doc__
     subcommand = tyro.conf.subcommand
     records: list[Any] = [
@@ -329,11 +300,10 @@ def _parser(wanted: Sequence[str]) -> Any:
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """Reads the command line; help exits with 0, anything wrong raises a ValueError of one line."""
+    """Parses the command line; help exits with 0, anything wrong raises an InputError of one line."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        match = difflib.get_close_matches(arguments[0], COMMANDS, 1)
-        hint = f" (did you mean {match[0]!r}?)" if match else ""
-        raise ValueError(f"unknown command {arguments[0]!r}{hint}; allowed: {', '.join(COMMANDS)}")
+        hint = nearest(arguments[0], COMMANDS)
+        raise InputError(f"unknown command {arguments[0]!r}{hint}; allowed: {', '.join(COMMANDS)}")
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
@@ -347,11 +317,11 @@ def parse(arguments: Sequence[str]) -> Command:
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise ValueError(one_line(errors.getvalue())) from None
+        raise InputError(one_line(errors.getvalue())) from None
 
 
 def one_line(box: str) -> str:
-    """What tyro says in a box, as one line without the frame."""
+    """Returns tyro's boxed message as one line without the frame."""
     lines = [re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()]
     kept = []
     for line in lines:

@@ -10,11 +10,12 @@ import jax
 
 from mqe_jax.cli import bench as benchmark
 from mqe_jax.cli.arguments import Bench, Eval, Render, Tasks, Train
+from mqe_jax.cli.flags import given
 from mqe_jax.cli.output import print_table, say
-from mqe_jax.cli.players import PLANNER_NAMES, Actor
+from mqe_jax.cli.players import PLANNER_NAMES, Player
 from mqe_jax.cli.setup import make_env, parse_overrides, train_config
 from mqe_jax.envs import ALIASES, TASKS
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import PLANNERS
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy, runner
@@ -28,40 +29,40 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
-def find_actor(arguments: Eval | Render, default: str) -> Actor:
+def find_player(arguments: Eval | Render, default: str) -> Player:
     """Reads RUN|TASK, --policy and --planner; `default` acts on a task where nobody is named."""
     target = arguments.target
     given = parse_overrides(arguments.set) | ({} if arguments.control is None else {"control": arguments.control})
     if arguments.planner is not None and arguments.policy is not None:
-        raise ValueError("planner: give --planner or --policy, not both")
+        raise InputError("planner: give --planner or --policy, not both")
     for flag, name, allowed in (
         ("planner", arguments.planner, PLANNER_NAMES),
         ("opponent", arguments.opponent, (*PLANNER_NAMES, "self")),
     ):
         if name is not None and name not in allowed:
-            raise ValueError(f"{flag}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}")
+            raise InputError(f"{flag}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}")
     run = arguments.policy
     if is_run(target):
         _check_run(target)
         config = runner.load_run_config(target)
         if config.task is None:
-            raise ValueError(f"{target}: its {runner.CONFIG_FILE} names no task")
+            raise InputError(f"{target}: its {runner.CONFIG_FILE} names no task")
         task, env_values = config.task, {**config.env, **given}
         run = Path(target) if run is None and arguments.planner is None else run
     else:
         task, env_values = ALIASES.get(target, target), given
     if run is not None:
-        return Actor(task, env_values, policy.load_policy(run), arguments.opponent)
+        return Player(task, env_values, policy.load_policy(run), arguments.opponent)
     if default == "scripted" and task not in PLANNERS:
         default = "forward"
-    return Actor(task, env_values, arguments.planner or default, arguments.opponent)
+    return Player(task, env_values, arguments.planner or default, arguments.opponent)
 
 
 def _check_run(target: str) -> None:
     if not Path(target).is_dir():
-        raise ValueError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
+        raise InputError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
-        raise ValueError(f"run: {target!r} holds no {runner.CONFIG_FILE}; it is not the folder of a training")
+        raise InputError(f"run: {target!r} holds no {runner.CONFIG_FILE}; it is not the folder of a training")
 
 
 def tasks(arguments: Tasks) -> dict[str, Any] | None:
@@ -95,7 +96,7 @@ def train(arguments: Train) -> None:
     overrides = parse_overrides(arguments.set)
     if arguments.control is not None:
         overrides["control"] = arguments.control
-    config = train_config(arguments.task, arguments.config, arguments.settings(), overrides)
+    config = train_config(arguments.task, arguments.config, given(arguments.settings), overrides)
     run_dir = arguments.run_dir or Path("runs") / arguments.task
     _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
     try:
@@ -110,16 +111,16 @@ def train(arguments: Train) -> None:
 def evaluate(arguments: Eval) -> dict[str, Any]:
     """Measures a policy and prints a table, or gives the object for `--json`."""
     if arguments.episodes < 1:
-        raise ValueError(f"episodes: {arguments.episodes} is not allowed; it must be at least 1")
-    actor = find_actor(arguments, "random")
+        raise InputError(f"episodes: {arguments.episodes} is not allowed; it must be at least 1")
+    player = find_player(arguments, "random")
     num_envs = min(arguments.num_envs, arguments.episodes)
-    env, vector_env = make_env(actor.task, arguments.impl, actor.overrides, num_envs)
+    env, vector_env = make_env(player.task, arguments.impl, player.overrides, num_envs)
     result = evaluation.evaluate(
         vector_env,
-        actor.act(env, arguments.deterministic),
+        player.act(env, arguments.deterministic),
         arguments.episodes,
         jax.random.PRNGKey(arguments.seed),
-        memory=actor.memory(num_envs),
+        memory=player.memory(num_envs),
     ).to_dict()
     if not arguments.json:
         print_table(result)
@@ -130,16 +131,16 @@ def render(arguments: Render) -> None:
     """Draws an episode into a file."""
     for name, value in (("best_of", arguments.best_of), ("seconds", arguments.seconds)):
         if not value > 0:
-            raise ValueError(f"{name}: {value} is not allowed; it must be greater than 0")
+            raise InputError(f"{name}: {value} is not allowed; it must be greater than 0")
     for name, value in (("width", arguments.width), ("fps", arguments.fps)):
         if value is not None and not 0 < value <= 4096:
-            raise ValueError(f"{name}: {value} is not allowed; it must be between 1 and 4096")
+            raise InputError(f"{name}: {value} is not allowed; it must be between 1 and 4096")
     check_output(arguments.output)
-    actor = find_actor(arguments, "scripted")
-    env, _ = make_env(actor.task, arguments.impl, actor.overrides, arguments.best_of)
+    player = find_player(arguments, "scripted")
+    env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
     drawn_by = draw(
         env,
-        actor,
+        player,
         arguments.output,
         seed=arguments.seed,
         worlds=arguments.best_of,
@@ -153,7 +154,7 @@ def render(arguments: Render) -> None:
 
 def draw(
     env: Any,
-    actor: Actor,
+    player: Player,
     path: Path,
     *,
     seed: int,
@@ -164,7 +165,7 @@ def draw(
     fps: float | None = None,
 ) -> str:
     """Plays `worlds` episodes and draws the best one; returns what drew it."""
-    act, memory = actor.act(env, deterministic), actor.memory(worlds)
+    act, memory = player.act(env, deterministic), player.memory(worlds)
     episodes = recording.record(env, act, memory, jax.random.PRNGKey(seed), worlds=worlds, seconds=seconds)
     return rendering.render_episode(env, recording.best(episodes), path, size=size, fps=fps)
 

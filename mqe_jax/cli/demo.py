@@ -12,14 +12,14 @@ import jax
 from mqe_jax.cli.arguments import Demo
 from mqe_jax.cli.commands import draw
 from mqe_jax.cli.output import say
-from mqe_jax.cli.players import Actor
+from mqe_jax.cli.players import Player
 from mqe_jax.cli.setup import make_env, train_config
 from mqe_jax.envs import VectorEnv
 from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy, runner
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import env_sizes, make_learner
+from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.viz import curves
 from mqe_jax.viz.clips import check_output
 
@@ -29,7 +29,7 @@ DEMO_TASK = "go1gate"
 def demo(arguments: Demo) -> None:
     """Trains from scratch, measures before and after, draws curve and video; goes on where it stopped."""
     began, run_dir = time.perf_counter(), arguments.run_dir
-    config = train_config(DEMO_TASK, arguments.config, {}, {})
+    config = train_config(DEMO_TASK, arguments.config)
     check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
     _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)
@@ -38,7 +38,7 @@ def demo(arguments: Demo) -> None:
 
     untrained = make_learner(vector_env, config)
     state = jax.jit(untrained.init)(runner.initial_key(config))
-    before = policy.policy_of(state, env_sizes(vector_env), config, task=DEMO_TASK)
+    before = policy.policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
     del state
     say("mqe demo: measuring the untrained policy")
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
@@ -60,7 +60,7 @@ def demo(arguments: Demo) -> None:
     say("mqe demo: drawing an episode")
     draw(
         env,
-        Actor(DEMO_TASK, dict(config.env), after),
+        Player(DEMO_TASK, dict(config.env), after),
         video,
         seed=config.seed + 1,
         worlds=16,

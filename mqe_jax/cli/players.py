@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.envs import TaskParams
+from mqe_jax.errors import InputError
 from mqe_jax.planners import PLANNERS
 from mqe_jax.train import policy
 
@@ -31,7 +32,7 @@ def against(act: Act, opponent: Act, env: Any) -> Act:
 
 
 def planner(name: str, env: Any) -> Act:
-    """What acts without training; `act` as in `evaluate`. ValueError where the task has no scripted planner."""
+    """What acts without training; `act` as in `evaluate`. InputError where the task has no scripted planner."""
     shape = (env.num_agents, env.action_size)
     plan = _scripted(env) if name == "scripted" else None
 
@@ -49,16 +50,16 @@ def planner(name: str, env: Any) -> Act:
 def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
     """The task's planner for a batch of worlds: observations (N, A, O) to actions (N, A, 3)."""
     if env.name not in PLANNERS:
-        raise ValueError(f"planner: {env.name} has none that is scripted; allowed for: {', '.join(PLANNERS)}")
+        raise InputError(f"planner: {env.name} has none that is scripted; allowed for: {', '.join(PLANNERS)}")
     if env.control != "command":
-        raise ValueError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
+        raise InputError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
     if tuple(env.params.commands) != TaskParams.commands:
-        raise ValueError(f"commands: {env.params.commands}; planner 'scripted' gives {TaskParams.commands}")
+        raise InputError(f"commands: {env.params.commands}; planner 'scripted' gives {TaskParams.commands}")
     return jax.vmap(PLANNERS[env.name])
 
 
 @dataclasses.dataclass(frozen=True)
-class Actor:
+class Player:
     """Who acts on what: a task with its parameters, and a trained policy or a planner's name."""
 
     task: str
@@ -67,10 +68,10 @@ class Actor:
     opponent: str | None = None
 
     def act(self, env: Any, deterministic: bool) -> Act:
-        """The batched `act`, against the opponent in a match; ValueError where it does not fit the task."""
+        """The batched `act`, against the opponent in a match; InputError where it does not fit the task."""
         act = self._own_act(env, deterministic)
         if self.opponent is not None and len(env.teams) < 2:
-            raise ValueError(f"opponent: {self.task} is no match; leave --opponent out")
+            raise InputError(f"opponent: {self.task} is no match; leave --opponent out")
         if len(env.teams) < 2 or self.opponent == "self":
             return act
         return against(act, planner(self.opponent or "idle", env), env)
@@ -80,9 +81,9 @@ class Actor:
             return planner(self.policy, env)
         policy = self.policy
         sizes = (env.num_agents, env.observation_size, env.action_size)
-        trained = (policy.sizes.agents, policy.sizes.observation, policy.sizes.action)
+        trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
         if sizes != trained:
-            raise ValueError(
+            raise InputError(
                 f"policy: trained for (agents, observation, action) {trained}, but {self.task} has {sizes}"
             )
 

@@ -14,15 +14,14 @@ def gae(
     done: jax.Array,
     *,
     gamma: float,
-    lam: float,
+    gae_lambda: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the advantage and the value target, both shaped as `reward`.
 
     Shapes: time-major (T, ...); `terminated` and `done` (bool) may lack trailing axes of `reward`.
-    `next_value[t]` is the value of the state in which step t arrived, before any reset, so a truncated
-    episode bootstraps from its own last state. `terminated` removes the bootstrap; `done`
-    (terminated or truncated) cuts the trace. A `terminated` between 0 and 1
-    removes that part of the bootstrap. Source: Schulman et al., arXiv 1506.02438.
+    `next_value[t]` is the value of the state reached by step t, before any reset, so that a truncated episode
+    bootstraps from its own last state. `terminated` removes the bootstrap (a fraction of it where between 0 and 1);
+    `done` (terminated or truncated) cuts the trace. Source: Schulman et al., arXiv 1506.02438.
     """
 
     def as_reward(flag: jax.Array) -> jax.Array:
@@ -30,7 +29,7 @@ def gae(
         return jnp.broadcast_to(flag, reward.shape).astype(reward.dtype)
 
     delta = reward + gamma * (1.0 - as_reward(terminated)) * next_value - value
-    carry_over = gamma * lam * (1.0 - as_reward(done))
+    carry_over = gamma * gae_lambda * (1.0 - as_reward(done))
 
     def backwards(trace: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         delta_t, carry_over_t = inputs

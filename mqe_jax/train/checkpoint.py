@@ -1,4 +1,4 @@
-"""Whole checkpoints of any pytree of arrays, written atomically as safetensors files."""
+"""Checkpoints of any pytree of arrays, written atomically as safetensors files."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 
 FORMAT = "mqe_jax.train"
-VERSION = 1
+VERSION = 2
 
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
 
 
 class Checkpoint(NamedTuple):
-    """A restored tree and what was noted beside it."""
+    """A restored tree and its metadata."""
 
     tree: Any
     metadata: dict[str, Any]
@@ -44,9 +45,9 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
 
 
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
-    """Writes a pytree of arrays with JSON metadata; `kind` says what the file is for."""
+    """Writes a pytree of arrays with JSON metadata; `kind` is the kind of file that `load_tree` checks."""
     named, _ = _flatten(jax.device_get(tree))
-    # ascontiguousarray makes scalars (1,); the shape is put back, for it is checked when loading
+    # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
     arrays = {name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()}
     header = {
         "format": FORMAT,
@@ -59,55 +60,56 @@ def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind:
 
 
 def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Returns arrays by name and metadata; raises a ValueError that names the file and what is wrong."""
+    """Returns arrays by name and metadata; raises an InputError that names the file and what is wrong."""
     if not path.is_file():
-        raise ValueError(f"{path}: no such file; a {kind} written by this package is needed")
+        raise InputError(f"{path}: no such file; a {kind} written by this package is needed")
     try:
         with safe_open(path, framework="numpy") as file:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
-                raise ValueError(f"{path}: not a file of this package; a {kind} is needed")
+                raise InputError(f"{path}: not a file of this package; a {kind} is needed")
             if header.get("kind") != kind:
-                raise ValueError(f"{path}: holds a {header.get('kind')}; a {kind} is needed")
+                raise InputError(f"{path}: holds a {header.get('kind')}; a {kind} is needed")
             if header.get("version") != str(VERSION):
                 version = header.get("version")
-                raise ValueError(f"{path}: has format version {version}; version {VERSION} is needed")
+                raise InputError(f"{path}: has format version {version}; version {VERSION} is needed")
             arrays = {name: file.get_tensor(name) for name in file.keys()}
         metadata = json.loads(header.get("metadata", ""))
     except (SafetensorError, OSError, json.JSONDecodeError, KeyError) as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: damaged, truncated or not a {kind} ({reason})") from None
+        raise InputError(f"{path}: damaged, truncated or not a {kind} ({reason})") from None
     if header.get("checksum") != str(_checksum(arrays)):
-        raise ValueError(f"{path}: damaged (its content does not match its checksum)")
+        raise InputError(f"{path}: damaged (its content does not match its checksum)")
     return arrays, metadata
 
 
 def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
-    """Returns what was noted beside the arrays of a file, after checking the file."""
+    """Returns the metadata of a file, after checking the file."""
     return _read(Path(path), kind)[1]
 
 
 def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
-    """Reads a pytree; `template` has its structure, and leaves with the shapes and dtypes to expect.
+    """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
-    Raises ValueError, in one line naming the file, for a missing, damaged, truncated or foreign file,
-    another format version, and leaves that are missing, unknown or of another shape or dtype.
+    Raises:
+        InputError: in one line naming the file, for a missing, damaged, truncated or foreign file, another format
+            version, and leaves that are missing, unknown or of another shape or dtype.
     """
     path = Path(path)
     arrays, metadata = _read(path, kind)
     expected, structure = _flatten(template)
     for name in expected:
         if name not in arrays:
-            raise ValueError(f"{path}: lacks {name}; it belongs to other settings or another version")
+            raise InputError(f"{path}: lacks {name}; it belongs to other settings or another version")
     for name in arrays:
         if name not in expected:
-            raise ValueError(f"{path}: holds {name}, which these settings do not have")
+            raise InputError(f"{path}: holds {name}, which these settings do not have")
     for name, leaf in expected.items():
         found = arrays[name]
         if tuple(found.shape) != tuple(leaf.shape):
-            raise ValueError(f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed")
+            raise InputError(f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed")
         if found.dtype != leaf.dtype:
-            raise ValueError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
+            raise InputError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
     leaves = [jnp.asarray(arrays[name]) for name in expected]
     return Checkpoint(jax.tree_util.tree_unflatten(structure, leaves), metadata)
 
@@ -124,14 +126,14 @@ def list_checkpoints(run_dir: str | Path) -> list[Path]:
 
 
 def latest(run_dir: str | Path) -> Path | None:
-    """Returns a run's newest checkpoint, none where it has no checkpoint."""
+    """Returns a run's newest checkpoint, or None."""
     return next(reversed(list_checkpoints(run_dir)), None)
 
 
 def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:
     """Writes a checkpoint of environment step `step`, then removes all but the newest `keep`.
 
-    Files that a killed writer left half-written are removed too.
+    Partial files of a killed writer are removed too.
     """
     folder = checkpoint_folder(run_dir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -139,8 +141,8 @@ def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping
     save_tree(path, tree, {**metadata, "step": step}, kind="checkpoint")
     for old in list_checkpoints(run_dir)[:-keep]:
         old.unlink(missing_ok=True)
-    for left_over in folder.glob(".step_*.tmp"):
-        left_over.unlink(missing_ok=True)
+    for partial in folder.glob(".step_*.tmp"):
+        partial.unlink(missing_ok=True)
     return path
 
 

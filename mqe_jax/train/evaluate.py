@@ -1,4 +1,7 @@
-"""Fair evaluation: the first episodes of every world, however long each of them takes."""
+"""Unbiased evaluation: each environment contributes a fixed quota of episodes.
+
+Short episodes are therefore not over-represented.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.errors import InputError
+from mqe_jax.settings import fail
 from mqe_jax.train.types import Memory, VectorEnv
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
@@ -18,20 +23,20 @@ Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 
 @dataclass(frozen=True)
 class EvalResult:
-    """What an evaluation measured; means are over the steps of the counted episodes or over episodes."""
+    """Results of an evaluation; means are over the steps of the counted episodes or over episodes."""
 
     task: str
     episodes: int
-    success_rate: float  # share of episodes, 0 to 1
+    success_rate: float  # fraction of episodes
     average_step_reward: float  # mean over steps of the sum of reward terms
     terms: dict[str, float]  # mean over steps of each reward term
     mean_length: float  # steps per episode
-    diverged: int  # episodes ended by the guard against divergence
-    success: dict[str, float]  # other ends by name, mean over episodes, from metrics `success/<name>`
-    match: dict[str, float]  # win_rate, draw_rate, loss_rate of the first team; empty where there is no opponent
+    diverged: int  # episodes that ended because the physics diverged
+    success: dict[str, float]  # other outcomes by name, mean over episodes, from metrics `success/<name>`
+    match: dict[str, float]  # win_rate, draw_rate, loss_rate of team 0; empty without an opponent
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; further successes become `success/<name>`, a match's rates their own."""
+        """Returns plain values for JSON; the entries of `success` and `match` become top-level keys."""
         values = {k: v for k, v in vars(self).items() if k not in ("success", "match")}
         return {**values, **self.match, **{f"success/{name}": value for name, value in self.success.items()}}
 
@@ -39,10 +44,10 @@ class EvalResult:
 class _Progress(NamedTuple):
     env_state: Any
     memory: Memory
-    finished: jax.Array  # (N,) int32, episodes that the world has finished
+    finished: jax.Array  # (N,) int32, finished episodes
     steps: jax.Array  # (N,) int32, counted steps
     step_sums: dict[str, jax.Array]  # (N,) each, over counted steps
-    end_sums: dict[str, jax.Array]  # (N,) each, over ends of counted episodes
+    end_sums: dict[str, jax.Array]  # (N,) each, over the last steps of counted episodes
 
 
 def evaluate(
@@ -55,15 +60,25 @@ def evaluate(
     block: int = 50,
     max_steps: int = 1_000_000,
 ) -> EvalResult:
-    """Plays `episodes` episodes from fresh resets and returns their means.
+    """Runs `episodes` episodes from fresh resets and returns their means.
 
-    World i counts its first `episodes // N` episodes (one more where i < `episodes % N`) and nothing
-    after: which episodes count does not depend on how long they are. `memory` is what `act` remembers at an
-    episode's start, leading axis N. `block` steps run per compiled call.
-    Raises ValueError for `episodes` < 1 or where the worlds do not finish in `max_steps` steps.
+    Environment i counts its first `episodes // N` episodes (one more where i < `episodes % N`) and none after, so
+    that which episodes count does not depend on their length.
+
+    Args:
+        env: the environments.
+        act: the policy.
+        episodes: number of episodes.
+        key: random key.
+        memory: of `act` at an episode's start, leading axis N.
+        block: steps per compiled call.
+        max_steps: limit on the steps of an environment.
+
+    Raises:
+        InputError: for `episodes` < 1, or where the environments do not finish within `max_steps`.
     """
     if episodes < 1:
-        raise ValueError(f"episodes: {episodes} is not allowed; it must be at least 1")
+        fail("episodes", episodes, "at least 1")
     count = env.num_envs
     quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
     reset_key, key = jax.random.split(key)
@@ -73,7 +88,7 @@ def evaluate(
         progress = run(progress, jax.random.fold_in(key, done_steps))
         if np.all(np.asarray(progress.finished) >= quota):
             return _result(env.name, episodes, progress)
-    raise ValueError(f"episodes: {episodes} episodes of {env.name} are not finished after {max_steps} steps")
+    raise InputError(f"episodes: {episodes} episodes of {env.name} are not finished after {max_steps} steps")
 
 
 def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:

@@ -1,7 +1,7 @@
-"""PPO for teams: one pure function from a training state to the next.
+"""PPO for teams: one pure function from a learner state to the next.
 
-A rollout of all worlds, advantages, then epochs of minibatches. The ratio that PPO clips and the network
-make the difference between MAPPO, JRPO, independent PPO and their variants; both come from the settings.
+A rollout of all environments, advantages, then epochs of minibatches. MAPPO, JRPO, independent PPO and their variants
+differ in the ratio that PPO clips, the kind of value, and the network; all three are settings.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
-from mqe_jax.train.networks import Network, Params, Sizes, make_network
+from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
     ValueStatistics,
     running_init,
@@ -28,12 +29,12 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
-from mqe_jax.train.rollout import Cursor, ObservationNormalizer, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Transition, VectorEnv
+from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
+from mqe_jax.train.types import Batch, Params, Transition, VectorEnv
 
 Metrics = dict[str, jax.Array]
 Carry = tuple[Params, AdamState, jax.Array]
-"""What a gradient step changes: parameters, optimiser state, step size () before the schedule."""
+"""Carry of a gradient step: parameters, optimiser state, learning rate () before the schedule."""
 
 _LEARNING_RATE_RANGE = (1e-5, 1e-2)
 _ADAPTATION = 1.5
@@ -42,14 +43,14 @@ _ADAPTATION = 1.5
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """Everything that a training is at one moment: saved whole, it goes on as if never stopped."""
+    """Complete learner state. Restoring it resumes training exactly (bit for bit on deterministic backends)."""
 
     params: Params
     optimizer: AdamState
     obs_normalizer: ObservationNormalizer
     value_normalizer: ValueStatistics
     learning_rate: jax.Array  # () float32, before the schedule
-    cursor: Cursor
+    rollout: RolloutState
     key: jax.Array  # raw uint32 random key
     updates: jax.Array  # () int32, updates done
 
@@ -62,24 +63,35 @@ class Learner(NamedTuple):
     network: Network
 
 
-def env_sizes(env: VectorEnv) -> Sizes:
-    """Returns the widths that the networks take from the environment."""
-    return Sizes(env.num_agents, env.observation_size, env.privileged_observation_size, env.action_size)
+def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
+    """Returns the sizes that a network is built for."""
+    agents = env.num_agents
+    return EnvDims(
+        agents=agents,
+        observation=env.observation_size,
+        privileged=env.privileged_observation_size,
+        action=env.action_size,
+        teams=(tuple(range(agents)),),
+        values=1 if config.ppo.value == "joint" else agents,
+    )
 
 
 def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
-    """Makes the learner of an environment.
+    """Returns the learner of an environment.
 
-    Raises ValueError where the settings do not fit the environment.
+    Raises:
+        InputError: where the settings do not fit the environment.
     """
     if env.num_envs != config.num_envs:
-        raise ValueError(f"num_envs: {config.num_envs}; the environment given has {env.num_envs} worlds")
-    if config.aid and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "aid"):
-        raise ValueError(f"aid: {config.aid}; the environment {env.name} has no aid in its state")
+        fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
+    assistance = config.curriculum.assistance
+    if assistance and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "aid"):
+        fail("curriculum.assistance", assistance, f"0: the state of the environment {env.name} has no such field")
     if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
-        raise ValueError(f"stagger_episodes: True; the environment {env.name} has no max_episode_steps")
-    network = make_network(env_sizes(env), config)
-    optimizer = adam(eps=config.adam_eps, max_grad_norm=config.max_grad_norm)
+        fail("stagger_episodes", True, f"false: the environment {env.name} has no max_episode_steps")
+    network = config.network.build(env_dims(env, config))
+    _check_divisible(config, network)
+    optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
     def init(key: jax.Array) -> TrainState:
         params_key, env_key, stagger_key, key = jax.random.split(key, 4)
@@ -95,11 +107,11 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
                     running_init(env.observation_size), running_init(env.privileged_observation_size)
                 ),
                 value_normalizer=value_init(),
-                learning_rate=jnp.float32(config.learning_rate),
-                cursor=Cursor(
+                learning_rate=jnp.float32(config.optimizer.learning_rate),
+                rollout=RolloutState(
                     env_state=env_state,
                     memory=network.initial_memory(env.num_envs),
-                    start=jnp.ones((env.num_envs,), bool),
+                    is_first=jnp.ones((env.num_envs,), bool),
                     episode_steps=jnp.zeros((env.num_envs,), jnp.int32),
                 ),
                 key=key,
@@ -110,23 +122,26 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
         progress = state.updates.astype(jnp.float32) / config.num_updates
-        aid = config.aid * jnp.maximum(1.0 - progress / config.aid_until, 0.0)
-        cursor, transitions, metrics = rollout(
+        assistance = config.curriculum.assistance * jnp.maximum(
+            1.0 - progress / config.curriculum.assistance_until, 0.0
+        )
+        rollout_state, transitions, metrics = rollout(
             env,
             network,
             state.params,
             state.obs_normalizer,
-            _aided(state.cursor, aid) if config.aid else state.cursor,
+            _assisted(state.rollout, assistance) if config.curriculum.assistance else state.rollout,
             rollout_key,
             config.rollout_steps,
-            config.normalize_observations,
+            normalize=config.normalization.observations,
+            action_scale=config.action_scale,
         )
         batch, value_normalizer, batch_metrics = _prepare(network, config, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
             network, optimizer, config, state, value_normalizer, batch, epoch_key
         )
         obs_normalizer = state.obs_normalizer
-        if config.normalize_observations:
+        if config.normalization.observations:
             obs_normalizer = ObservationNormalizer(
                 running_update(obs_normalizer.obs, transitions.obs),
                 running_update(obs_normalizer.privileged, transitions.privileged_obs),
@@ -137,54 +152,65 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
             obs_normalizer=obs_normalizer,
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
-            cursor=cursor,
+            rollout=rollout_state,
             key=key,
             updates=state.updates + 1,
         )
-        metrics["aid"] = aid
+        metrics["assistance"] = assistance
         return _strongly_typed(new_state), {**metrics, **batch_metrics, **loss_metrics}
 
     return Learner(init, update, network)
 
 
-def _aided(cursor: Cursor, aid: jax.Array) -> Cursor:
-    """Sets how much every world helps from its next episode on."""
-    env_state = dataclasses.replace(cursor.env_state, aid=jnp.full_like(cursor.env_state.aid, aid))
-    return cursor._replace(env_state=env_state)
+def _check_divisible(config: TrainConfig, network: Network) -> None:
+    """Checks that rollouts split into chunks, and these into minibatches."""
+    if config.rollout_steps % network.chunk_length:
+        fail(
+            "rollout_steps", config.rollout_steps, f"a multiple of the network's chunk_length ({network.chunk_length})"
+        )
+    chunks = config.steps_per_update // network.chunk_length
+    if chunks % config.ppo.minibatches:
+        fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")
+
+
+def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
+    """Sets the assistance of every environment, which takes effect with its next episode."""
+    env_state = dataclasses.replace(state.env_state, aid=jnp.full_like(state.env_state.aid, assistance))
+    return state._replace(env_state=env_state)
 
 
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
-    """Sets every world's clock to a random time, so that their first episodes end at different steps."""
+    """Sets every environment's clock to a random step, so that the first episodes end at different steps."""
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
     step = jax.random.randint(key, env_state.step.shape, 0, limit, env_state.step.dtype)
     return dataclasses.replace(env_state, step=step)
 
 
 def _strongly_typed(state: TrainState) -> TrainState:
-    """Removes weak types, so that the state goes in as it comes out and `update` is traced once."""
+    """Removes weak types, so that input and output states have the same types and `update` is traced once."""
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), state)
 
 
 def _prepare(
     network: Network, config: TrainConfig, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
-    """Works out values, advantages and targets of a rollout and cuts it into chunks (L, C, ...).
+    """Computes values, advantages and targets of a rollout and cuts it into chunks (L, C, ...).
 
-    The critic takes each step's observation and the one in which the step arrived as a chunk of two, all
-    steps at once: its memory of the first serves the second, whether or not the episode ended there.
+    The critic takes each step's observation and that of the state reached as a chunk of two, all steps at once: its
+    memory after the first serves the second, whether or not the episode ended there.
     """
     obs, privileged = normalize_obs(
-        state.obs_normalizer, transitions.obs, transitions.privileged_obs, config.normalize_observations
+        state.obs_normalizer, transitions.obs, transitions.privileged_obs, config.normalization.observations
     )
     final_obs, final_privileged = normalize_obs(
         state.obs_normalizer,
         transitions.final_obs,
         transitions.final_privileged_obs,
-        config.normalize_observations,
+        config.normalization.observations,
     )
     pair, _ = network.value(
         state.params,
-        transitions.memory["critic"],
+        transitions.memory.critic,
         jnp.zeros((2, *transitions.done.shape), bool),
         jnp.stack([obs, final_obs]),
         jnp.stack([privileged, final_privileged]),
@@ -192,34 +218,35 @@ def _prepare(
     value_normalizer = state.value_normalizer
     value, next_value = value_denormalize(value_normalizer, pair)
     reward = transitions.reward
-    if config.value == "joint":
+    if config.ppo.value == "joint":
         reward = jnp.mean(reward, axis=-1, keepdims=True)
     progress = state.updates.astype(jnp.float32) / config.num_updates
-    share = config.failure_bootstrap * jnp.maximum(1.0 - progress / config.failure_bootstrap_until, 0.0)
+    curriculum = config.curriculum
+    kept = curriculum.failure_bootstrap * jnp.maximum(1.0 - progress / curriculum.failure_bootstrap_until, 0.0)
     advantage, target = gae(
         reward,
         value,
         next_value,
-        transitions.terminated * (1.0 - share),
+        transitions.terminated * (1.0 - kept),
         transitions.done,
-        gamma=config.gamma,
-        lam=config.gae_lambda,
+        gamma=config.ppo.gamma,
+        gae_lambda=config.ppo.gae_lambda,
     )
-    if config.normalize_values:
-        value_normalizer = value_update(value_normalizer, target, config.value_norm_decay)
-    error_share = jnp.var(target - value) / jnp.maximum(jnp.var(target), 1e-8)
-    metrics = {"value_mean": jnp.mean(value), "explained_variance": 1.0 - error_share}
-    if config.advantage_clip is not None:
+    if config.normalization.values:
+        value_normalizer = value_update(value_normalizer, target, config.normalization.value_decay)
+    unexplained = jnp.var(target - value) / jnp.maximum(jnp.var(target), 1e-8)
+    metrics = {"value_mean": jnp.mean(value), "explained_variance": 1.0 - unexplained}
+    if config.ppo.advantage_clip is not None:
         scale = jnp.median(jnp.abs(advantage)) + 1e-8
-        bound = jnp.where(progress < config.advantage_clip_until, config.advantage_clip, jnp.inf)
+        bound = jnp.where(progress < config.ppo.advantage_clip_until, config.ppo.advantage_clip, jnp.inf)
         advantage = jnp.clip(advantage / scale, -bound, bound)
-    if config.normalize_advantages:
+    if config.normalization.advantages:
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 
-    steps = config.chunk
+    steps = network.chunk_length
     batch = Batch(
         memory=jax.tree.map(lambda x: x[::steps].reshape(-1, *x.shape[2:]), transitions.memory),
-        start=_chunks(transitions.start, steps),
+        is_first=_chunks(transitions.is_first, steps),
         obs=_chunks(obs, steps),
         privileged_obs=_chunks(privileged, steps),
         action=_chunks(transitions.action, steps),
@@ -238,7 +265,7 @@ def _chunks(x: jax.Array, length: int) -> jax.Array:
 
 
 def _take(batch: Batch, index: jax.Array) -> Batch:
-    """Returns the chunks of the given numbers (C',)."""
+    """Returns the chunks with the given indices (C',)."""
     memory = jax.tree.map(lambda x: x[index], batch.memory)
     rest = {name: getattr(batch, name)[:, index] for name in Batch._fields if name != "memory"}
     return Batch(memory=memory, **rest)
@@ -253,12 +280,13 @@ def _loss(
     batch: Batch,
 ) -> tuple[jax.Array, Metrics]:
     """Returns the PPO loss () of a minibatch and its parts."""
-    now = network.evaluate(params, batch.memory, batch.start, batch.obs, batch.privileged_obs, batch.action)
-    log_ratio = RATIOS[config.ratio](now.log_prob, batch.log_prob)
-    surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], config.clip, config.dual_clip)
+    ppo = config.ppo
+    now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
+    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
+    surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
-    critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, config.value_clip, config.huber_delta))
+    critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
     mean_entropy = jnp.mean(now.entropy)
     per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
     metrics = {
@@ -266,13 +294,13 @@ def _loss(
         "loss/value": critic_loss,
         "entropy": mean_entropy,
         "approx_kl": jnp.mean(jnp.exp(per_agent) - 1.0 - per_agent),
-        "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > config.clip).astype(jnp.float32)),
+        "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32)),
     }
-    return policy_loss + config.value_coef * critic_loss - entropy_coef * mean_entropy, metrics
+    return policy_loss + ppo.value_coef * critic_loss - entropy_coef * mean_entropy, metrics
 
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
-    """Returns a smaller step size where the policy moved too far, a larger one where it hardly moved."""
+    """Returns a smaller learning rate where the KL divergence exceeds the target, a larger one where it is below."""
     factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
 
@@ -286,35 +314,35 @@ def _learn(
     batch: Batch,
     key: jax.Array,
 ) -> tuple[Params, AdamState, jax.Array, Metrics]:
-    """Passes `epochs` times over the batch; returns parameters, optimiser, step size and mean metrics."""
+    """Runs the epochs over the batch; returns parameters, optimiser state, learning rate and mean metrics."""
     progress = state.updates.astype(jnp.float32) / config.num_updates
-    schedule = jnp.maximum(1.0 - progress, 0.0) if config.learning_rate_schedule == "linear" else 1.0
-    entropy_coef = jnp.float32(config.entropy_coef)
-    if config.entropy_coef_final is not None:
-        entropy_coef += jnp.minimum(progress, 1.0) * (config.entropy_coef_final - config.entropy_coef)
-    chunks = batch.start.shape[1]
+    schedule = jnp.maximum(1.0 - progress, 0.0) if config.optimizer.schedule == "linear" else 1.0
+    entropy_coef = jnp.float32(config.ppo.entropy_coef)
+    if config.ppo.entropy_coef_final is not None:
+        entropy_coef += jnp.minimum(progress, 1.0) * (config.ppo.entropy_coef_final - config.ppo.entropy_coef)
+    chunks = batch.is_first.shape[1]
 
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
         gradient, metrics = jax.grad(_loss, has_aux=True)(
             params, network, config, value_normalizer, entropy_coef, minibatch
         )
-        if config.target_kl is not None:
-            learning_rate = _adapted(learning_rate, metrics["approx_kl"], config.target_kl)
+        if config.optimizer.target_kl is not None:
+            learning_rate = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
         params, optimizer_state, grad_norm = optimizer.update(
             gradient, optimizer_state, params, learning_rate * schedule
         )
         return (params, optimizer_state, learning_rate), {**metrics, "grad_norm": grad_norm}
 
     def epoch(carry: Carry, epoch_key: jax.Array) -> tuple[Carry, Metrics]:
-        if config.minibatches == 1:
+        if config.ppo.minibatches == 1:
             return step(carry, batch)
-        index = jax.random.permutation(epoch_key, chunks).reshape(config.minibatches, -1)
+        index = jax.random.permutation(epoch_key, chunks).reshape(config.ppo.minibatches, -1)
         carry, metrics = jax.lax.scan(lambda c, i: step(c, _take(batch, i)), carry, index)
         return carry, jax.tree.map(jnp.mean, metrics)
 
     carry = (state.params, state.optimizer, state.learning_rate)
-    carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
+    carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.ppo.epochs))
     params, optimizer_state, learning_rate = carry
     metrics = jax.tree.map(jnp.mean, metrics)
     metrics["learning_rate"] = learning_rate * schedule

@@ -1,4 +1,4 @@
-"""What a training tells: a CSV file, TensorBoard events, progress on the terminal."""
+"""Training loggers: a CSV file, TensorBoard events, progress on the terminal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PLAIN_SECONDS = 10.0
 
 
 class CsvLog:
-    """Rows of `metrics.csv`, one per update; those past `env_steps` are dropped when a run goes on."""
+    """Rows of `metrics.csv`, one per update; a resumed run drops rows after `env_steps`."""
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
         self._path = run_dir / CSV_FILE
@@ -69,7 +69,7 @@ def _text(value: float) -> str:
 
 
 def _read_rows(path: Path, env_steps: int | None) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns columns and whole rows up to `env_steps`; a half-written last row is left out."""
+    """Returns columns and complete rows up to `env_steps`; a partial last row is left out."""
     if not path.is_file():
         return [], []
     with path.open(encoding="utf-8", newline="") as file:
@@ -109,7 +109,7 @@ class TensorBoardLog:
                 self._writer.add_scalar(name, value, step)
 
     def close(self) -> None:
-        """Writes what is pending."""
+        """Flushes and closes the file."""
         if self._writer is not None:
             self._writer.close()
 
@@ -149,7 +149,7 @@ class ProgressLog:
             self._bar.stop()
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Shows steps, reward, speed and the time left."""
+        """Shows steps, reward, speed and the remaining time."""
         step = int(row["env_steps"])
         numbers = f"reward {row.get('average_step_reward', math.nan):.4g}"
         if math.isfinite(row.get("success", math.nan)):

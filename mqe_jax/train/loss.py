@@ -60,18 +60,18 @@ def value_loss(
 ) -> jax.Array:
     """Returns the value loss per element: Huber (or half the square), clipped around `old_value`.
 
-    With `clip`, the larger of the loss of `value` and of `value` kept within `old_value` +- clip.
+    With `clip`, the larger of the losses of `value` and of `value` clipped to `old_value` +- clip.
     Shapes: all the same. Source: Yu et al., arXiv 2103.01955.
     """
 
     def loss(error: jax.Array) -> jax.Array:
         return 0.5 * jnp.square(error) if huber_delta is None else huber(error, huber_delta)
 
-    free = loss(value - target)
+    unclipped = loss(value - target)
     if clip is None:
-        return free
-    kept = old_value + jnp.clip(value - old_value, -clip, clip)
-    return jnp.maximum(free, loss(kept - target))
+        return unclipped
+    clipped = old_value + jnp.clip(value - old_value, -clip, clip)
+    return jnp.maximum(unclipped, loss(clipped - target))
 
 
 def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
@@ -83,7 +83,7 @@ def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
 
 
 def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
-    """Returns one log-ratio per action dimension, as OpenRL clips them: (..., A, D) -> (..., A, D)."""
+    """Returns one log-ratio per action dimension, as OpenRL does: (..., A, D) -> (..., A, D)."""
     return new - old
 
 
@@ -100,4 +100,4 @@ RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
     "dimension": ratio_per_dimension,
     "joint": ratio_joint,
 }
-"""What PPO clips, by the name that the settings give it."""
+"""Log-ratio functions by the name of `ppo.ratio`."""

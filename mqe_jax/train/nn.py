@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-Params = dict[str, Any]
+from mqe_jax.train.types import Params
 
 PRECISION = "highest"
-"""Matrix products of the learner: full float32 on every device, so that results do not depend on the card."""
+"""Precision of the learner's matrix products: full float32, so that results do not depend on the GPU model."""
 
 
 def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Array:
@@ -25,12 +24,12 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
 
     def add_column(j: jax.Array, q: jax.Array) -> jax.Array:
         column = normal[:, j]
-        for _ in range(2):  # once more takes off what rounding left
+        for _ in range(2):  # the second pass removes rounding errors
             column = column - jnp.matmul(q, jnp.matmul(column, q, precision=PRECISION), precision=PRECISION)
         return q.at[:, j].set(column / jnp.linalg.norm(column))
 
-    # Gram-Schmidt by hand: on a CPU with few cores, LAPACK's decompositions in one program (jnp.linalg.qr)
-    # run side by side in XLA's threads, each waits for a free thread, and the program stands still.
+    # Gram-Schmidt in place of jnp.linalg.qr: on a CPU with few cores, LAPACK decompositions in one program run
+    # concurrently in XLA's threads, each waits for a free thread, and the program deadlocks.
     q = jax.lax.fori_loop(0, min(shape), add_column, jnp.zeros_like(normal))
     return scale * (q if rows >= columns else q.T)
 

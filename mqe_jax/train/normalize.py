@@ -1,4 +1,4 @@
-"""Running statistics: of observations over everything seen, of value targets over the recent past."""
+"""Running statistics: of observations over the whole training, of value targets over the recent past."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class RunningStatistics(NamedTuple):
 
 
 def running_init(size: int) -> RunningStatistics:
-    """Makes statistics that leave the data as it is until the first update."""
+    """Returns statistics that leave data unchanged until the first update."""
     return RunningStatistics(jnp.zeros((size,)), jnp.ones((size,)), jnp.zeros(()))
 
 
@@ -33,24 +33,28 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
     batch_mean = jnp.mean(batch, axis=0)
     batch_variance = jnp.mean(jnp.square(batch - batch_mean), axis=0)
     samples = statistics.samples + batch_samples
-    share = batch_samples / samples
+    fraction = batch_samples / samples
     shift = batch_mean - statistics.mean
-    mean = statistics.mean + shift * share
-    variance = statistics.variance * (1.0 - share) + batch_variance * share + jnp.square(shift) * share * (1.0 - share)
+    mean = statistics.mean + shift * fraction
+    variance = (
+        statistics.variance * (1.0 - fraction)
+        + batch_variance * fraction
+        + jnp.square(shift) * fraction * (1.0 - fraction)
+    )
     return RunningStatistics(mean, variance, samples)
 
 
 def running_normalize(statistics: RunningStatistics, x: jax.Array, limit: float = 10.0) -> jax.Array:
-    """Returns x (..., size) with mean 0 and deviation 1, kept within +-limit.
+    """Returns x (..., size) normalised to mean 0 and standard deviation 1, clipped to +-limit.
 
-    Deviations count as at least 0.01, so that a constant entry becomes 0 and not noise.
+    The standard deviation is floored at 0.01, so that a constant entry becomes 0 and not noise.
     """
     std = jnp.maximum(jnp.sqrt(statistics.variance), _MIN_STD)
     return jnp.clip((x - statistics.mean) / std, -limit, limit)
 
 
 class ValueStatistics(NamedTuple):
-    """Exponential averages of value targets () and of their squares (), and the weight () gathered so far."""
+    """Exponential averages of value targets () and of their squares (), and the accumulated weight ()."""
 
     mean: jax.Array
     square: jax.Array
@@ -58,12 +62,12 @@ class ValueStatistics(NamedTuple):
 
 
 def value_init() -> ValueStatistics:
-    """Makes statistics that leave values as they are until the first update."""
+    """Returns statistics that leave values unchanged until the first update."""
     return ValueStatistics(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
 
 
 def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -> ValueStatistics:
-    """Moves the averages towards a rollout's targets, of any shape; the start is debiased by the weight.
+    """Updates the averages with a rollout's targets, of any shape; the weight removes the initial bias.
 
     Source: Yu et al., arXiv 2103.01955 (there with decay 0.99999 per minibatch; here per rollout).
     """
@@ -74,7 +78,7 @@ def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -
 
 
 def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
-    """Returns mean and deviation, 0 and 1 before the first update."""
+    """Returns mean and standard deviation, 0 and 1 before the first update."""
     seen = statistics.weight > 0.0
     weight = jnp.where(seen, statistics.weight, 1.0)
     mean = statistics.mean / weight
@@ -84,12 +88,12 @@ def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
 
 
 def value_normalize(statistics: ValueStatistics, value: jax.Array) -> jax.Array:
-    """Returns a value in units of reward as the network is to give it."""
+    """Returns the normalised value of one in units of reward."""
     mean, std = _value_moments(statistics)
     return (value - mean) / std
 
 
 def value_denormalize(statistics: ValueStatistics, value: jax.Array) -> jax.Array:
-    """Returns what the network gave in units of reward."""
+    """Returns the value in units of reward of a normalised one."""
     mean, std = _value_moments(statistics)
     return value * std + mean

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-PyTree = Any
+from mqe_jax.train.types import PyTree
 
 
 class AdamState(NamedTuple):
@@ -20,21 +20,21 @@ class AdamState(NamedTuple):
 
 
 class Optimizer(NamedTuple):
-    """`init(params) -> state`; `update(grads, state, params, rate) -> (params, state, grad_norm)`."""
+    """`init(params) -> state`; `update(grads, state, params, learning_rate) -> (params, state, grad_norm)`."""
 
     init: Callable[[PyTree], AdamState]
     update: Callable[[PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]]
 
 
 def global_norm(tree: PyTree) -> jax.Array:
-    """Returns the Euclidean norm () of all leaves taken as one vector."""
+    """Returns the Euclidean norm () of all leaves as one vector."""
     return jnp.sqrt(sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.float32(0.0)))
 
 
 def adam(eps: float = 1e-5, b1: float = 0.9, b2: float = 0.999, max_grad_norm: float | None = None) -> Optimizer:
-    """Makes Adam; gradients whose global norm exceeds `max_grad_norm` are first scaled down to it.
+    """Returns Adam with gradients clipped to a global norm of at most `max_grad_norm`.
 
-    `grad_norm` is the norm before the scaling. Source: Kingma and Ba, arXiv 1412.6980.
+    `grad_norm` is the norm before clipping. Source: Kingma and Ba, arXiv 1412.6980.
     """
 
     def init(params: PyTree) -> AdamState:

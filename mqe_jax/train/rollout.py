@@ -1,4 +1,4 @@
-"""Steps all worlds under the current policy and gathers what there is to learn from."""
+"""Steps all environments under the current policy and collects transitions and metrics."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train.networks import Network, Params, reset_memory
+from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Memory, Transition, VectorEnv
+from mqe_jax.train.types import NetworkMemory, Params, Transition, VectorEnv
 
 
-class Cursor(NamedTuple):
-    """Where the worlds stand between two rollouts; leading axis N."""
+class RolloutState(NamedTuple):
+    """State carried between rollouts: environment states, recurrent states, episode counters; leading axis N."""
 
     env_state: Any
-    memory: Memory
-    start: jax.Array  # (N,) bool, the next step is the first of an episode
+    memory: NetworkMemory
+    is_first: jax.Array  # (N,) bool, the next step is the first of an episode
     episode_steps: jax.Array  # (N,) int32, steps since the episode began
 
 
@@ -31,7 +31,7 @@ class ObservationNormalizer(NamedTuple):
 def normalize_obs(
     normalizer: ObservationNormalizer, obs: jax.Array, privileged: jax.Array, enabled: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns both observations as the networks see them."""
+    """Returns both observations as the networks take them: normalised where `enabled`."""
     if not enabled:
         return obs, privileged
     return running_normalize(normalizer.obs, obs), running_normalize(normalizer.privileged, privileged)
@@ -42,29 +42,32 @@ def rollout(
     network: Network,
     params: Params,
     normalizer: ObservationNormalizer,
-    cursor: Cursor,
+    state: RolloutState,
     key: jax.Array,
     length: int,
+    *,
     normalize: bool,
-) -> tuple[Cursor, Transition, dict[str, jax.Array]]:
-    """Steps every world `length` times; returns the new cursor, transitions (T, N, ...) and metrics ().
+    action_scale: float,
+) -> tuple[RolloutState, Transition, dict[str, jax.Array]]:
+    """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
-    Environment metrics are means over steps and worlds, except: names that begin with `success` are means
-    over the steps that ended an episode (NaN where none did), and `diverged` is a count.
+    The environment gets `action_scale` times the sampled action. Its metrics are means over steps and environments,
+    except: names that begin with `success` are means over the steps that ended an episode (NaN where none did), and
+    `diverged` is a count.
     """
 
-    def one_step(cursor: Cursor, key: jax.Array) -> tuple[Cursor, tuple[Transition, dict[str, jax.Array]]]:
-        before = cursor.env_state
-        memory = reset_memory(cursor.memory, cursor.start)
+    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, dict[str, jax.Array]]]:
+        before = state.env_state
+        memory = reset_memory(state.memory, state.is_first)
         obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, normalize)
-        action, log_prob, actor_memory = network.act(params, memory["actor"], obs, key)
-        no_start = jnp.zeros((1, *cursor.start.shape), bool)
-        _, critic_memory = network.value(params, memory["critic"], no_start, obs[None], privileged[None])
-        after = env.step(before, action)
+        action, log_prob, actor_memory = network.act(network.acting(params), memory.actor, obs, key)
+        not_first = jnp.zeros((1, *state.is_first.shape), bool)
+        _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None])
+        after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
         transition = Transition(
             memory=memory,
-            start=cursor.start,
+            is_first=state.is_first,
             obs=before.obs,
             privileged_obs=before.privileged_obs,
             final_obs=after.final_obs,
@@ -75,18 +78,18 @@ def rollout(
             terminated=after.terminated,
             done=done,
         )
-        episode_steps = cursor.episode_steps + 1
+        episode_steps = state.episode_steps + 1
         sums = _sums(after.metrics, done, episode_steps)
-        cursor = Cursor(
+        state = RolloutState(
             env_state=after,
-            memory={"actor": actor_memory, "critic": critic_memory},
-            start=done,
+            memory=NetworkMemory(actor_memory, critic_memory),
+            is_first=done,
             episode_steps=jnp.where(done, 0, episode_steps),
         )
-        return cursor, (transition, sums)
+        return state, (transition, sums)
 
-    cursor, (transitions, sums) = jax.lax.scan(one_step, cursor, jax.random.split(key, length))
-    return cursor, transitions, _means(sums, length * env.num_envs)
+    state, (transitions, sums) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    return state, transitions, _means(sums, length * env.num_envs)
 
 
 def _at_episode_end(name: str) -> bool:
@@ -94,7 +97,7 @@ def _at_episode_end(name: str) -> bool:
 
 
 def _sums(metrics: dict[str, jax.Array], done: jax.Array, episode_steps: jax.Array) -> dict[str, jax.Array]:
-    """Returns sums over worlds, of one step."""
+    """Returns the sums over environments of one step."""
     sums = {
         name: jnp.sum(jnp.where(done, value, 0.0) if _at_episode_end(name) else value)
         for name, value in metrics.items()
@@ -105,7 +108,7 @@ def _sums(metrics: dict[str, jax.Array], done: jax.Array, episode_steps: jax.Arr
 
 
 def _means(sums: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
-    """Returns the means of the sums per step (T,)."""
+    """Returns the metrics of a rollout from its sums per step (T,)."""
     totals = {name: jnp.sum(value) for name, value in sums.items()}
     episodes = totals["episodes"]
     means = {}

@@ -1,11 +1,11 @@
-"""The driver of a training: a run folder that holds settings, metrics, checkpoints and the policy."""
+"""The training loop: updates, logs, and a run folder with settings, metrics, checkpoints and the policy."""
 
 from __future__ import annotations
 
 import math
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
+from mqe_jax.settings import to_mapping
 from mqe_jax.train.checkpoint import latest, load_checkpoint, save_checkpoint
-from mqe_jax.train.config import TrainConfig, config_to_mapping, load_config
-from mqe_jax.train.learner import Learner, TrainState, env_sizes, make_learner
+from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CsvLog, ProgressLog, TensorBoardLog
 from mqe_jax.train.policy import policy_of, save_policy
 from mqe_jax.train.types import VectorEnv
@@ -26,7 +28,7 @@ CONFIG_FILE = "config.yaml"
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
-_MAY_CHANGE = ("total_steps", "checkpoint_every", "checkpoints_kept")
+_MAY_CHANGE = ("total_steps", "checkpoint")
 
 
 def train(
@@ -36,24 +38,29 @@ def train(
     resume: bool = False,
     on_update: OnUpdate | None = None,
 ) -> TrainState:
-    """Trains until `config.total_steps` and returns the last state; everything lands in `run_dir`.
+    """Trains until `config.total_steps` and returns the last state.
 
-    The folder gets config.yaml, metrics.csv, tensorboard/, checkpoints/ and policy.safetensors. With
-    `resume` the newest checkpoint goes on as if the training had never stopped (from the start where there
-    is none yet). `on_update(state, row)` is called after every update with its row of metrics.csv.
-    Raises ValueError before any work where the folder cannot be written, already holds a run that is not to
-    be resumed, or holds one of other settings.
+    Args:
+        env: the environments.
+        config: settings.
+        run_dir: folder for config.yaml, metrics.csv, tensorboard/, checkpoints/ and policy.safetensors.
+        resume: continues exactly from the newest checkpoint (from the start where there is none yet).
+        on_update: called after every update with the state and its row of metrics.csv.
+
+    Raises:
+        InputError: before any work, where the folder cannot be written, already holds a run that is not to be
+            resumed, or holds one of other settings.
     """
     run_dir = Path(run_dir)
     learner = make_learner(env, config)
     checkpoint = _prepare_folder(run_dir, config, resume)
     state, seconds = _first_state(env, learner, config, checkpoint)
-    text = yaml.safe_dump(config_to_mapping(config), sort_keys=False)
+    text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     write_atomically(run_dir / CONFIG_FILE, text.encode())
     update = jax.jit(learner.update)
     env_steps = int(state.updates) * config.steps_per_update
     csv_log, tensorboard_log = CsvLog(run_dir, env_steps), TensorBoardLog(run_dir, env_steps)
-    began = time.perf_counter() - seconds
+    start_time = time.perf_counter() - seconds
     saved = -1 if checkpoint is None else env_steps
 
     def save() -> None:
@@ -62,11 +69,11 @@ def train(
         if saved != step:
             metadata = {
                 "task": env.name,
-                "config": config_to_mapping(config),
-                "seconds": time.perf_counter() - began,
+                "config": to_mapping(config),
+                "seconds": time.perf_counter() - start_time,
             }
-            save_policy(run_dir, policy_of(state, env_sizes(env), config, task=env.name, env_steps=step))
-            save_checkpoint(run_dir, state, step, metadata, config.checkpoints_kept)
+            save_policy(run_dir, policy_of(state, env_dims(env, config), config, task=env.name, env_steps=step))
+            save_checkpoint(run_dir, state, step, metadata, config.checkpoint.kept)
             saved = step
 
     total_steps = config.num_updates * config.steps_per_update
@@ -75,14 +82,14 @@ def train(
             while env_steps < total_steps:
                 update_began = time.perf_counter()
                 after, metrics = update(state)
-                row = _row(after, jax.device_get(metrics), config, began, update_began)
+                row = _row(after, jax.device_get(metrics), config, start_time, update_began)
                 for log in (csv_log, tensorboard_log, progress_log):
                     log.write(row)
-                # Only now, so that an interrupted training is saved with no more updates than its logs show.
+                # Assigned after logging, so that an interrupted training saves no more updates than its logs show.
                 state, env_steps = after, int(row["env_steps"])
                 if on_update is not None:
                     on_update(state, row)
-                if int(row["updates"]) % config.checkpoint_every == 0:
+                if int(row["updates"]) % config.checkpoint.every == 0:
                     save()
         save()
     except KeyboardInterrupt:
@@ -95,17 +102,17 @@ def train(
 
 
 def load_run_config(run_dir: str | Path) -> TrainConfig:
-    """Reads the settings of a run's folder; raises a ValueError that names the file."""
+    """Reads the settings of a run's folder; raises an InputError that names the file."""
     return load_config(Path(run_dir) / CONFIG_FILE)
 
 
 def initial_key(config: TrainConfig) -> jax.Array:
-    """Returns the random key (raw uint32) from which a training of these settings begins."""
+    """Returns the initial random key (raw uint32) of a training."""
     return jax.random.PRNGKey(config.seed)
 
 
 def _row(
-    state: TrainState, metrics: dict[str, Any], config: TrainConfig, began: float, update_began: float
+    state: TrainState, metrics: dict[str, Any], config: TrainConfig, start_time: float, update_began: float
 ) -> dict[str, float]:
     """Returns a row of metrics.csv: steps and times first, then the update's metrics by name."""
     now = time.perf_counter()
@@ -113,7 +120,7 @@ def _row(
     row: dict[str, float] = {
         "env_steps": updates * config.steps_per_update,
         "updates": updates,
-        "seconds": now - began,
+        "seconds": now - start_time,
         "fps": config.steps_per_update / (now - update_began),
     }
     row.update({name: float(np.asarray(value)) for name, value in sorted(metrics.items())})
@@ -121,44 +128,53 @@ def _row(
 
 
 def _prepare_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Path | None:
-    """Makes the run's folder and checks what it holds; returns the checkpoint to go on from, if any."""
+    """Creates the run's folder and checks its content; returns the checkpoint to resume from, if any."""
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=run_dir):
             pass
     except OSError as error:
-        raise ValueError(f"run_dir: {run_dir} cannot be written ({error.strerror or error})") from None
+        raise InputError(f"run_dir: {run_dir} cannot be written ({error.strerror or error})") from None
     checkpoint = latest(run_dir)
     if checkpoint is not None and not resume:
-        raise ValueError(f"run_dir: {run_dir} already holds a run; resume it (--resume) or name another folder")
+        raise InputError(f"run_dir: {run_dir} already holds a run; resume it (--resume) or name another folder")
     if checkpoint is not None:
         _check_same(run_dir, config)
     return checkpoint
 
 
 def _check_same(run_dir: Path, config: TrainConfig) -> None:
-    """Raises a ValueError naming the first setting in which the run to resume differs."""
-    before = config_to_mapping(load_run_config(run_dir))
-    for name, value in config_to_mapping(config).items():
-        if name not in _MAY_CHANGE and before[name] != value:
-            raise ValueError(
-                f"{name}: {value!r} differs from the run in {run_dir}, which has {before[name]!r}; "
+    """Raises an InputError naming the first setting in which the run to resume differs."""
+    before = dict(_leaves(to_mapping(load_run_config(run_dir))))
+    for name, value in _leaves(to_mapping(config)):
+        if name.split(".")[0] not in _MAY_CHANGE and before.get(name) != value:
+            raise InputError(
+                f"{name}: {value!r} differs from the run in {run_dir}, which has {before.get(name)!r}; "
                 f"a resumed run may change only {', '.join(_MAY_CHANGE)}"
             )
+
+
+def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the dotted names and values of nested settings."""
+    for name, value in mapping.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def _first_state(
     env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None
 ) -> tuple[TrainState, float]:
-    """Returns the state to start from and the seconds that the training has already taken."""
+    """Returns the initial or restored state and the seconds already spent."""
     if checkpoint is None:
         return jax.jit(learner.init)(initial_key(config)), 0.0
     template = jax.eval_shape(learner.init, initial_key(config))
     restored = load_checkpoint(checkpoint, template)
     if restored.metadata.get("task") != env.name:
-        raise ValueError(f"{checkpoint}: belongs to task {restored.metadata.get('task')}, not {env.name}")
+        raise InputError(f"{checkpoint}: belongs to task {restored.metadata.get('task')}, not {env.name}")
     state = jax.tree.map(jnp.asarray, restored.tree)
     seconds = float(restored.metadata.get("seconds", 0.0))
     if not math.isfinite(seconds):
-        raise ValueError(f"{checkpoint}: seconds: {seconds} is not a finite number")
+        raise InputError(f"{checkpoint}: seconds: {seconds} is not a finite number")
     return state, seconds

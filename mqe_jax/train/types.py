@@ -1,4 +1,4 @@
-"""What the learner asks of an environment, and the records that it passes along."""
+"""Environment protocol and learner data types."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from typing import Any, NamedTuple, Protocol
 import jax
 
 PyTree = Any
+Params = dict[str, Any]
+"""Nested dict of parameter arrays."""
 Memory = Any
-"""A pytree of arrays with leading axis N, or an empty one for networks without memory."""
+"""Recurrent state: a pytree of arrays with leading axis N, or an empty one for networks without memory."""
 
 
 class EnvState(Protocol):
-    """The fields of a batched environment state that the learner reads; N worlds of A agents.
+    """The fields of a batched environment state that the learner reads; N environments of A agents.
 
-    obs (N, A, O) is what to act on next; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the
-    state in which the step arrived, before any reset; privileged_obs (N, P); reward (N, A);
-    terminated, truncated (N,) bool; metrics maps names to (N,); step (N,) int32.
+    obs (N, A, O) is the input of the next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the
+    state reached by the step, before any reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool;
+    metrics maps names to (N,), and every name is present from the reset on.
     """
 
     @property
@@ -35,15 +37,13 @@ class EnvState(Protocol):
     def truncated(self) -> jax.Array: ...
     @property
     def metrics(self) -> dict[str, jax.Array]: ...
-    @property
-    def step(self) -> jax.Array: ...
 
 
 class VectorEnv(Protocol):
-    """N worlds that reset themselves; `reset` and `step` are pure and may be jitted.
+    """N environments with automatic reset; `reset` and `step` are pure and may be jitted.
 
-    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with
-    the fields of `EnvState`. An environment may also have `max_episode_steps` (int), which staggering needs.
+    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with the fields
+    of `EnvState`.
     """
 
     @property
@@ -62,16 +62,23 @@ class VectorEnv(Protocol):
     def step(self, state: Any, action: jax.Array) -> Any: ...
 
 
+class NetworkMemory(NamedTuple):
+    """Recurrent state of a network's two roles; leading axis N."""
+
+    actor: Memory
+    critic: Memory
+
+
 class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
-    memory: Memory  # what the networks remembered before this step, zeroed at an episode's start
-    start: jax.Array  # (N,) bool, the step is the first of its episode
+    memory: NetworkMemory  # before this step, zeroed at an episode's first step
+    is_first: jax.Array  # (N,) bool, the step is the first of its episode
     obs: jax.Array  # (N, A, O)
     privileged_obs: jax.Array  # (N, P)
-    final_obs: jax.Array  # (N, A, O), where the step arrived
+    final_obs: jax.Array  # (N, A, O), of the state reached
     final_privileged_obs: jax.Array  # (N, P)
-    action: jax.Array  # (N, A, D), before the environment clips it
+    action: jax.Array  # (N, A, D), as sampled: unscaled and unclipped
     log_prob: jax.Array  # (N, A, D)
     reward: jax.Array  # (N, A)
     terminated: jax.Array  # (N,) bool
@@ -79,14 +86,14 @@ class Transition(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Chunks of L steps to learn from: (L, C, ...), the memory at each chunk's start (C, ...)."""
+    """Chunks of L steps to learn from: (L, C, ...), the memory at each chunk's first step (C, ...)."""
 
-    memory: Memory
-    start: jax.Array
+    memory: NetworkMemory
+    is_first: jax.Array
     obs: jax.Array
     privileged_obs: jax.Array
     action: jax.Array
     log_prob: jax.Array
     advantage: jax.Array  # (L, C, V)
     target: jax.Array  # (L, C, V), in units of reward
-    old_value: jax.Array  # (L, C, V), as the network gives it (normalised)
+    old_value: jax.Array  # (L, C, V), normalised

@@ -187,7 +187,7 @@ def make_iteration(
             records["terminated"],
             done,
             gamma=config.gamma,
-            lam=config.lam,
+            gae_lambda=config.lam,
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
         old_log_std = learner.params["log_std"]

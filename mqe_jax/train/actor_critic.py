@@ -1,0 +1,210 @@
+"""The network `actor_critic`: feed-forward or recurrent actors and a centralised or own critic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+from annotated_types import MinLen
+
+from mqe_jax.settings import Positive, PositiveInt, fail
+from mqe_jax.train import nn
+from mqe_jax.train.loss import entropy, log_prob
+from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
+from mqe_jax.train.types import Memory, NetworkMemory, Params
+
+_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "relu": jax.nn.relu,
+    "elu": jax.nn.elu,
+    "tanh": jnp.tanh,
+}
+
+
+@register_network("actor_critic")
+class ActorCritic(NetworkSettings):
+    """Settings of actor and critic: hidden layers, an optional recurrent unit, a Gaussian policy."""
+
+    critic_input: Literal["privileged", "observations", "own"] = "privileged"
+    """Critic input: the privileged observation, all agents' observations, or each agent's own."""
+    share_policy: bool = True
+    """One actor for all agents (their id is in the observation), or one for each."""
+    hidden_sizes: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64,)
+    """Widths of the hidden layers of actor and critic."""
+    activation: Literal["relu", "elu", "tanh"] = "relu"
+    """Activation after each hidden layer."""
+    recurrent: bool = True
+    """Gated recurrent unit after the hidden layers of actor and critic."""
+    gru_size: PositiveInt = 64
+    """Width of the recurrent unit."""
+    chunk_length: PositiveInt = 2
+    """Steps of truncated backpropagation through time; used with `recurrent`."""
+    action_gain: Positive = 0.01
+    """Gain of the orthogonal initialisation of the action layer."""
+    action_mean: Literal["linear", "tanh"] = "linear"
+    """Output of the mean action: unbounded, or within -1 and 1."""
+    log_std_init: float = 0.0
+    """Initial log standard deviation of the actions."""
+    log_std_max: float | None = None
+    """Upper bound on the log standard deviation; none sets no bound."""
+    log_std_min: float | None = None
+    """Lower bound on the log standard deviation, which maintains exploration; none sets no bound."""
+
+    def __post_init__(self) -> None:
+        if self.log_std_max is not None and self.log_std_init > self.log_std_max:
+            fail("log_std_init", self.log_std_init, f"at most log_std_max ({self.log_std_max})")
+        if self.log_std_min is not None and self.log_std_init < self.log_std_min:
+            fail("log_std_init", self.log_std_init, f"at least log_std_min ({self.log_std_min})")
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network; see `Network`."""
+        return _build(self, dims)
+
+
+def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, settings: ActorCritic) -> Params:
+    """Initialises hidden layers, an optional recurrent unit and an output layer."""
+    hidden_key, gru_key, head_key = jax.random.split(key, 3)
+    width = settings.hidden_sizes[-1]
+    params: Params = {
+        "hidden": nn.mlp_init(hidden_key, (n_in, *settings.hidden_sizes), final_scale=math.sqrt(2.0)),
+        "head": nn.dense_init(head_key, settings.gru_size if settings.recurrent else width, n_out, final_scale),
+    }
+    if settings.recurrent:
+        params["gru"] = nn.gru_init(gru_key, width, settings.gru_size)
+    return params
+
+
+def _trunk(
+    params: Params, memory: Memory, is_first: jax.Array, x: jax.Array, settings: ActorCritic
+) -> tuple[jax.Array, Memory]:
+    """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ..., n_out), memory.
+
+    Only the recurrent unit is sequential; the layers around it take all steps at once.
+    """
+    x = nn.mlp(params["hidden"], x, _ACTIVATIONS[settings.activation], activate_last=True)
+    if "gru" in params:
+
+        def step(h: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            first_t, x_t = inputs
+            h = nn.gru(params["gru"], jnp.where(first_t[..., None], 0.0, h), x_t)
+            return h, h
+
+        memory, x = jax.lax.scan(step, memory, (is_first, x), unroll=min(x.shape[0], 8))
+    return nn.dense(params["head"], x), memory
+
+
+def _over_agents(function: Callable[..., Any], share: bool) -> Callable[..., Any]:
+    """Maps `_trunk` over an agent axis before the last, with one set of parameters or A."""
+    if share:
+        return function
+    return jax.vmap(function, in_axes=(0, -2, -1, -2), out_axes=(-2, -2))
+
+
+def _build(settings: ActorCritic, dims: EnvDims) -> Network:
+    agents, share = dims.agents, settings.share_policy
+    own = settings.critic_input == "own"
+    if own and dims.values != agents:
+        fail("network.critic_input", "own", "'privileged' or 'observations' when ppo.value is 'joint'")
+    if settings.critic_input == "privileged" and not dims.privileged:
+        fail(
+            "network.critic_input", "privileged", "'observations' or 'own': the environment has none that is privileged"
+        )
+    critic_rows = agents if own else 1
+    critic_in = {
+        "privileged": dims.privileged,
+        "observations": agents * dims.observation,
+        "own": dims.observation,
+    }[settings.critic_input]
+    critic_out = 1 if own else dims.values
+    critic_shared = share or not own
+
+    def init(key: jax.Array) -> Params:
+        actor_key, critic_key = jax.random.split(key)
+
+        def actor_init(k: jax.Array) -> Params:
+            return _trunk_init(k, dims.observation, dims.action, settings.action_gain, settings)
+
+        def critic_init(k: jax.Array) -> Params:
+            return _trunk_init(k, critic_in, critic_out, 1.0, settings)
+
+        if not share:
+            actor_key = jax.random.split(actor_key, agents)
+        if not critic_shared:
+            critic_key = jax.random.split(critic_key, agents)
+        log_std_shape = (dims.action,) if share else (agents, dims.action)
+        return {
+            "actor": actor_init(actor_key) if share else jax.vmap(actor_init)(actor_key),
+            "log_std": jnp.full(log_std_shape, settings.log_std_init, jnp.float32),
+            "critic": critic_init(critic_key) if critic_shared else jax.vmap(critic_init)(critic_key),
+        }
+
+    def acting(params: Params) -> Params:
+        return {name: params[name] for name in ("actor", "log_std")}
+
+    def initial_memory(num_envs: int) -> NetworkMemory:
+        if not settings.recurrent:
+            return NetworkMemory((), ())
+        return NetworkMemory(
+            actor=jnp.zeros((num_envs, agents, settings.gru_size)),
+            critic=jnp.zeros((num_envs, critic_rows, settings.gru_size)),
+        )
+
+    def run(params: Params, shared: bool, memory: Memory, is_first: jax.Array, x: jax.Array) -> Any:
+        def trunk(params: Params, memory: Memory, is_first: jax.Array, x: jax.Array) -> tuple[jax.Array, Memory]:
+            return _trunk(params, memory, is_first, x, settings)
+
+        is_first = jnp.broadcast_to(is_first[..., None], x.shape[:-1])
+        return _over_agents(trunk, shared)(params, memory, is_first, x)
+
+    def distribution(
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array
+    ) -> tuple[jax.Array, jax.Array, Memory]:
+        mean, memory = run(params["actor"], share, memory, is_first, obs)
+        if settings.action_mean == "tanh":
+            mean = jnp.tanh(mean)
+        log_std = params["log_std"]
+        if settings.log_std_max is not None:
+            log_std = jnp.minimum(log_std, settings.log_std_max)
+        if settings.log_std_min is not None:
+            log_std = jnp.maximum(log_std, settings.log_std_min)
+        return mean, jnp.broadcast_to(log_std, mean.shape), memory
+
+    def act(
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, Memory]:
+        is_first = jnp.zeros((1, *obs.shape[:-2]), bool)
+        mean, log_std, memory = distribution(params, memory, is_first, obs[None])
+        mean, log_std = mean[0], log_std[0]
+        action = mean
+        if key is not None:
+            action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
+        return action, log_prob(action, mean, log_std), memory
+
+    def value(
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
+    ) -> tuple[jax.Array, Memory]:
+        if settings.critic_input == "privileged":
+            x = privileged[..., None, :]
+        elif settings.critic_input == "observations":
+            x = obs.reshape(*obs.shape[:-2], 1, critic_in)
+        else:
+            x = obs
+        out, memory = run(params["critic"], critic_shared, memory, is_first, x)
+        return out.reshape(*out.shape[:-2], critic_rows * critic_out), memory
+
+    def evaluate(
+        params: Params,
+        memory: NetworkMemory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        action: jax.Array,
+    ) -> Evaluation:
+        mean, log_std, _ = distribution(params, memory.actor, is_first, obs)
+        values, _ = value(params, memory.critic, is_first, obs, privileged)
+        return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)
+
+    chunk_length = settings.chunk_length if settings.recurrent else 1
+    return Network(init, acting, initial_memory, act, value, evaluate, chunk_length)
