@@ -92,8 +92,10 @@ class Train:
     task: tyro.conf.Positional[str]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings, or the name of a shipped one: demo, go1gate, paper_mappo. Default: the shipped
-    file named after the task, else the paper's settings."""
+    """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
+    settings of the algorithm given, else the task's tuned ones, else the paper's MAPPO."""
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings in which they differ."""
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder of the run. Default: runs/TASK."""
     resume: bool = False

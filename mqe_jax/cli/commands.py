@@ -96,7 +96,7 @@ def train(arguments: Train) -> None:
     overrides = parse_overrides(arguments.set)
     if arguments.control is not None:
         overrides["control"] = arguments.control
-    config = train_config(arguments.task, arguments.config, given(arguments.settings), overrides)
+    config = train_config(arguments.task, arguments.config, given(arguments.settings), overrides, arguments.algorithm)
     run_dir = arguments.run_dir or Path("runs") / arguments.task
     _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
     try:

@@ -50,6 +50,7 @@ class VectorEnv:
         self.name = env.name
         self.max_episode_steps = env.max_steps
         self.num_agents = env.num_agents
+        self.teams = env.teams
         self.observation_size = env.observation_size
         self.privileged_observation_size = env.privileged_observation_size
         self.action_size = env.action_size

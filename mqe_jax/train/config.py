@@ -24,6 +24,7 @@ from mqe_jax.settings import (
     record,
 )
 from mqe_jax.train.actor_critic import ActorCritic
+from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
+from mqe_jax.train.loss import RATIOS, Teams, clipped_surrogate, ratio_joint, value_loss
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
     ValueStatistics,
@@ -66,13 +66,14 @@ class Learner(NamedTuple):
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     """Returns the sizes that a network is built for."""
     agents = env.num_agents
+    teams = tuple(getattr(env, "teams", None) or (tuple(range(agents)),))
     return EnvDims(
         agents=agents,
         observation=env.observation_size,
         privileged=env.privileged_observation_size,
         action=env.action_size,
-        teams=(tuple(range(agents)),),
-        values=1 if config.ppo.value == "joint" else agents,
+        teams=teams,
+        values=len(teams) if config.ppo.value == "joint" else agents,
     )
 
 
@@ -89,7 +90,8 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
         fail("curriculum.assistance", assistance, f"0: the state of the environment {env.name} has no such field")
     if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
         fail("stagger_episodes", True, f"false: the environment {env.name} has no max_episode_steps")
-    network = config.network.build(env_dims(env, config))
+    dims = env_dims(env, config)
+    network, teams = config.network.build(dims), dims.teams
     _check_divisible(config, network)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
@@ -136,9 +138,9 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
         )
-        batch, value_normalizer, batch_metrics = _prepare(network, config, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(network, config, teams, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
-            network, optimizer, config, state, value_normalizer, batch, epoch_key
+            network, optimizer, config, teams, state, value_normalizer, batch, epoch_key
         )
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
@@ -192,7 +194,7 @@ def _strongly_typed(state: TrainState) -> TrainState:
 
 
 def _prepare(
-    network: Network, config: TrainConfig, state: TrainState, transitions: Transition
+    network: Network, config: TrainConfig, teams: Teams, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and cuts it into chunks (L, C, ...).
 
@@ -219,7 +221,7 @@ def _prepare(
     value, next_value = value_denormalize(value_normalizer, pair)
     reward = transitions.reward
     if config.ppo.value == "joint":
-        reward = jnp.mean(reward, axis=-1, keepdims=True)
+        reward = jnp.stack([jnp.mean(reward[..., jnp.array(team)], axis=-1) for team in teams], axis=-1)
     progress = state.updates.astype(jnp.float32) / config.num_updates
     curriculum = config.curriculum
     kept = curriculum.failure_bootstrap * jnp.maximum(1.0 - progress / curriculum.failure_bootstrap_until, 0.0)
@@ -275,6 +277,7 @@ def _loss(
     params: Params,
     network: Network,
     config: TrainConfig,
+    teams: Teams,
     value_normalizer: ValueStatistics,
     entropy_coef: jax.Array,
     batch: Batch,
@@ -282,8 +285,15 @@ def _loss(
     """Returns the PPO loss () of a minibatch and its parts."""
     ppo = config.ppo
     now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
-    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
-    surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
+    advantage = batch.advantage[..., None]
+    if ppo.ratio == "joint":
+        log_ratio = ratio_joint(now.log_prob, batch.log_prob, teams)
+    else:
+        log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
+        if ppo.value == "joint":
+            number = {agent: team for team, members in enumerate(teams) for agent in members}
+            advantage = advantage[..., jnp.array([number[agent] for agent in range(len(number))]), :]
+    surrogate = clipped_surrogate(log_ratio, advantage, ppo.clip, ppo.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
     critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
@@ -309,6 +319,7 @@ def _learn(
     network: Network,
     optimizer: Optimizer,
     config: TrainConfig,
+    teams: Teams,
     state: TrainState,
     value_normalizer: ValueStatistics,
     batch: Batch,
@@ -325,7 +336,7 @@ def _learn(
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
         gradient, metrics = jax.grad(_loss, has_aux=True)(
-            params, network, config, value_normalizer, entropy_coef, minibatch
+            params, network, config, teams, value_normalizer, entropy_coef, minibatch
         )
         if config.optimizer.target_kl is not None:
             learning_rate = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)

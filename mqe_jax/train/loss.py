@@ -8,6 +8,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+Teams = tuple[tuple[int, ...], ...]
+"""Indices of the agents of each team."""
+
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -87,17 +90,18 @@ def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
     return new - old
 
 
-def ratio_joint(new: jax.Array, old: jax.Array) -> jax.Array:
-    """Returns the log of the product of all agents' ratios: (..., A, D) -> (..., 1, 1).
+def ratio_joint(new: jax.Array, old: jax.Array, teams: Teams | None = None) -> jax.Array:
+    """Returns the log of the product of each team's ratios, of one team by default: (..., A, D) -> (..., T, 1).
 
     Source: JRPO, PPO on the joint policy of a team.
     """
-    return jnp.sum(new - old, axis=(-2, -1), keepdims=True)
+    per_agent = jnp.sum(new - old, axis=-1)
+    members = [jnp.array(team) for team in teams or (tuple(range(per_agent.shape[-1])),)]
+    return jnp.stack([jnp.sum(per_agent[..., team], axis=-1) for team in members], axis=-1)[..., None]
 
 
 RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
     "agent": ratio_per_agent,
     "dimension": ratio_per_dimension,
-    "joint": ratio_joint,
 }
-"""Log-ratio functions by the name of `ppo.ratio`."""
+"""Log-ratio functions of one agent by the name of `ppo.ratio`; `joint`, which also takes teams, is `ratio_joint`."""

@@ -78,7 +78,10 @@ def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:
 
 
 def layer_norm(params: Params, x: jax.Array) -> jax.Array:
-    """Normalises the last axis to mean 0 and variance 1, then scales and shifts. Source: Ba et al., arXiv 1607.06450."""
+    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) -> (..., W).
+
+    Source: Ba et al., arXiv 1607.06450.
+    """
     x = x - jnp.mean(x, axis=-1, keepdims=True)
     x = x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
     return x * params["scale"] + params["shift"]
