@@ -11,30 +11,30 @@ import mqe_jax
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.planners.steering import go_to
 
-WORLDS, SECONDS = 32, 3.0
+NUM_ENVS, SECONDS = 32, 3.0
 
 
 def start(env: QuadrupedEnv, key: jax.Array, place: jax.Array) -> State:
-    """Returns a fresh world with the robots at (2, 2), m."""
+    """Returns an initial state with the robots at `place` (2, 2), m."""
     state = env.reset(key)
-    qpos = state.data.qpos.at[env.robot.base_qpos[:, :2]].set(place)
+    qpos = state.data.qpos.at[env.index.base_qpos[:, :2]].set(place)
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos))
 
 
-def pushed(robots: int, worlds: int = WORLDS) -> float:
-    """Returns the mean way, m, of the box at vx 0.8 m/s; with one robot the other stands aside."""
+def pushed(robots: int, num_envs: int = NUM_ENVS) -> float:
+    """Returns the box's mean displacement, m, at vx 0.8 m/s; with one robot the other stands aside."""
     env = mqe_jax.make(
-        "go1pushbox", num_envs=worlds, track_width=8.0, gate_width=7.0, box_noise=0.0, spawn_velocity=0.0
+        "go1pushbox", num_envs=num_envs, track_width=8.0, gate_width=7.0, box_noise=0.0, spawn_velocity=0.0
     )
     lane = jnp.array([-0.3, 0.3] if robots == 2 else [0.0, -3.0])
     place = jnp.stack([jnp.full(2, 1.5), lane], axis=-1)
     pushes = jnp.array([1.0, 1.0 if robots == 2 else 0.0])[:, None]
 
     def step(state: State, _: None) -> tuple[State, None]:
-        readings = env.read(state.data)
-        position = readings.position_w[:, :2]
+        robot_state = env.read(state.data)
+        position = robot_state.position_w[:, :2]
         goal = jnp.stack([position[:, 0] + 1.0, lane], axis=-1)
-        action = go_to(position, readings.euler[:, 2], goal).at[:, 0].set(0.4)
+        action = go_to(position, robot_state.euler[:, 2], goal).at[:, 0].set(0.4)
         return env.step(state, pushes * action), None
 
     def way(key: jax.Array) -> jax.Array:
@@ -42,13 +42,15 @@ def pushed(robots: int, worlds: int = WORLDS) -> float:
         box = lambda state: env.object_pose(state.data, "box")[0]  # noqa: E731
         return box(jax.lax.scan(step, state, None, round(SECONDS / env.dt))[0]) - box(state)
 
-    return float(jnp.mean(jax.jit(jax.vmap(way))(jax.random.split(jax.random.PRNGKey(0), worlds))))
+    return float(jnp.mean(jax.jit(jax.vmap(way))(jax.random.split(jax.random.PRNGKey(0), num_envs))))
 
 
 def main() -> None:
     """Runs the example."""
     for robots in (1, 2):
-        print(f"{robots} robot(s): {pushed(robots):.2f} m in {SECONDS:g} s, mean of {WORLDS} worlds", flush=True)
+        print(
+            f"{robots} robot(s): {pushed(robots):.2f} m in {SECONDS:g} s, mean of {NUM_ENVS} environments", flush=True
+        )
 
 
 if __name__ == "__main__":

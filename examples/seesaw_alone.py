@@ -7,15 +7,17 @@ import jax
 import mqe_jax
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
+from mqe_jax.planners.steering import Observation
 from mqe_jax.train.evaluate import evaluate
 
-EPISODES, WORLDS = 200, 100
+EPISODES, NUM_ENVS = 200, 100
 
 
-def success_rate(plan: Callable[[jax.Array], jax.Array]) -> float:
-    """Returns the share of episodes after which a robot stands on the platform."""
-    env = VectorEnv(mqe_jax.make("go1seesaw", num_envs=WORLDS), WORLDS)
-    act = jax.vmap(plan)
+def success_rate(plan: Callable[[Observation], jax.Array]) -> float:
+    """Returns the fraction of episodes that end with a robot on the platform."""
+    env = VectorEnv(mqe_jax.make("go1seesaw", num_envs=NUM_ENVS), NUM_ENVS)
+    layout = env.env.observation_layout
+    act = jax.vmap(lambda obs: plan(layout.split(obs)))
     result = evaluate(env, lambda obs, memory, _: (act(obs), memory), EPISODES, jax.random.PRNGKey(0))
     return result.success_rate
 

@@ -1,8 +1,11 @@
-"""Collision bits: which shapes touch which."""
+"""Collision bits: two shapes touch where the contype of one has a bit of the other's conaffinity."""
 
 from __future__ import annotations
 
-# Collision bits. Every robot's trunk has one of its own, which only other robots' shapes answer to: so a robot
-# never touches itself, and limbs touch trunks but not limbs.
 GROUND_BIT, WALL_BIT, OBJECT_BIT = 1, 2, 4
 MAX_ROBOTS = 16
+
+
+def robot_bit(number: int) -> int:
+    """Returns the contype bit of robot `number`, which only other robots' shapes answer to: none touches itself."""
+    return 8 << number

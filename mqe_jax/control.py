@@ -1,4 +1,4 @@
-"""Control: what an agent's action means, and the way from it to the actuators.
+"""Control: from agents' actions to actuator targets.
 
 | mode | per robot | meaning |
 |---|---|---|
@@ -12,6 +12,7 @@ Actions lie in [-1, 1]. PD control runs inside the physics engine, at every phys
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import pathlib
 from collections.abc import Sequence
@@ -22,15 +23,15 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax import walk_policy
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
 from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.walk_policy import WalkMemory
 
 MODES = ("command", "position", "torque")
 
-# What an action of 1 adds to a command's default: (gain before clipping, greatest size), in the command's unit.
+# Per-command action scaling around the default: (scale, clip), in the command's unit.
 COMMAND_RANGES = {
     "vx": (2.0, 1.0),
     "vy": (0.5, 0.5),
@@ -46,25 +47,25 @@ COMMAND_RANGES = {
 
 
 def check_mode(mode: str) -> str:
-    """Returns the mode, or raises a ValueError that names the allowed ones."""
+    """Returns the mode, or raises an InputError that names the allowed ones."""
     if mode not in MODES:
-        raise ValueError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
+        raise InputError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
     return mode
 
 
 def check_commands(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the opened commands, or raises a ValueError that names the allowed ones."""
+    """Returns the opened commands, or raises an InputError that names the allowed ones."""
     for name in names:
         if name not in COMMAND_RANGES:
             allowed = ", ".join(COMMAND_RANGES)
-            raise ValueError(f"commands: unknown command {name!r}{nearest(name, COMMAND_RANGES)}; allowed: {allowed}")
+            raise InputError(f"commands: unknown command {name!r}{nearest(name, COMMAND_RANGES)}; allowed: {allowed}")
     if not names or len(set(names)) != len(names):
-        raise ValueError(f"commands: {tuple(names)} must name at least one command, none twice")
+        raise InputError(f"commands: {tuple(names)} must name at least one command, none twice")
     return tuple(names)
 
 
 def commands_from_action(action: jax.Array, names: Sequence[str], default: np.ndarray) -> jax.Array:
-    """Turns actions (A, len(names)) in [-1, 1] into walk commands (A, 15) around the defaults (15,)."""
+    """Computes walk commands (A, 15) around the defaults (15,) from actions (A, len(names)) in [-1, 1]."""
     gain = np.array([COMMAND_RANGES[name][0] for name in names], np.float32)
     limit = np.array([COMMAND_RANGES[name][1] for name in names], np.float32)
     index = np.array([walk_policy.command_index(name) for name in names])
@@ -79,25 +80,25 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
     """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6), `0.bias`, `2...`, `4...`.
 
     Raises:
-        ValueError: if the file is missing, damaged, or holds other names or shapes.
+        InputError: if the file is missing, damaged, or holds other names or shapes.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
     file = pathlib.Path(path)
     if not file.is_file():
-        raise ValueError(f"actuator_network: no file {file}")
+        raise InputError(f"actuator_network: no file {file}")
     try:
         flat = load_file(file)
     except SafetensorError as error:
-        raise ValueError(f"actuator_network {file}: not a safetensors file ({error})") from None
+        raise InputError(f"actuator_network {file}: not a safetensors file ({error})") from None
     params: ActuatorParams = {}
     for layer, (n_in, n_out) in zip(("0", "2", "4"), ((6, 32), (32, 32), (32, 1)), strict=True):
         for kind, shape in (("weight", (n_out, n_in)), ("bias", (n_out,))):
             name = f"{layer}.{kind}"
             found = tuple(flat[name].shape) if name in flat else "nothing"
             if found != shape:
-                raise ValueError(f"actuator_network {file}: {name} has shape {found}; expected {shape}")
+                raise InputError(f"actuator_network {file}: {name} has shape {found}; expected {shape}")
             params.setdefault(layer, {})[kind] = jnp.asarray(flat[name], jnp.float32)
     return params
 
@@ -119,11 +120,11 @@ def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Arra
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ControlState:
-    """What control remembers of one world with R robots.
+    """Controller state of one environment (R robots).
 
     Attributes:
-        walk: the walk policies' memories, leading axis R; None where the robots do not walk by it.
-        delayed: actuator targets of the last steps, newest first (lag + 1, R, 12).
+        walk: memories of the walk policies, leading axis R; None where no robot uses one.
+        delayed: past actuator targets, newest first (lag + 1, R, 12).
         error: joint position errors of the last two physics steps (2, R, 12), rad; empty without an actuator network.
         velocity: joint velocities likewise (2, R, 12), rad/s.
     """
@@ -140,17 +141,19 @@ class Controller:
 
     Attributes:
         mode: one of `MODES`.
-        physics: steps the world.
-        index: the robots in it.
-        num_agents: A, the first robots of the world.
+        robot: all of them.
+        physics: of the environment.
+        index: of the robots.
+        num_agents: A, the first A robots.
         walk_params: weights of the walk policy, or None where it is not used.
         actuator_params: weights of the actuator network, or None for PD.
         commands: the opened commands.
         default_commands: of the walk policy (15,).
-        lag: greatest action lag, environment steps.
+        lag: maximum action lag, environment steps.
     """
 
     mode: str
+    robot: Robot
     physics: Physics
     index: RobotIndex
     num_agents: int
@@ -162,30 +165,35 @@ class Controller:
 
     @property
     def action_size(self) -> int:
-        """Numbers per robot."""
-        return len(self.commands) if self.mode == "command" else go1.NUM_JOINTS
+        """Length of one agent's action."""
+        return len(self.commands) if self.mode == "command" else NUM_JOINTS
 
     @property
     def neutral(self) -> np.ndarray:
-        """Actuator targets (R, 12) of a robot that is told nothing."""
-        rest = np.tile(go1.DEFAULT_JOINTS, (self.index.num_robots, 1)).astype(np.float32)
+        """Neutral actuator targets (R, 12), used without an action."""
+        rest = np.tile(self.robot.default_joints, (self.index.num_robots, 1)).astype(np.float32)
         if self.mode == "torque":
             rest[: self.num_agents] = 0.0
         return rest
 
     def reset(self) -> ControlState:
-        """Returns the control state of a fresh world."""
+        """Returns the controller state after a reset."""
         robots = self.index.num_robots
         walk = None
         if self.walk_params is not None:
             walk = jax.tree.map(lambda x: jnp.broadcast_to(x, (robots, *x.shape)), walk_policy.initial_memory())
-        past = jnp.zeros((2 if self.actuator_params is not None else 0, robots, go1.NUM_JOINTS))
+        past = jnp.zeros((2 if self.actuator_params is not None else 0, robots, NUM_JOINTS))
         return ControlState(walk, jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1)), past, past)
 
     def targets(
-        self, state: ControlState, action: jax.Array, gravity_b: jax.Array, joint_position: jax.Array,
-        joint_velocity: jax.Array, npc_commands: jax.Array | None = None,
-    ) -> tuple[jax.Array, ControlState]:  # fmt: skip
+        self,
+        state: ControlState,
+        action: jax.Array,
+        gravity_b: jax.Array,
+        joint_position: jax.Array,
+        joint_velocity: jax.Array,
+        npc_commands: jax.Array | None = None,
+    ) -> tuple[jax.Array, ControlState]:
         """Computes the actuator targets (R, 12) of all robots from the agents' actions.
 
         Args:
@@ -194,7 +202,7 @@ class Controller:
             gravity_b: unit gravity vectors (R, 3).
             joint_position: (R, 12), rad.
             joint_velocity: (R, 12), rad/s.
-            npc_commands: walk commands of the other robots (R - A, 15), if there are any.
+            npc_commands: walk commands of the NPC robots (R - A, 15), if there are any.
         """
         agents = self.num_agents
         target = jnp.asarray(self.neutral)
@@ -202,23 +210,27 @@ class Controller:
         if self.mode == "command":
             commands = commands_from_action(action, self.commands, self.default_commands)
         elif self.mode == "position":
-            target = target.at[:agents].set(walk_policy.joint_targets(action))
+            target = target.at[:agents].set(walk_policy.joint_targets(self.robot, action))
         else:
-            target = target.at[:agents].set(action * go1.TORQUE_LIMIT)
+            target = target.at[:agents].set(action * self.robot.torque_limit)
         if self.walk_params is None or state.walk is None:
             return target, state
         if npc_commands is not None:
             commands = jnp.concatenate([commands, npc_commands])
-        walked, walk = jax.vmap(walk_policy.walk, (None, 0, 0, 0, 0, 0))(
-            self.walk_params, state.walk, commands, gravity_b, joint_position, joint_velocity
-        )
+        act = functools.partial(walk_policy.walk, self.robot, self.walk_params)
+        walked, walk = jax.vmap(act)(state.walk, commands, gravity_b, joint_position, joint_velocity)
         walks = np.arange(len(walked))[:, None] >= (0 if self.mode == "command" else agents)
         return jnp.where(walks, walked, target), dataclasses.replace(state, walk=walk)
 
     def apply(
-        self, state: ControlState, data: mjx.Data, target: jax.Array, lag: jax.Array,
-        fields: dict[str, jax.Array], xfrc_applied: jax.Array | None,
-    ) -> tuple[mjx.Data, ControlState]:  # fmt: skip
+        self,
+        state: ControlState,
+        data: mjx.Data,
+        target: jax.Array,
+        lag: jax.Array,
+        fields: dict[str, jax.Array],
+        xfrc_applied: jax.Array | None,
+    ) -> tuple[mjx.Data, ControlState]:
         """Steps the physics by one environment step under targets (R, 12) that act `lag` () steps late."""
         delayed = jnp.concatenate([target[None], state.delayed[:-1]])
         target = delayed[lag] if self.lag else target
@@ -234,7 +246,8 @@ class Controller:
             data, errors, velocities = carry
             errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
             velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
-            torque = jnp.clip(actuator_torque(params, errors, velocities), -go1.TORQUE_LIMIT, go1.TORQUE_LIMIT)
+            limit = self.robot.torque_limit
+            torque = jnp.clip(actuator_torque(params, errors, velocities), -limit, limit)
             data = self.physics.step(data, scatter(torque), fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
             return (data, errors[:2], velocities[:2]), None
 

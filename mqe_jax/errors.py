@@ -1,4 +1,4 @@
-"""The error of bad input, and suggestions of the nearest allowed name."""
+"""Errors that the command line prints as one line, and suggestions of the nearest allowed name."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ class InputError(ValueError):
 
     Any other exception is a defect of the program and keeps its traceback.
     """
+
+
+class NonFiniteError(ArithmeticError):
+    """Training produced NaN or infinite numbers. The command line prints it as one line, exit code 1."""
 
 
 def nearest(word: object, known: Iterable[object]) -> str:

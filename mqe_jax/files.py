@@ -1,14 +1,19 @@
-"""Files and folders: writing whole, and checks before any work."""
+"""Files and folders: atomic writes, checks before any work, locks."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+
+from mqe_jax.errors import InputError
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file whole: under a temporary name in the same folder, flushed to disk, then renamed."""
+    """Writes a file atomically: under a temporary name in the same folder, flushed to disk, then renamed."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -23,10 +28,28 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuses a folder that cannot be written, before any work."""
+    """Creates a folder, and raises an InputError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise ValueError(f"run_dir: {folder} cannot be written ({error.strerror or error})") from None
+        raise InputError(f"run_dir: {folder} cannot be written ({error.strerror or error})") from None
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Holds a lock on a folder; it ends with the process, however that ends.
+
+    Raises:
+        InputError: where another process (or this one) already holds it.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"run_dir: {folder} is in use by another training") from None
+        yield
+    finally:
+        os.close(handle)

@@ -1,4 +1,4 @@
-"""The rules of scripted NPCs: sheep and football defender.
+"""Control laws of the scripted NPCs: sheep and football defender.
 
 Frame: the environment's; metre, second, radian.
 """
@@ -22,23 +22,23 @@ def flock(
     friction: float = 1.0,
     top_speed: float = 2.0,
 ) -> jax.Array:
-    """Returns the velocities (S, 2), m/s, with which S sheep go through the next environment step.
+    """Returns the velocities (S, 2), m/s, of S sheep during the next environment step.
 
-    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over dogs of 0.2 r / q^1.4, with c the herd's centre (left
-    out for one sheep), r = p - p_dog and q = |r squared element by element|, dropped beyond q = 9; then each
-    component is kept within the top speed. Half of what the ground's friction takes off in a step is taken
-    before and half after that, so that the sheep moves on at the mean speed of the step.
-    Source: the paper's sheep, section III, with the figures of the released system.
+    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over dogs of 0.2 r / q^1.4, with c the herd's centre (this
+    term is omitted for one sheep), r = p - p_dog and q = |r squared element by element|, zero beyond q = 9; then each
+    component is clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
+    before and half after this, so that the sheep moves at the step's mean speed.
+    Source: paper, section III, with the constants of the released system.
 
     Args:
         key: random key.
         position: of the sheep (S, 2), m.
         velocity: of the sheep (S, 2), m/s.
         dogs: positions of the robots (A, 2), m.
-        restlessness: s.
+        restlessness: s in the formula, m/s.
         step: environment step, s.
-        friction: sliding friction with the ground.
-        top_speed: of each component, m/s.
+        friction: sliding friction between sheep and ground.
+        top_speed: maximum of each velocity component, m/s.
     """
     half = friction * GRAVITY * step / 2
     velocity = slowed(velocity, half)
@@ -53,32 +53,32 @@ def flock(
 
 
 def slowed(velocity: jax.Array, loss: float) -> jax.Array:
-    """Returns velocities (..., 2) made slower by `loss` m/s, at most to a stop."""
+    """Reduces each speed by `loss` m/s, clamped at zero: velocities (..., 2) -> (..., 2)."""
     speed = jnp.maximum(_length(velocity), 1e-9)
     return velocity * jnp.maximum(1.0 - loss / speed, 0.0)
 
 
 def defend(position: jax.Array, yaw: jax.Array, ball: jax.Array, goal: jax.Array) -> jax.Array:
-    """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that keeps between ball and goal.
+    """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that stays between ball and goal.
 
-    With p its position, g the goal, t = 0.6 ball + 0.4 g the place to stand and wrap() an angle in [-pi, pi]:
+    With position p, goal g, target t = 0.6 ball + 0.4 g and wrap() mapping an angle to [-pi, pi]:
 
-        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (it faces away from its goal)
+        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (faces away from its goal)
         vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the goal as t)
         vy       = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
 
-    Source: the paper's defender, section III, with the figures of the released system.
+    Source: paper, section III, with the constants of the released system.
 
     Args:
         position: of the robot (2,), m.
         yaw: of the robot (), rad.
         ball: (2,), m.
-        goal: middle of the goal line (2,), m.
+        goal: midpoint of the goal line (2,), m.
     """
-    own, way = position - goal, 0.6 * (ball - goal)
-    distance = jnp.linalg.norm(way)
+    own, target = position - goal, 0.6 * (ball - goal)
+    distance = jnp.linalg.norm(target)
     turn = jnp.arctan2(own[1], own[0]) - yaw
-    left = (way[0] * own[1] - way[1] * own[0]) / jnp.maximum(distance, 1e-6)
+    left = (target[0] * own[1] - target[1] * own[0]) / jnp.maximum(distance, 1e-6)
     return jnp.stack(
         [
             jnp.clip(distance - jnp.linalg.norm(own), -0.5, 0.5),

@@ -1,7 +1,7 @@
-"""Everything in a scene that is no agent and no wall: boxes, balls, sheep, doors, planks, platforms.
+"""Scene objects: boxes, balls, sheep, doors, planks, platforms.
 
-An object is a small frozen dataclass that adds one body named `object/<name>` to a scene; `index_objects` says
-where the coordinates of a compiled scene's objects are. The rules that drive NPCs are in `npc`.
+An object is a small frozen dataclass that adds one body named `object/<name>` to a scene; `index_objects` returns the
+addresses of its coordinates in a compiled scene. The control laws of scripted NPCs are in `npc`.
 
 Frame: the environment's; metre, kilogram, second, radian, newton.
 """
@@ -22,11 +22,11 @@ Color = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
-# What touches ground, walls, other objects, and those parts of robots that answer to objects.
+# Collides with ground, walls, other objects, and the robot parts listed in `Contacts.object`.
 _FREE = {"contype": OBJECT_BIT, "conaffinity": GROUND_BIT | WALL_BIT | OBJECT_BIT}
-# What the scene holds in place or at its height: it need not touch the ground.
+# The same without the ground: bodies whose joints fix their height.
 _HELD = {"contype": OBJECT_BIT, "conaffinity": WALL_BIT | OBJECT_BIT}
-# What robots and free objects stand on.
+# Supporting surfaces for robots and free objects.
 _FLOOR = {"contype": GROUND_BIT, "conaffinity": 0}
 
 
@@ -41,15 +41,15 @@ class Object:
     name: str
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
-        """Adds the body, and the geoms that are only looked at if `visual`."""
-        raise TypeError(f"object {type(self).__name__}: add() is not defined")
+        """Adds the body to a scene, with its purely visual geoms if `visual`."""
+        raise NotImplementedError(f"object {type(self).__name__}: add() is not defined")
 
     def _body(
         self, spec: mujoco.MjSpec, position: Sequence[float], mass: float, inertia: Sequence[float] | np.ndarray
     ) -> Any:
         body = spec.worldbody.add_body(name=f"object/{self.name}", pos=position)
         body.explicitinertial, body.mass, body.inertia = True, mass, inertia
-        body.ipos = (0, 0, 0)  # or MuJoCo puts the centre of mass at `position` from the body
+        body.ipos = (0, 0, 0)  # if unset, MuJoCo offsets the centre of mass by `position`
         return body
 
     def _joint(self, body: Any, suffix: str, kind: Any, damping: float = 0.0, **shape: Any) -> None:
@@ -61,23 +61,30 @@ class Object:
 
     def _solid(self, body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **shape: Any) -> None:
         body.add_geom(
-            name=f"object/{self.name}", type=kind, condim=3, friction=(friction, 0.005, 0.0001), rgba=color,
-            priority=1, group=group, mass=0.0, **shape,
-        )  # fmt: skip
+            name=f"object/{self.name}",
+            type=kind,
+            condim=3,
+            friction=(friction, 0.005, 0.0001),
+            rgba=color,
+            priority=1,
+            group=group,
+            mass=0.0,
+            **shape,
+        )
 
 
-def _look(body: Any, kind: Any, color: Color, **shape: Any) -> None:
+def _visual_geom(body: Any, kind: Any, color: Color, **shape: Any) -> None:
     body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **shape)
 
 
 @dataclasses.dataclass(frozen=True)
 class Box(Object):
-    """A box to push. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
+    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
 
     Attributes:
         size: full extents, m.
         mass: kg.
-        friction: sliding friction with the ground, which takes precedence over the ground's own.
+        friction: sliding friction; takes precedence over the ground's.
     """
 
     size: Vector = (1.0, 1.0, 1.0)
@@ -95,13 +102,13 @@ class Box(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Ball(Object):
-    """A football that rolls and comes to rest. Coordinates and velocity as those of `Box`.
+    """A football with rolling resistance. Coordinates and velocity as in `Box`.
 
     Attributes:
         radius: m.
         mass: kg.
-        drag: resistance to its motion, N s/m.
-        spin_drag: resistance to its rotation, N m s/rad.
+        drag: linear damping, N s/m.
+        spin_drag: angular damping, N m s/rad.
     """
 
     radius: float = 0.1
@@ -110,34 +117,37 @@ class Ball(Object):
     spin_drag: float = 0.0003
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
-        """Adds the ball, a thin shell; three slides and a ball joint, because a free joint has no drag of its own."""
+        """Adds the ball, a thin shell, on three slides and a ball joint: a free joint takes no damping."""
         body = self._body(spec, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
         self._slides(body, "xyz", self.drag)
         self._joint(body, "turn", _JOINT.mjJNT_BALL, self.spin_drag)
         self._solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
-        if visual:  # dark patches, so that one sees it roll
+        if visual:  # dark patches make the rotation visible
             for axis in _AXES.values():
                 for side in (-1, 1):
-                    _look(
-                        body, _GEOM.mjGEOM_SPHERE, (0.1, 0.1, 0.12, 1.0), size=(0.5 * self.radius, 0, 0),
+                    _visual_geom(
+                        body,
+                        _GEOM.mjGEOM_SPHERE,
+                        (0.1, 0.1, 0.12, 1.0),
+                        size=(0.5 * self.radius, 0, 0),
                         pos=np.array(axis) * side * 0.56 * self.radius,
-                    )  # fmt: skip
+                    )
 
 
 @dataclasses.dataclass(frozen=True)
 class Cylinder(Object):
     """An upright cylinder that slides along y only. Coordinate: y, m; velocity likewise.
 
-    Its shape for contacts is a capsule that is full up to its height; its friction with the ground is that of the
-    slide, so that it costs no contacts.
+    Its collision geom is a capsule whose cylindrical part has the cylinder's height; ground friction is modelled as
+    friction loss of the slide, which needs no contacts.
 
     Attributes:
         position: of its axis at y = 0 (x, y), m.
         radius: m.
         height: m.
         mass: kg.
-        friction: sliding friction with the ground.
-        reach: how far it may slide either way, m.
+        friction: sliding friction between cylinder and ground.
+        reach: maximum |y|, m.
     """
 
     position: tuple[float, float] = (0.0, 0.0)
@@ -151,22 +161,32 @@ class Cylinder(Object):
         """Adds the cylinder."""
         body = self._body(spec, (*self.position, 0.0), self.mass, (1.0, 1.0, 1.0))
         self._joint(
-            body, "y", _JOINT.mjJNT_SLIDE, axis=_AXES["y"], limited=True, range=(-self.reach, self.reach),
+            body,
+            "y",
+            _JOINT.mjJNT_SLIDE,
+            axis=_AXES["y"],
+            limited=True,
+            range=(-self.reach, self.reach),
             frictionloss=self.friction * self.mass * GRAVITY,
-        )  # fmt: skip
+        )
         white = (0.95, 0.95, 0.95, 1.0)
         self._solid(
-            body, _GEOM.mjGEOM_CAPSULE, white, group=3, size=(self.radius, 0, 0),
-            fromto=(0, 0, 0, 0, 0, self.height), **_HELD,
-        )  # fmt: skip
+            body,
+            _GEOM.mjGEOM_CAPSULE,
+            white,
+            group=3,
+            size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height),
+            **_HELD,
+        )
         if visual:
             half = self.height / 2
-            _look(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
+            _visual_geom(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
 
 
 @dataclasses.dataclass(frozen=True)
 class Door(Object):
-    """A revolving door: a panel on a vertical hinge in its middle. Coordinate: angle, rad, 0 along y.
+    """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y.
 
     Attributes:
         position: of the hinge (x, y), m.
@@ -191,17 +211,17 @@ class Door(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Seesaw(Object):
-    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative where the near end is down.
+    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative with the near end down.
 
     Attributes:
         hinge: position (x, y, z), m.
         size: length, width and thickness of the plank, m.
-        behind: how far the plank's middle is before the hinge, towards the near end, m.
-        mass: kg; the centre of mass is in the hinge, so that the plank stays as it is.
+        behind: distance of the plank's centre from the hinge, towards the near end, m.
+        mass: kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every angle.
         inertia: about the hinge, kg m^2.
-        limit: greatest angle either way, rad; at the lower limit the near end lies on the ground.
-        damping: of the hinge, N m s/rad, which limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge,
-            turns it at 0.21 rad/s.
+        limit: maximum |angle|, rad; at the lower limit the near end is on the ground.
+        damping: of the hinge, N m s/rad; limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge, turns
+            it at 0.21 rad/s.
     """
 
     hinge: Vector = (5.6, 0.0, 0.545)
@@ -213,12 +233,17 @@ class Seesaw(Object):
     damping: float = 1000.0
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
-        """Adds the plank, and the posts that carry it to look at."""
+        """Adds the plank, and its posts as visual geoms."""
         body = self._body(spec, self.hinge, self.mass, (self.inertia,) * 3)
         self._joint(
-            body, "pitch", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["y"], limited=True,
+            body,
+            "pitch",
+            _JOINT.mjJNT_HINGE,
+            self.damping,
+            axis=_AXES["y"],
+            limited=True,
             range=(-self.limit, self.limit),
-        )  # fmt: skip
+        )
         half, white = np.array(self.size) / 2, (0.95, 0.95, 0.95, 1.0)
         self._solid(body, _GEOM.mjGEOM_BOX, white, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
         if visual:
@@ -226,21 +251,24 @@ class Seesaw(Object):
             grey = (0.55, 0.55, 0.58, 1.0)
             for side in (-1, 1):
                 edge, post = y + side * half[1], y + side * (half[1] + 0.06)
-                _look(
-                    spec.worldbody, _GEOM.mjGEOM_CYLINDER, grey, size=(0.05, 0, 0),
+                _visual_geom(
+                    spec.worldbody,
+                    _GEOM.mjGEOM_CYLINDER,
+                    grey,
+                    size=(0.05, 0, 0),
                     fromto=(x, edge, z, x, edge + side * 0.08, z),
-                )  # fmt: skip
-                _look(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
+                )
+                _visual_geom(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
 
 
 @dataclasses.dataclass(frozen=True)
 class Platform(Object):
-    """A fixed block to stand on. No coordinates.
+    """A fixed block that supports robots. No coordinates.
 
     Attributes:
         center: of its top face (x, y, z), m.
         size: full extents, m.
-        column: radius of the column that carries it, m; none if 0.
+        column: radius of the supporting column, m; none if 0.
     """
 
     center: Vector = (0.0, 0.0, 1.0)
@@ -256,20 +284,30 @@ class Platform(Object):
             return
         foot = top - self.size[2]
         body.add_geom(
-            name=f"object/{self.name}/column", type=_GEOM.mjGEOM_CAPSULE, group=3, mass=0.0, condim=3, priority=1,
-            contype=WALL_BIT, conaffinity=0, size=(self.column, 0, 0),
+            name=f"object/{self.name}/column",
+            type=_GEOM.mjGEOM_CAPSULE,
+            group=3,
+            mass=0.0,
+            condim=3,
+            priority=1,
+            contype=WALL_BIT,
+            conaffinity=0,
+            size=(self.column, 0, 0),
             fromto=(0, 0, -top + self.size[2] / 2, 0, 0, -self.size[2] / 2 - self.column),
-        )  # fmt: skip
+        )
         if visual:
-            _look(
-                spec.worldbody, _GEOM.mjGEOM_CYLINDER, (0.75, 0.75, 0.78, 1.0), size=(self.column, foot / 2, 0),
+            _visual_geom(
+                spec.worldbody,
+                _GEOM.mjGEOM_CYLINDER,
+                (0.75, 0.75, 0.78, 1.0),
+                size=(self.column, foot / 2, 0),
                 pos=(x, y, foot / 2),
-            )  # fmt: skip
+            )
 
 
 @dataclasses.dataclass(frozen=True)
 class Ring(Object):
-    """A circle drawn on the ground: nothing that can be touched. No coordinates.
+    """A circle marked on the ground, without collision geoms. No coordinates.
 
     Attributes:
         center: (x, y, z), m.
@@ -282,25 +320,28 @@ class Ring(Object):
     width: float = 0.04
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
-        """Adds the line, made of short pieces."""
+        """Adds the line as short visual segments."""
         body = spec.worldbody.add_body(name=f"object/{self.name}", pos=self.center)
         if not visual:
             return
         pieces = 72
         half = np.pi * self.radius / pieces * 1.05
         for angle in np.arange(pieces) * 2 * np.pi / pieces:
-            _look(
-                body, _GEOM.mjGEOM_BOX, (0.2, 0.2, 0.22, 1.0), size=(self.width / 2, half, 0.004),
+            _visual_geom(
+                body,
+                _GEOM.mjGEOM_BOX,
+                (0.2, 0.2, 0.22, 1.0),
+                size=(self.width / 2, half, 0.004),
                 pos=(self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0),
                 quat=(np.cos(angle / 2), 0, 0, np.sin(angle / 2)),
-            )  # fmt: skip
+            )
 
 
 @dataclasses.dataclass(frozen=True)
 class Sheep(Object):
-    """An upright sheep that slides over the ground without turning. Coordinates: x, y; velocity likewise.
+    """An upright sheep that slides over the ground without rotating. Coordinates: x, y; velocity likewise.
 
-    Its friction with the ground is part of `flock`, so that it costs no contacts.
+    Ground friction is part of `flock`, which needs no contacts.
 
     Attributes:
         radius: m.
@@ -313,40 +354,53 @@ class Sheep(Object):
     mass: float = 5.0
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
-        """Adds the sheep: a capsule that is full at the ground and round at the top."""
+        """Adds the sheep: a capsule whose lower end is below the ground, so that it is cylindrical at ground level."""
         body = self._body(spec, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
         self._slides(body, "xy")
         fleece = (0.96, 0.95, 0.90, 1.0)
         self._solid(
-            body, _GEOM.mjGEOM_CAPSULE, fleece, group=3 if visual else 1, size=(self.radius, 0, 0),
-            fromto=(0, 0, 0, 0, 0, self.height - self.radius), **_HELD,
-        )  # fmt: skip
+            body,
+            _GEOM.mjGEOM_CAPSULE,
+            fleece,
+            group=3 if visual else 1,
+            size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height - self.radius),
+            **_HELD,
+        )
         if visual:
             dark = (0.16, 0.14, 0.13, 1.0)
             top, wide = self.height, self.radius
-            _look(body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=(wide, 0.75 * wide, 0.32 * top), pos=(0, 0, 0.62 * top))
-            _look(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
-            _look(
-                body, _GEOM.mjGEOM_ELLIPSOID, dark, size=(0.45 * wide, 0.3 * wide, 0.3 * wide),
+            _visual_geom(
+                body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=(wide, 0.75 * wide, 0.32 * top), pos=(0, 0, 0.62 * top)
+            )
+            _visual_geom(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
+            _visual_geom(
+                body,
+                _GEOM.mjGEOM_ELLIPSOID,
+                dark,
+                size=(0.45 * wide, 0.3 * wide, 0.3 * wide),
                 pos=(1.15 * wide, 0, 0.82 * top),
-            )  # fmt: skip
+            )
             for x in (-0.5, 0.5):
                 for y in (-0.35, 0.35):
-                    _look(
-                        body, _GEOM.mjGEOM_CAPSULE, dark, size=(0.12 * wide, 0, 0),
+                    _visual_geom(
+                        body,
+                        _GEOM.mjGEOM_CAPSULE,
+                        dark,
+                        size=(0.12 * wide, 0, 0),
                         fromto=(x * wide, y * wide, 0.02, x * wide, y * wide, 0.4 * top),
-                    )  # fmt: skip
+                    )
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectIndex:
-    """Where one object of a compiled model is; host integers.
+    """Addresses of one object in a compiled model; host integers.
 
     Attributes:
-        qpos: its coordinates in qpos (C,).
-        qvel: its velocities in qvel (V,).
+        qpos: of its coordinates in qpos (C,).
+        qvel: of its velocities in qvel (V,).
         body: body id.
-        geom: id of its collision shape, -1 if it has none.
+        geom: id of its collision geom, -1 if it has none.
     """
 
     qpos: np.ndarray
@@ -356,7 +410,7 @@ class ObjectIndex:
 
 
 def index_objects(model: mujoco.MjModel, objects: Sequence[Object]) -> Mapping[str, ObjectIndex]:
-    """Looks up by name, once, where every object of a compiled model is."""
+    """Looks up the addresses of all objects of a compiled model by name."""
     found = {}
     for item in objects:
         body = model.body(f"object/{item.name}")

@@ -6,8 +6,8 @@
 | `warp` | MJX, Warp implementation | NVIDIA GPU (CPU for tests) |
 | `c` | MuJoCo's own C engine on all cores, called through `jax.pure_callback` | CPU |
 
-The functions are written for one world and batched by `jax.vmap`. What differs between worlds beyond the
-state (friction, masses, motor strength) is passed to `Physics.step` as arrays named after `mjModel` fields.
+The functions are written for one environment and batched by `jax.vmap`. Model parameters that differ between
+environments (friction, masses, motor strength) are passed to `Physics.step` as arrays named after `mjModel` fields.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
 
 IMPLS = ("auto", "jax", "warp", "c")
 
-# What a step carries from one physics step to the next; everything else in `mjx.Data` is derived from it.
+# Fields of `mjx.Data` that carry the state; all others are recomputed from them in every step.
 STATE_FIELDS = (
     "qpos",
     "qvel",
@@ -42,24 +42,24 @@ STATE_FIELDS = (
 
 
 def resolve_impl(impl: str = "auto") -> str:
-    """Chooses the engine: warp where there is an NVIDIA GPU and warp-lang, c on a CPU, else jax.
+    """Resolves `auto`: warp with an NVIDIA GPU and warp-lang, c on a CPU, else jax.
 
     Raises:
-        ValueError: for an unknown engine, or one that this machine cannot run, naming what is missing.
+        InputError: for an unknown engine, or one that this machine cannot run; names what is missing.
     """
     if impl not in IMPLS:
-        raise ValueError(f"impl: unknown engine {impl!r}{nearest(impl, IMPLS)}; allowed: {', '.join(IMPLS)}")
+        raise InputError(f"impl: unknown engine {impl!r}{nearest(impl, IMPLS)}; allowed: {', '.join(IMPLS)}")
     platform = jax.default_backend()
     if impl == "auto":
         if platform == "gpu" and _has_warp() and _has_cuda():
             return "warp"
         return "c" if platform == "cpu" else "jax"
     if impl == "warp" and not _has_warp():
-        raise ValueError(
+        raise InputError(
             "impl 'warp' needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'"
         )
     if impl == "c" and platform != "cpu":
-        raise ValueError(
+        raise InputError(
             f"impl 'c' runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
         )
     return impl
@@ -78,15 +78,15 @@ def _has_cuda() -> bool:
 
 
 class Physics:
-    """Steps one world of a compiled model on one engine; batch with `jax.vmap`.
+    """Steps one environment of a compiled model on one engine; batch with `jax.vmap`.
 
     Attributes:
         model: the compiled `mujoco.MjModel`.
         impl: 'jax', 'warp' or 'c'.
-        num_substeps: physics steps a call of `step`.
-        num_envs: how many worlds the Warp engine's contact buffer has room for.
-        contacts_per_env: how many contacts a world may have on average on Warp.
-        rows_per_env: how many constraint rows a world may have on Warp.
+        num_substeps: physics steps per call of `step`.
+        num_envs: environments for which Warp's contact buffer is sized.
+        contacts_per_env: contacts per environment for which that buffer is sized, on average over environments.
+        max_constraints_per_env: maximum constraints of each environment on Warp (njmax).
     """
 
     def __init__(
@@ -97,26 +97,28 @@ class Physics:
         num_substeps: int = 4,
         num_envs: int = 4096,
         contacts_per_env: int = 32,
-        rows_per_env: int = 160,
+        max_constraints_per_env: int = 160,
     ) -> None:
         self.model = model
         self.impl = resolve_impl(impl)
         self.num_substeps = num_substeps
         self.num_envs = num_envs
         self.contacts_per_env = contacts_per_env
-        self.rows_per_env = rows_per_env
+        self.max_constraints_per_env = max_constraints_per_env
         if self.impl == "c":
             self._engine = _CEngine(model, num_substeps)
             self._template = _without_pointers(mjx.make_data(model, impl="cpp"))
         elif self.impl == "warp":
             self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
-            self._template = mjx.make_data(model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=rows_per_env)
+            self._template = mjx.make_data(
+                model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=max_constraints_per_env
+            )
         else:
             self._mjx_model = mjx.put_model(model, impl="jax")
             self._template = mjx.make_data(model, impl="jax")
 
     def init(self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array) -> mjx.Data:
-        """Makes the state of one world without a forward pass.
+        """Returns the initial state of one environment, without a forward pass.
 
         Args:
             qpos: (nq,).
@@ -126,10 +128,15 @@ class Physics:
         """
         as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
         return self._template.replace(
-            qpos=as_float(qpos), qvel=as_float(qvel), mocap_pos=as_float(mocap_pos), ctrl=as_float(ctrl),
-            qacc_warmstart=jnp.zeros(self.model.nv), xfrc_applied=jnp.zeros((self.model.nbody, 6)),
-            sensordata=jnp.zeros(self.model.nsensordata), time=jnp.zeros(()),
-        )  # fmt: skip
+            qpos=as_float(qpos),
+            qvel=as_float(qvel),
+            mocap_pos=as_float(mocap_pos),
+            ctrl=as_float(ctrl),
+            qacc_warmstart=jnp.zeros(self.model.nv),
+            xfrc_applied=jnp.zeros((self.model.nbody, 6)),
+            sensordata=jnp.zeros(self.model.nsensordata),
+            time=jnp.zeros(()),
+        )
 
     def step(
         self,
@@ -140,14 +147,14 @@ class Physics:
         xfrc_applied: jax.Array | None = None,
         num_substeps: int | None = None,
     ) -> mjx.Data:
-        """Advances one world by `num_substeps` physics steps under a constant control.
+        """Advances one environment by `num_substeps` physics steps under a constant control.
 
         Args:
-            data: the world's state.
+            data: state of the environment.
             ctrl: (nu,), joint targets (rad) or torques (N m).
-            fields: model fields of this world in place of the model's, by their `mjModel` names.
+            fields: model fields that this environment overrides, by their `mjModel` names.
             xfrc_applied: external forces and torques on the bodies (nbody, 6), N and N m, world frame.
-            num_substeps: physics steps; the engine's own number if None.
+            num_substeps: physics steps; `self.num_substeps` if None.
         """
         substeps = self.num_substeps if num_substeps is None else num_substeps
         data = data.replace(ctrl=ctrl.astype(jnp.float32))
@@ -159,40 +166,53 @@ class Physics:
         return jax.lax.scan(lambda state, _: (mjx.step(model, state), None), data, None, substeps)[0]
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
-        """Returns `first` where `choose` () is true, else `second`; copies only what a step carries."""
+        """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
         merged = {name: jnp.where(choose, getattr(first, name), getattr(second, name)) for name in STATE_FIELDS}
         return second.replace(**merged)
 
     def overflow(self, data: mjx.Data) -> jax.Array:
-        """Returns whether Warp dropped contacts or constraint rows in the last step, () bool; else false."""
-        if self.impl != "warp":
-            return jnp.zeros((), bool)
-        return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+        """Returns whether contacts or constraints may have been dropped in the last physics step () bool.
+
+        On Warp the engine's own flags; on MJX-JAX whether the capped contact list is full. The C engine has no cap.
+        """
+        if self.impl == "warp":
+            return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+        if self.impl == "jax":
+            contact = data._impl.contact
+            if len(contact.dist) == _contact_cap(self.model):
+                return jnp.all(contact.dist < contact.includemargin)
+        return jnp.zeros((), bool)
 
 
-# Warp's flags for a solver that used all its iterations, which is how it is set here, and no overflow.
+def _contact_cap(model: mujoco.MjModel) -> int:
+    """Returns the maximum number of contacts that MJX-JAX keeps, -1 without a cap."""
+    names = [model.numeric(i).name for i in range(model.nnumeric)]
+    return int(model.numeric("max_contact_points").data[0]) if "max_contact_points" in names else -1
+
+
+# Warp's flags for a solver that used all its iterations: expected with few iterations, and no overflow.
 _ITERATIONS = 1 << 9 | 1 << 10
 
 
 def _quiet(model: mjx.Model) -> mjx.Model:
-    """Switches off Warp's printed warnings; `Physics.overflow` tells of what matters."""
+    """Disables Warp's printed warnings; `Physics.overflow` reports overflows."""
     return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
 
 
 def _without_pointers(data: mjx.Data) -> mjx.Data:
-    """Clears the addresses in memory that MJX keeps in this kind of data: they mean nothing in another process."""
+    """Zeroes MJX's memory addresses in this kind of data: they are invalid in another process."""
     zeros = {name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")}
     return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
 
 
 class _CEngine:
-    """MuJoCo's C engine as a pure JAX function: state in, state out, all worlds of a batch in one call."""
+    """MuJoCo's C engine as a pure JAX function: state in, state out, all environments of a batch in one call."""
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int) -> None:
         from mujoco.batch import Batch
 
         self._model = model.__copy__()
-        # A diverged world keeps its non-finite numbers (the environment ends it) instead of starting over unseen.
+        # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._make = Batch
         self._batches: dict[tuple[int, tuple[str, ...]], Any] = {}
@@ -210,14 +230,25 @@ class _CEngine:
             return self._call(names, forced, substeps, qpos, *rest)
 
         row = jax.pure_callback(
-            call, out, data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, *mocap, *forces,
-            *(fields[name] for name in names), vmap_method="broadcast_all",
-        )  # fmt: skip
+            call,
+            out,
+            data.qpos,
+            data.qvel,
+            data.qacc_warmstart,
+            data.ctrl,
+            *mocap,
+            *forces,
+            *(fields[name] for name in names),
+            vmap_method="broadcast_all",
+        )
         qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
         return data.replace(
-            qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, sensordata=sensordata,
+            qpos=qpos,
+            qvel=qvel,
+            qacc_warmstart=warmstart,
+            sensordata=sensordata,
             time=data.time + substeps * self._model.opt.timestep,
-        )  # fmt: skip
+        )
 
     def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
         qpos, *rest = (np.asarray(array) for array in arrays)

@@ -30,7 +30,7 @@ def euler_to_quaternion(euler: jax.Array) -> jax.Array:
 
 
 def rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Turns body vectors (..., 3) into the world by wxyz quaternions (..., 4)."""
+    """Rotates body-frame vectors (..., 3) into the world frame by wxyz quaternions (..., 4)."""
     w, imaginary = quaternion[..., :1], quaternion[..., 1:]
     vector = jnp.broadcast_to(vector, imaginary.shape)
     cross = 2 * jnp.cross(imaginary, vector)
@@ -38,5 +38,5 @@ def rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def rotate_inverse(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Turns world vectors (..., 3) into the body frame of wxyz quaternions (..., 4)."""
+    """Rotates world-frame vectors (..., 3) into the body frame of wxyz quaternions (..., 4)."""
     return rotate(quaternion * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)

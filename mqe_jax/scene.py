@@ -12,34 +12,38 @@ import numpy as np
 
 from mqe_jax import robots
 from mqe_jax.collision import MAX_ROBOTS
+from mqe_jax.errors import InputError
 from mqe_jax.objects import Object, ObjectIndex, index_objects
 from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.robot import Robot
 from mqe_jax.terrain import Layout, Track, build_terrain
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What to build.
+    """A scene to compile.
 
     Attributes:
         track: ground, walls and spawn poses.
         num_robots: R.
+        robot: all R of them.
         contacts: which parts of the robots touch what.
-        objects: everything else that is in it, added after the robots.
-        colors: of the robots, as indices of `mqe_jax.robots.visuals.COLORS`; one after the other if empty.
+        objects: movable and fixed objects, added after the robots.
+        colors: of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty.
         friction: sliding friction of the robots' shapes and the ground.
-        torque_robots: the actuators of the first so many robots take torques (N m), not PD joint targets (rad).
+        torque_robots: the actuators of the first `torque_robots` robots take torques (N m), not PD joint targets (rad).
         foot_sensors: whether the feet's contact forces are measured too.
         timestep: physics step, s.
-        solver_iterations: at most so many Newton iterations per physics step.
-        line_search_iterations: at most so many line search steps per iteration.
-        max_contacts: MJX-JAX keeps so many of the deepest contacts; it would otherwise have constraints for every pair
-            of shapes that could ever touch, and be half as fast on a CPU. The other engines keep all.
+        solver_iterations: maximum Newton iterations per physics step.
+        line_search_iterations: maximum line search steps per iteration.
+        max_contacts: maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX allocates
+            constraints for every candidate geom pair, which halves CPU throughput. The other engines keep all.
     """
 
     track: Track
     num_robots: int = 2
+    robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
     contacts: Contacts = dataclasses.field(default_factory=Contacts)
     objects: tuple[Object, ...] = ()
     colors: tuple[int, ...] = ()
@@ -53,9 +57,11 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_robots <= MAX_ROBOTS:
-            raise ValueError(f"Scene.num_robots: {self.num_robots} is not between 1 and {MAX_ROBOTS}")
+            raise InputError(f"Scene.num_robots: {self.num_robots} must be between 1 and {MAX_ROBOTS}")
         if self.colors and len(self.colors) != self.num_robots:
-            raise ValueError(f"Scene.colors: {self.colors} has not one of each of the {self.num_robots} robots")
+            raise InputError(
+                f"Scene.colors: {self.colors} must have one colour for each of the {self.num_robots} robots"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,8 +70,8 @@ class CompiledScene:
 
     Attributes:
         scene: what it was built from.
-        model: for the physics, without the geoms that are only looked at.
-        robot: index tables of the robots.
+        model: for the physics, without visual geoms.
+        index: tables of the robots.
         objects: where each object is, by name.
         layout: the track's walls, anchors and spawn poses.
         mocap_offset: of each moving wall from its anchor (W, 3), m; the anchor's z is 0.
@@ -74,7 +80,7 @@ class CompiledScene:
 
     scene: Scene
     model: mujoco.MjModel
-    robot: RobotIndex
+    index: RobotIndex
     objects: Mapping[str, ObjectIndex]
     layout: Layout
     mocap_offset: np.ndarray
@@ -98,7 +104,7 @@ class CompiledScene:
 
 
 def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
-    """Compiles a scene; without `visual` only what the physics needs."""
+    """Compiles a scene, with or without visual geoms."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = scene.timestep
@@ -109,20 +115,29 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     spec.add_numeric(name="max_contact_points", size=1, data=[scene.max_contacts])
     layout = build_terrain(spec, scene.track, visual=visual)
-    for robot in range(scene.num_robots):
+    for number in range(scene.num_robots):
         body = robots.build_robot(
-            robot, scene.num_robots, scene.contacts, visual=visual, friction=scene.friction,
-            torque_control=robot < scene.torque_robots, color=scene.colors[robot] if scene.colors else robot,
-        )  # fmt: skip
-        spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
+            scene.robot,
+            number,
+            scene.num_robots,
+            scene.contacts,
+            visual=visual,
+            friction=scene.friction,
+            torque_control=number < scene.torque_robots,
+            color=scene.colors[number] if scene.colors else number,
+        )
+        spec.attach(body, prefix=robots.prefix(number), frame=spec.worldbody.add_frame())
     for item in scene.objects:
         item.add(spec, visual)
-    robots.add_sensors(spec, scene.num_robots, scene.contacts, feet=scene.foot_sensors)
+    robots.add_sensors(spec, scene.robot, scene.num_robots, scene.contacts, feet=scene.foot_sensors)
     if visual:
         spec.worldbody.add_light(
-            pos=(scene.track.length / 2, 0, 8), dir=(0.2, 0.3, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            castshadow=True, diffuse=(0.6, 0.6, 0.6),
-        )  # fmt: skip
+            pos=(scene.track.length / 2, 0, 8),
+            dir=(0.2, 0.3, -1),
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            castshadow=True,
+            diffuse=(0.6, 0.6, 0.6),
+        )
         spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
         spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
         spec.visual.quality.shadowsize = 4096
@@ -131,13 +146,13 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
 
 
 def compile_scene(scene: Scene) -> CompiledScene:
-    """Compiles a scene for the physics and looks its names up."""
+    """Compiles a scene for the physics and indexes it by name."""
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
     return CompiledScene(
         scene=scene,
         model=model,
-        robot=robots.index_robots(model, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
+        index=robots.index_robots(model, scene.robot, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
         objects=index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),

@@ -1,9 +1,8 @@
 """Terrain: a track is a row of named blocks along x, each as wide as the track.
 
 A block is a small frozen dataclass with a length and a `layout` method; it is registered by name in one line.
-Blocks say where their walls are; a block whose walls differ between environments gives them as moving walls
-around an anchor, and the anchor's position is drawn at reset and lives in the state (mocap bodies), because
-that works alike on all engines.
+Blocks define their walls; a block whose walls differ between environments attaches them to an anchor, whose
+position is sampled at reset and is part of the state (mocap bodies, which all engines support).
 
 Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z up; metres.
 """
@@ -18,9 +17,9 @@ import mujoco
 import numpy as np
 
 from mqe_jax.collision import GROUND_BIT, WALL_BIT
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
 
-# A block parameter that may be given as (easy, hard): its value is interpolated by the track's difficulty in [0, 1].
+# A block parameter that may be a pair (easy, hard), interpolated by the track's difficulty in [0, 1].
 Ranged = float | tuple[float, float]
 
 WALL_COLOR = (0.17, 0.17, 0.2, 1.0)
@@ -33,9 +32,9 @@ class Wall:
 
     Attributes:
         name: unique in the track.
-        center: (3,) m; relative to the anchor (z to the ground) if `anchor` is not None.
+        center: (3,) m; relative to the anchor (z: to the ground) if `anchor` is not None.
         size: full extents (3,) m.
-        anchor: index of the moving anchor that carries it, or None for a fixed wall.
+        anchor: index of the anchor to which it is attached, or None for a fixed wall.
     """
 
     name: str
@@ -46,13 +45,13 @@ class Wall:
 
 @dataclasses.dataclass(frozen=True)
 class Barrier:
-    """An endless vertical wall that faces along `normal`, which nothing can pass; drawn as a box.
+    """An infinite vertical plane that blocks motion against `normal`; rendered as a box.
 
     Attributes:
         name: unique in the track.
-        point: a point on its face (2,), m.
-        normal: direction it faces (2,), a unit vector.
-        length: how much of it is drawn, m.
+        point: a point on the plane (2,), m.
+        normal: unit normal (2,).
+        length: rendered length, m.
     """
 
     name: str
@@ -63,11 +62,11 @@ class Barrier:
 
 @dataclasses.dataclass(frozen=True)
 class Anchor:
-    """A point that is drawn anew at every reset and carries moving walls.
+    """A reference point for moving walls, sampled at every reset.
 
     Attributes:
         name: the block's name and number, such as `gate1`.
-        position: its mean (2,), m.
+        position: mean (2,), m.
         spread: half-widths of the uniform range in x and y (2,), m.
     """
 
@@ -78,13 +77,13 @@ class Anchor:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What one block adds to the track; positions in the environment frame, m.
+    """Contribution of one block to the track; positions in the environment frame, m.
 
     Attributes:
-        walls: fixed and moving walls; `anchor` counts within this block.
-        barriers: endless walls.
-        anchors: the block's own anchors.
-        spawn: poses (x, y, yaw) where robots start, agent by agent.
+        walls: fixed and moving walls; `anchor` is an index into this layout's anchors.
+        barriers: infinite walls.
+        anchors: the block's anchors.
+        spawn: spawn poses (x, y, yaw) of the robots, m and rad.
     """
 
     walls: tuple[Wall, ...] = ()
@@ -109,17 +108,17 @@ def register_block(name: str) -> Callable[[type[B]], type[B]]:
 
 
 def block(name: str, **parameters: Any) -> Block:
-    """Makes a block by its registered name.
+    """Creates a block by its registered name.
 
     Raises:
-        ValueError: for an unknown block or parameter, with the nearest match.
+        InputError: for an unknown block or parameter, with the nearest match.
     """
     if name not in BLOCKS:
-        raise ValueError(f"terrain block: unknown name {name!r}{nearest(name, BLOCKS)}; allowed: {', '.join(BLOCKS)}")
+        raise InputError(f"terrain block: unknown name {name!r}{nearest(name, BLOCKS)}; allowed: {', '.join(BLOCKS)}")
     fields = [field.name for field in dataclasses.fields(BLOCKS[name])]
     for key in parameters:
         if key not in fields:
-            raise ValueError(
+            raise InputError(
                 f"terrain block {name}: unknown parameter {key!r}{nearest(key, fields)}; allowed: {', '.join(fields)}"
             )
     return BLOCKS[name](**parameters)
@@ -137,11 +136,11 @@ class Block:
     length: Ranged = 1.0
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        """Lays the block out from x = `start`; `number` counts the track's blocks."""
-        raise TypeError(f"terrain block {type(self).__name__}: layout() is not defined")
+        """Returns the walls and poses of the block from x = `start`, m; `number` is its index in the track."""
+        raise NotImplementedError(f"terrain block {type(self).__name__}: layout() is not defined")
 
     def at(self, difficulty: float) -> Block:
-        """Returns the block with every (easy, hard) parameter fixed at a difficulty in [0, 1]."""
+        """Returns the block with every (easy, hard) parameter interpolated at a difficulty in [0, 1]."""
         ranged = {field.name for field in dataclasses.fields(self) if "Ranged" in str(field.type)}
         fixed = {}
         for name in ranged:
@@ -153,19 +152,21 @@ class Block:
 
 def _number(value: Ranged) -> float:
     if isinstance(value, tuple | list):
-        raise ValueError(f"terrain block: the range {value} has no value; give the track a difficulty in [0, 1]")
+        raise InputError(
+            f"terrain block: the range {value} is not resolved; call `at` with a difficulty in [0, 1] first"
+        )
     return float(value)
 
 
-@register_block("init")
+@register_block("spawn")
 @dataclasses.dataclass(frozen=True)
-class Init(Block):
-    """Spawn rooms, one a robot side by side across the track, with a wall behind them.
+class SpawnArea(Block):
+    """Spawn poses side by side across the track, with a wall behind them.
 
     Attributes:
         spawn_x: x of the spawn poses from the block's start, m; half its length if None.
-        room_width: width of one room, m; the track's width shared out if None.
-        back_wall: whether there is a wall behind the rooms.
+        room_width: distance between neighbouring spawn poses, m; the track's width / number of robots if None.
+        back_wall: whether there is a wall behind the robots.
     """
 
     length: Ranged = 2.0
@@ -174,7 +175,6 @@ class Init(Block):
     back_wall: bool = True
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        """Lays the block out from x = `start`."""
         x = start + (_number(self.length) / 2 if self.spawn_x is None else self.spawn_x)
         room = track.width / track.num_robots if self.room_width is None else self.room_width
         middle = (track.num_robots - 1) / 2
@@ -186,22 +186,20 @@ class Init(Block):
 @register_block("plane")
 @dataclasses.dataclass(frozen=True)
 class Plane(Block):
-    """Free ground."""
+    """Ground without walls."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        """Adds nothing."""
         return Layout()
 
 
-@register_block("wall")
+@register_block("end_wall")
 @dataclasses.dataclass(frozen=True)
-class Closing(Block):
-    """The wall that closes the track."""
+class EndWall(Block):
+    """The wall at the end of the track."""
 
     length: Ranged = 0.0
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        """Lays the block out from x = `start`."""
         return Layout(barriers=(Barrier(f"end{number}", (start, 0.0), (-1.0, 0.0), track.width),))
 
 
@@ -213,8 +211,8 @@ class Gate(Block):
     Attributes:
         width: of the gap, m.
         depth: thickness of the wall along x, m.
-        offset: of the gap's centre from the block's centre (x, y), m.
-        random: half-widths of the range from which the centre is drawn at reset (x, y), m.
+        offset: of the gap's mean centre from the block's centre (x, y), m.
+        random: half-widths of the range of the gap's centre, sampled at reset (x, y), m.
     """
 
     length: Ranged = 3.0
@@ -224,12 +222,11 @@ class Gate(Block):
     random: tuple[float, float] = (0.0, 0.0)
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        """Lays the block out from x = `start`."""
         gap, depth, height = _number(self.width), _number(self.depth), track.wall_height
         if not 0 < gap < track.width:
-            raise ValueError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")
+            raise InputError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")
         center = (start + _number(self.length) / 2 + self.offset[0], self.offset[1])
-        # Long enough to reach the side wall wherever the gap is drawn; what stands out beyond it is not drawn.
+        # Long enough to reach the side wall for every sampled gap position; the overhang is hidden when rendering.
         reach = (track.width - gap) / 2 + abs(self.offset[1]) + self.random[1]
         walls = tuple(
             Wall(
@@ -243,10 +240,10 @@ class Gate(Block):
         return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))
 
 
-@register_block("rotation")
+@register_block("door_gap")
 @dataclasses.dataclass(frozen=True)
-class Rotation(Gate):
-    """A gate for the revolving door: a fixed gap whose middle holds the door's hinge."""
+class DoorGap(Gate):
+    """The gate of the revolving door, whose hinge is at the centre of the gap."""
 
     length: Ranged = 1.0
     width: Ranged = 2.0
@@ -254,12 +251,12 @@ class Rotation(Gate):
 
 @dataclasses.dataclass(frozen=True)
 class RoughGround:
-    """Perlin-noise ground in place of the flat floor.
+    """Perlin-noise ground instead of the flat floor; a height field, on all engines.
 
     Attributes:
-        amplitude: greatest height above the flat ground, m.
-        wavelength: size of the largest bumps, m.
-        octaves: how many times finer noise of half the height is added.
+        amplitude: maximum height above the flat ground, m.
+        wavelength: period of the coarsest octave, m.
+        octaves: number of noise octaves, each with half the wavelength and amplitude of the previous one.
         resolution: grid spacing, m.
         seed: of the noise.
     """
@@ -271,7 +268,7 @@ class RoughGround:
     seed: int = 0
 
     def heights(self, length: float, width: float, difficulty: float = 1.0) -> np.ndarray:
-        """Returns heights in [0, amplitude] (rows along y, columns along x), m."""
+        """Returns heights in [0, amplitude] (rows along y, columns along x), m; `difficulty` as in `Track`."""
         amplitude = self.amplitude
         if isinstance(amplitude, tuple | list):
             amplitude = amplitude[0] + difficulty * (amplitude[1] - amplitude[0])
@@ -286,7 +283,7 @@ class RoughGround:
 
 
 def _perlin(y: np.ndarray, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Gradient noise at the grid points (len(y), len(x)); unit cells."""
+    """Returns gradient noise with unit cells at the grid points (len(y), len(x))."""
     angle = random.uniform(0, 2 * np.pi, (int(y.max()) + 2, int(x.max()) + 2))
     gradient = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     row, column = y.astype(int)[:, None], x.astype(int)[None, :]
@@ -307,12 +304,12 @@ class Track:
     Attributes:
         blocks: in order along x.
         width: between the side walls, m.
-        num_robots: how many spawn rooms the init block has.
+        num_robots: number of spawn poses of a `SpawnArea`.
         wall_height: of every wall, m.
         wall_thickness: of the side walls, m.
-        difficulty: in [0, 1]; fixes block parameters that are given as (easy, hard) ranges.
+        difficulty: in [0, 1]; interpolates block parameters given as pairs (easy, hard).
         rough: Perlin-noise ground, or None for a flat floor.
-        walled: whether there are side walls at all.
+        walled: whether there are side walls.
     """
 
     blocks: tuple[Block, ...] = ()
@@ -326,9 +323,9 @@ class Track:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.difficulty <= 1.0:
-            raise ValueError(f"Track.difficulty: {self.difficulty} is not in [0, 1]")
+            raise InputError(f"Track.difficulty: {self.difficulty} is not in [0, 1]")
         if self.width <= 0:
-            raise ValueError(f"Track.width: {self.width} must be positive")
+            raise InputError(f"Track.width: {self.width} must be positive")
 
     @property
     def length(self) -> float:
@@ -336,7 +333,7 @@ class Track:
         return sum(_number(block.at(self.difficulty).length) for block in self.blocks)
 
     def layout(self) -> Layout:
-        """Lays all blocks out; anchors are numbered over the whole track."""
+        """Returns the layout of all blocks; anchors are numbered over the whole track."""
         walls, barriers, anchors, spawn = [], [], [], []
         start = 0.0
         for number, piece in enumerate(self.blocks):
@@ -357,7 +354,7 @@ class Track:
 
 
 def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> Layout:
-    """Adds a track's ground and walls to a scene; returns the layout it was built from.
+    """Adds a track's ground and walls to a scene; returns the layout.
 
     Moving walls become mocap bodies named `wall/<name>`, in the order of the layout's walls.
     """
@@ -367,9 +364,15 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
     for barrier in layout.barriers:
         normal = np.array([*barrier.normal, 0.0])
         world.add_geom(
-            name=f"barrier/{barrier.name}", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1),
-            pos=(*barrier.point, 0.0), zaxis=normal, contype=WALL_BIT, conaffinity=0, group=3,
-        )  # fmt: skip
+            name=f"barrier/{barrier.name}",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=(0, 0, 1),
+            pos=(*barrier.point, 0.0),
+            zaxis=normal,
+            contype=WALL_BIT,
+            conaffinity=0,
+            group=3,
+        )
         if visual:
             half = (
                 track.wall_thickness / 2,
@@ -379,9 +382,15 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
             yaw = np.arctan2(normal[1], normal[0])
             world.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=center, rgba=WALL_COLOR, contype=0, conaffinity=0,
-                quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)), group=1,
-            )  # fmt: skip
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=half,
+                pos=center,
+                rgba=WALL_COLOR,
+                contype=0,
+                conaffinity=0,
+                quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
+                group=1,
+            )
     for wall in layout.walls:
         half = np.array(wall.size) / 2
         if wall.anchor is None:
@@ -391,9 +400,15 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             start = np.add(wall.center, [*anchor.position, 0.0])
             body, position = world.add_body(name=f"wall/{wall.name}", mocap=True, pos=start), (0, 0, 0)
         body.add_geom(
-            name=f"wall/{wall.name}", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=position, rgba=WALL_COLOR,
-            contype=WALL_BIT, conaffinity=0, group=1,
-        )  # fmt: skip
+            name=f"wall/{wall.name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=half,
+            pos=position,
+            rgba=WALL_COLOR,
+            contype=WALL_BIT,
+            conaffinity=0,
+            group=1,
+        )
     return layout
 
 
@@ -406,9 +421,12 @@ def _add_ground(spec: mujoco.MjSpec, track: Track, visual: bool) -> None:
     heights = track.rough.heights(length, width, track.difficulty)
     top = max(float(heights.max()), 1e-6)
     spec.add_hfield(
-        name="ground", nrow=heights.shape[0], ncol=heights.shape[1], size=(length / 2, width / 2, top, 0.1),
+        name="ground",
+        nrow=heights.shape[0],
+        ncol=heights.shape[1],
+        size=(length / 2, width / 2, top, 0.1),
         userdata=(heights / top).ravel(),
-    )  # fmt: skip
+    )
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=(length / 2, 0, 0), **ground
     )

@@ -13,7 +13,7 @@ A recurrence-free network sees the last 30 observations of 70 numbers:
 | clock | 4 | sine of each foot's phase, FL FR RL RR |
 
 adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives the action, clipped to +-10;
-the joint target is default + `ACTION_SCALE` * action. ELU between layers. Matrix products are in float32.
+the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.robots.go1 import ACTION_SCALE, DEFAULT_JOINTS, NUM_JOINTS
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
@@ -45,11 +46,11 @@ Params = dict[str, dict[str, dict[str, jax.Array]]]
 
 
 class Command(NamedTuple):
-    """One of the walk policy's commands: name, scale in the observation, default value, unit."""
+    """One of the walk policy's commands: name, scale in the observation, default value (None: the robot's), unit."""
 
     name: str
     scale: float
-    default: float
+    default: float | None
     unit: str
 
 
@@ -57,22 +58,21 @@ COMMANDS = (
     Command("vx", 2.0, 0.0, "m/s forward"),
     Command("vy", 2.0, 0.0, "m/s to the left"),
     Command("yaw_rate", 0.25, 0.0, "rad/s"),
-    Command("body_height", 2.0, 0.0, "m above the usual height"),
+    Command("body_height", 2.0, 0.0, "m above the robot's standing height"),
     Command("gait_frequency", 1.0, 3.0, "Hz"),
     Command("phase", 1.0, 0.5, "of FL and RR"),
     Command("offset", 1.0, 0.0, "of FL and FR"),
     Command("bound", 1.0, 0.0, "of FL and RL"),
-    Command("duration", 1.0, 0.5, "share of the cycle on the ground"),
+    Command("duration", 1.0, 0.5, "fraction of the cycle in contact"),
     Command("footswing_height", 0.15, 0.08, "m"),
     Command("pitch", 0.3, 0.0, "rad"),
     Command("roll", 0.3, 0.0, "rad"),
-    Command("stance_width", 1.0, 0.25, "m"),
-    Command("stance_length", 1.0, 0.428, "m"),
+    Command("stance_width", 1.0, None, "m"),
+    Command("stance_length", 1.0, None, "m"),
     Command("auxiliary", 1.0, 0.0, "unused"),
 )
 COMMAND_NAMES = tuple(command.name for command in COMMANDS)
 COMMAND_SCALE = np.array([command.scale for command in COMMANDS], np.float32)
-COMMAND_DEFAULT = np.array([command.default for command in COMMANDS], np.float32)
 
 # (phase, offset, bound) of the named gaits.
 GAITS = {"trot": (0.5, 0.0, 0.0), "pronk": (0.0, 0.0, 0.0), "bound": (0.0, 0.5, 0.0), "pace": (0.0, 0.0, 0.5)}
@@ -81,15 +81,18 @@ GAITS = {"trot": (0.5, 0.0, 0.0), "pronk": (0.0, 0.0, 0.0), "bound": (0.0, 0.5, 
 def command_index(name: str) -> int:
     """Returns the position of a command in the 15-vector."""
     if name not in COMMAND_NAMES:
-        raise ValueError(f"walk command: unknown name {name!r}; allowed: {', '.join(COMMAND_NAMES)}")
+        raise InputError(
+            f"walk command: unknown name {name!r}{nearest(name, COMMAND_NAMES)}; allowed: {', '.join(COMMAND_NAMES)}"
+        )
     return COMMAND_NAMES.index(name)
 
 
-def default_commands(gait: str = "trot", **values: float) -> np.ndarray:
-    """Returns the 15 commands (15,) at their defaults, with a gait and single values replaced."""
+def default_commands(robot: Robot, gait: str = "trot", **values: float) -> np.ndarray:
+    """Returns the default commands of a robot (15,), with a gait and single values replaced."""
     if gait not in GAITS:
-        raise ValueError(f"gait: unknown name {gait!r}; allowed: {', '.join(GAITS)}")
-    commands = COMMAND_DEFAULT.copy()
+        raise InputError(f"gait: unknown name {gait!r}{nearest(gait, GAITS)}; allowed: {', '.join(GAITS)}")
+    own = {"stance_width": robot.walk.stance_width, "stance_length": robot.walk.stance_length}
+    commands = np.array([own.get(name, default) for name, _, default, _ in COMMANDS], np.float32)
     commands[5:8] = GAITS[gait]
     for name, value in values.items():
         commands[command_index(name)] = value
@@ -99,13 +102,13 @@ def default_commands(gait: str = "trot", **values: float) -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkMemory:
-    """What the walk policy of one robot remembers.
+    """Memory of one robot's walk policy.
 
     Attributes:
         history: last observations, oldest first (30, 70); zeros after a reset.
         action: last action (12,).
         previous_action: the action before it (12,).
-        gait: position in the gait cycle () in [0, 1).
+        gait: phase of the gait cycle () in [0, 1).
     """
 
     history: jax.Array
@@ -121,7 +124,7 @@ def initial_memory() -> WalkMemory:
 
 
 def foot_phases(gait: jax.Array, commands: jax.Array) -> jax.Array:
-    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: below 0.5 it should stand, above it should swing."""
+    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above."""
     phase, offset, bound, duration = commands[5], commands[6], commands[7], commands[8]
     shift = jnp.stack([phase + offset + bound, offset, bound, phase])
     raw = jnp.mod(gait + shift, 1.0)
@@ -129,11 +132,12 @@ def foot_phases(gait: jax.Array, commands: jax.Array) -> jax.Array:
 
 
 def advance_gait(gait: jax.Array, commands: jax.Array) -> jax.Array:
-    """Moves the gait cycle on by one policy step."""
+    """Advances the gait phase by one policy step."""
     return jnp.mod(gait + STEP * commands[4], 1.0)
 
 
 def observe(
+    robot: Robot,
     memory: WalkMemory,
     commands: jax.Array,
     gravity_b: jax.Array,
@@ -143,7 +147,8 @@ def observe(
     """Builds one observation (70,).
 
     Args:
-        memory: of the robot.
+        robot: which one.
+        memory: its walk policy's.
         commands: unscaled (15,).
         gravity_b: unit gravity vector in the trunk frame (3,).
         joint_position: (12,), rad.
@@ -154,7 +159,7 @@ def observe(
         [
             gravity_b,
             commands * COMMAND_SCALE,
-            joint_position - DEFAULT_JOINTS,
+            joint_position - robot.default_joints,
             joint_velocity * JOINT_VELOCITY_SCALE,
             memory.action,
             memory.previous_action,
@@ -183,6 +188,7 @@ def infer_action(params: Params, history: jax.Array, latent: jax.Array) -> jax.A
 
 
 def walk(
+    robot: Robot,
     params: Params,
     memory: WalkMemory,
     commands: jax.Array,
@@ -191,20 +197,21 @@ def walk(
     joint_velocity: jax.Array,
 ) -> tuple[jax.Array, WalkMemory]:
     """Computes one robot's joint targets (12,), rad, and its next memory; arguments as in `observe`."""
-    observation = observe(memory, commands, gravity_b, joint_position, joint_velocity)
+    observation = observe(robot, memory, commands, gravity_b, joint_position, joint_velocity)
     history = jnp.concatenate([memory.history[1:], observation[None]])
     flat = history.reshape(-1)
     action = jnp.clip(infer_action(params, flat, infer_latent(params, flat)), -ACTION_CLIP, ACTION_CLIP)
-    return joint_targets(action), WalkMemory(history, action, memory.action, advance_gait(memory.gait, commands))
+    gait = advance_gait(memory.gait, commands)
+    return joint_targets(robot, action), WalkMemory(history, action, memory.action, gait)
 
 
-def joint_targets(action: jax.Array) -> jax.Array:
-    """Turns actions (..., 12) into joint targets (..., 12), rad."""
-    return jnp.asarray(DEFAULT_JOINTS) + ACTION_SCALE * action
+def joint_targets(robot: Robot, action: jax.Array) -> jax.Array:
+    """Computes joint targets (..., 12), rad, from actions (..., 12): default + scale x action."""
+    return jnp.asarray(robot.default_joints) + robot.action_scale * action
 
 
 def init_params(key: jax.Array) -> Params:
-    """Draws fresh weights: He-uniform as torch's linear layers have it, a small last layer for the body."""
+    """Samples initial weights: uniform as in torch's linear layers, the body's last layer scaled by 0.1."""
     params: Params = {}
     for part, sizes in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES)):
         layers = {}
@@ -233,38 +240,44 @@ def _nested(flat: Mapping[str, np.ndarray], source: str) -> Params:
     params: Params = {"adaptation": {}, "body": {}}
     for name, shape in _expected_shapes().items():
         if name not in flat:
-            raise ValueError(f"walk policy {source}: {name} is missing; expected {', '.join(_expected_shapes())}")
+            raise InputError(f"walk policy {source}: {name} is missing; expected {', '.join(_expected_shapes())}")
         if tuple(flat[name].shape) != shape:
-            raise ValueError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
+            raise InputError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
         part, layer, kind = name.split(".")
         params[part].setdefault(layer, {})[kind] = jnp.asarray(flat[name], jnp.float32)
     return params
 
 
-DEFAULT_WEIGHTS = pathlib.Path(__file__).parent / "assets" / "walk.safetensors"
+ASSETS = pathlib.Path(__file__).parent / "assets"
 
 
-def load_params(path: str | os.PathLike[str] | None = None) -> Params:
-    """Reads weights from a safetensors file; the ones that ship with the package if `path` is None.
+def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
+    """Reads weights from a safetensors file; those shipped for the robot if `path` is None.
 
     Raises:
-        ValueError: if the file is missing, damaged, or holds other names or shapes.
+        InputError: if the file is missing, damaged, or holds other names or shapes.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
-    file = pathlib.Path(path) if path is not None else DEFAULT_WEIGHTS
+    file = pathlib.Path(path) if path is not None else ASSETS / robot.walk.weights
+    make = f"make it with 'mqe walk train --robot {robot.name}' or 'mqe walk convert'"
+    if not file.is_file() and path is None:
+        raise InputError(
+            f"walk policy: no weights for {robot.name} ({file.name}) are shipped; {make} and give the file as "
+            "walk_policy (--weights), or use control 'position' or 'torque'"
+        )
     if not file.is_file():
-        raise ValueError(f"walk policy: no file {file}; make one with 'mqe walk train' or 'mqe walk convert'")
+        raise InputError(f"walk policy: no file {file}; {make}")
     try:
         flat = load_file(file)
     except SafetensorError as error:
-        raise ValueError(f"walk policy {file}: not a safetensors file ({error})") from None
+        raise InputError(f"walk policy {file}: not a safetensors file ({error})") from None
     return _nested(flat, str(file))
 
 
 def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
-    """Writes weights and a description to a safetensors file, whole or not at all."""
+    """Writes weights and metadata to a safetensors file, atomically."""
     from safetensors.numpy import save
 
     flat = {
@@ -280,4 +293,4 @@ def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[
         temporary.write_bytes(save(flat, {"about": json.dumps(dict(metadata or {}))}))
         os.replace(temporary, file)
     except OSError as error:
-        raise ValueError(f"walk policy: cannot write {file}: {error.strerror}") from None
+        raise InputError(f"walk policy: cannot write {file}: {error.strerror}") from None

@@ -1,4 +1,4 @@
-"""Settings that every test shares: the CPU, a compilation cache, and the reason why GPU tests are skipped."""
+"""Settings shared by all tests: the CPU, a compilation cache, and the skip reasons of GPU and soak tests."""
 
 import os
 import subprocess
@@ -23,9 +23,17 @@ def _gpu_missing() -> str:
     return ""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip the tests marked `gpu` where there is no GPU."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skips the tests marked `gpu` where there is no GPU, and those marked `soak` unless they are asked for.
+
+    `MQE_SOAK=1 pytest` runs all tests, `pytest -m soak` the soak alone.
+    """
     marked = [item for item in items if item.get_closest_marker("gpu")]
     reason = _gpu_missing() if marked else ""
     for item in marked if reason else []:
         item.add_marker(pytest.mark.skip(reason=reason))
+    if os.environ.get("MQE_SOAK") == "1" or "soak" in config.getoption("-m", default=""):
+        return
+    for item in items:
+        if item.get_closest_marker("soak"):
+            item.add_marker(pytest.mark.skip(reason="long: MQE_SOAK=1 pytest, or pytest -m soak, runs it"))

@@ -18,7 +18,7 @@ import numpy as np
 
 from mqe_jax.envs import TASKS, State, VectorEnv, make
 from mqe_jax.physics import STATE_FIELDS
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import PLANNERS, scripted_policy
 
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
@@ -52,14 +52,14 @@ def played(task: str, worlds: int) -> dict[str, np.ndarray]:
     Of each world's first `PLAY` steps the one is taken in which objects move fastest and robots touch most.
     """
     env: Any = make(task, impl="c", num_envs=worlds)
-    worlds_env, plan = VectorEnv(env, worlds), jax.vmap(PLANNERS.get(task, ahead))
-    robots = np.concatenate([env.robot.base_qvel, env.robot.joint_qvel], axis=1).ravel()
+    worlds_env, plan = VectorEnv(env, worlds), jax.vmap(scripted_policy(env) if task in PLANNERS else ahead)
+    robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 
     def advance(states: State, _: None) -> tuple[State, Any]:
         states = worlds_env.step(states, plan(states.obs))
-        readings = jax.vmap(env.read)(states.data)
-        touching = jnp.any(readings.touching, axis=(1, 2)) | jnp.any(readings.trunk_force > 1.0, axis=1)
+        robot_state = jax.vmap(env.read)(states.data)
+        touching = jnp.any(robot_state.touching, axis=(1, 2)) | jnp.any(robot_state.trunk_force > 1.0, axis=1)
         busy = jnp.minimum(jnp.linalg.norm(states.data.qvel[:, rest], axis=-1), 1.0) + 2.0 * touching
         return states, (busy, {name: getattr(states.data, name) for name in STATE_FIELDS})
 
@@ -114,7 +114,7 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     leaves = [jnp.asarray(reference[f"leaf/{i}"]) for i in range(len(jax.tree.leaves(parts)))]
     states = dataclasses.replace(fresh, data=data, **jax.tree.unflatten(jax.tree.structure(parts), leaves))
     apart = np.abs(np.asarray(rolled(env, states, actions_of(env, worlds))[1]) - reference["qpos"])
-    robots = np.concatenate([env.robot.base_qpos, env.robot.joint_qpos], axis=1).ravel()
+    robots = np.concatenate([env.index.base_qpos, env.index.joint_qpos], axis=1).ravel()
     rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
     figures = {}
     for number, kind in enumerate(("standing", "play")):
@@ -142,9 +142,12 @@ def crowd(task: str, worlds: int = 4096, steps: int = 1000) -> dict[str, Any]:
     state = jax.jit(worlds_env.reset)(jax.random.PRNGKey(0))
     overflow, diverged, finite = run(state, jax.random.split(jax.random.PRNGKey(1), steps))[1]
     return {
-        "worlds": worlds, "steps": steps, "overflows": int(np.sum(np.asarray(overflow))),
-        "diverged": int(np.sum(np.asarray(diverged))), "finite": bool(np.all(np.asarray(finite))),
-    }  # fmt: skip
+        "worlds": worlds,
+        "steps": steps,
+        "overflows": int(np.sum(np.asarray(overflow))),
+        "diverged": int(np.sum(np.asarray(diverged))),
+        "finite": bool(np.all(np.asarray(finite))),
+    }
 
 
 def main(what: str, folder: str, engine: str, *tasks: str) -> None:

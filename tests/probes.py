@@ -32,9 +32,9 @@ class Probe:
     """N worlds with one random sign `hidden` per episode.
 
     `show(hidden (N,), step (N,)) -> (N, F)` is what agents see besides their id;
-    `pay(hidden, action (N, A, D))` is the team's reward (N,), or each agent's own (N, A). Episodes of even
-    worlds end after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates` says whether
-    that is a termination (with `even_truncate` only in odd worlds). The shorter kind is a success.
+    `pay(hidden, action (N, A, D))` is the team's reward (N,), or each agent's own (N, A). Episodes of even worlds end
+    after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates` says whether that
+    is a termination (with `even_truncate` only in odd worlds). The shorter kind is a success.
     """
 
     show: Callable[[jax.Array, jax.Array], jax.Array]

@@ -170,10 +170,11 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any)
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_our_own_mistakes_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    def wrong(arguments: Any) -> None:
-        json.loads("{")  # a ValueError from somebody else's code
+@pytest.mark.parametrize("error", [ValueError("a defect in our own code"), KeyError("x"), ZeroDivisionError()])
+def test_defects_keep_their_traceback(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(num_envs: int) -> None:
+        raise error
 
-    monkeypatch.setattr(commands, "tasks", wrong)
-    with pytest.raises(ValueError):
-        cli.main(["tasks"])
+    monkeypatch.setattr(commands, "make_env", lambda *arguments: wrong(1))
+    with pytest.raises(type(error)):
+        cli.main(["bench", "fake"])

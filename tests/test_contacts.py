@@ -10,20 +10,26 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import TASKS, make
-from mqe_jax.robots import go1
 
 # What a crowd stands around or upon, and how far from its middle, m.
 REACH = {
-    "box": 0.7, "ball": 0.3, "sheep4": 0.3, "sheep0": 0.3, "cylinder": 1.35, "door": 0.35, "seesaw": 0.3,
-    "platform0": 0.3, "platform": 0.3,
-}  # fmt: skip
+    "box": 0.7,
+    "ball": 0.3,
+    "sheep4": 0.3,
+    "sheep0": 0.3,
+    "cylinder": 1.35,
+    "door": 0.35,
+    "seesaw": 0.3,
+    "platform0": 0.3,
+    "platform": 0.3,
+}
 
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     """All robots thrown together upon what there is to touch, under random joint targets, for two seconds."""
     env: Any = make(task, impl="c", control="position")
-    model, index = env.compiled.model, env.robot
+    model, index = env.compiled.model, env.index
     start = jax.tree.map(np.asarray, env.reset(jax.random.PRNGKey(0)))
     random = np.random.default_rng(0)
     data = mujoco.MjData(model)
@@ -46,7 +52,7 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     data.qpos[index.base_qpos[:, 2]] = place[2]
     contacts, rows, touched = [], [], 0
     for _ in range(100):
-        data.ctrl[index.actuator] = go1.DEFAULT_JOINTS + 0.4 * random.standard_normal((robots, 12))
+        data.ctrl[index.actuator] = env.robot.default_joints + 0.4 * random.standard_normal((robots, 12))
         mujoco.mj_step(model, data, 4)
         contacts.append(data.ncon)
         rows.append(data.nefc)
@@ -54,5 +60,5 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     assert max(contacts) >= 4 * robots - 2, "nobody touches anything: the scene is not crowded"
     assert not name or touched >= 10, f"{name} was touched in {touched} of 100 steps: nobody is at it"
     assert max(contacts) <= env.params.contacts_per_robot * robots
-    assert max(rows) <= env.params.rows_per_robot * robots
+    assert max(rows) <= env.params.constraints_per_robot * robots
     print(f"{task}: contacts {np.mean(contacts):.1f} on average, {max(contacts)} at most, rows {max(rows)}, {touched}")

@@ -1,54 +1,76 @@
-"""What ends an episode, in every task: a fall, the time limit, and a collision where the task says so."""
+"""Endings of every task: a fall, the time limit, and a collision in the tasks that end on one."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.envs import TASKS, make
-from tests.worlds import placed, still
+from mqe_jax.envs import TASKS
+from tests.states import made, placed, stepper, still
 
-COLLISION_ENDS = {"go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard"}
-TIME_LIMIT = {  # s
-    "go1plane": 10, "go1gate": 10, "go1seesaw": 10, "go1sheep-easy": 15, "go1sheep-hard": 15, "go1pushbox": 15,
-    "go1football-defender": 20, "go1tug": 15, "go1revolvingdoor": 5, "go1wrestling": 15, "go1bridge": 20,
-    "go1football-1vs1": 20, "go1football-2vs2": 20,
-}  # fmt: skip
+
+def ground_height(env: Any, x: float, y: float) -> float:
+    """The height of what is below (x, y), m, without the robots."""
+    model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
+    data.qpos[env.index.base_qpos[:, 2]] = 50.0
+    mujoco.mj_kinematics(model, data)
+    geom = np.zeros(1, np.int32)
+    return 5.0 - mujoco.mj_ray(model, data, np.array([x, y, 5.0]), np.array([0, 0, -1.0]), None, 1, -1, geom)
 
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_endings(task: str) -> None:
     """From the spawn poses, at standing height."""
-    env: Any = make(task, impl="c", control="position", spawn_noise=0.0)
-    pose = np.array(env.spawn(jax.random.PRNGKey(0)))
-    position = pose[:, :3] - [0, 0, env.params.spawn_height - 0.31]
-    if task in ("go1wrestling", "go1bridge"):
-        position[:, 2] += {"go1wrestling": 0.4, "go1bridge": 1.02}[task]
-    euler = np.zeros((len(pose), 3))
-    euler[:, 2] = pose[:, 3]
+    env, step = made(task), stepper(task)
+    pose = np.array(env.spawn_poses())
+    height = [ground_height(env, x, y) + env.robot.stand_height + 0.01 for x, y, _ in pose]
+    position, euler = np.c_[pose[:, :2], height], np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
 
-    after = env.step(placed(env, position, euler), still(env))
+    after = step(placed(env, position, euler), still(env))
     assert not after.terminated and not after.truncated
 
-    late = dataclasses.replace(placed(env, position, euler), step=jnp.int32(50 * TIME_LIMIT[task] - 1))
-    after = env.step(late, still(env))
+    late = dataclasses.replace(placed(env, position, euler), step=jnp.int32(env.max_steps - 1))
+    after = step(late, still(env))
     assert after.truncated and not after.terminated
 
     rolled, high = euler.copy(), position.copy()
-    rolled[-1, 0], high[-1, 2] = (1.35 if task == "go1wrestling" else 0.9), high[-1, 2] + 0.5
-    assert env.step(placed(env, high, rolled), still(env)).terminated
-    rolled[-1, 0] = 0.7
-    assert not env.step(placed(env, high, rolled), still(env)).terminated
+    rolled[-1, 0], high[-1, 2] = env.params.max_roll + 0.1, high[-1, 2] + 0.5
+    assert step(placed(env, high, rolled), still(env)).terminated
+    rolled[-1, 0] = env.params.max_roll - 0.1
+    assert not step(placed(env, high, rolled), still(env)).terminated
 
     # The first robot's trunk lies across the second's: they touch.
-    touching, across = position.copy(), euler.copy()
-    touching[0] = touching[1] + [0.0, 0.0, 0.09]
-    across[0, 2] = pose[1, 3] + np.pi / 2
-    bumped = env.step(placed(env, touching, across), still(env))
-    assert bool(bumped.metrics["collision"])
-    assert bool(bumped.terminated) == (task in COLLISION_ENDS)
+    if len(pose) > 1:
+        touching, across = position.copy(), euler.copy()
+        touching[0] = touching[1] + [0.0, 0.0, 0.09]
+        across[0, 2] = pose[1, 2] + np.pi / 2
+        bumped = step(placed(env, touching, across), still(env))
+        assert bool(bumped.metrics["collision"])
+        assert bool(bumped.terminated) == env.params.end_on_collision
+
+
+@pytest.mark.parametrize(
+    ("task", "time_limit", "end_on_collision"),
+    [
+        ("go1gate", 10, True),
+        ("go1seesaw", 10, True),
+        ("go1sheep-easy", 15, True),
+        ("go1sheep-hard", 15, True),
+        ("go1pushbox", 15, False),
+        ("go1football-defender", 20, False),
+        ("go1tug", 15, False),
+        ("go1revolvingdoor", 5, False),
+        ("go1wrestling", 15, False),
+        ("go1bridge", 20, False),
+        ("go1football-1vs1", 20, False),
+        ("go1football-2vs2", 20, False),
+    ],
+)
+def test_limits_are_those_of_the_paper(task: str, time_limit: float, end_on_collision: bool) -> None:
+    params = made(task).params
+    assert (params.episode_length, params.end_on_collision) == (time_limit, end_on_collision)

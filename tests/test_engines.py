@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 
 from mqe_jax.envs import TASKS
 from tests import engines
 
 
-@pytest.mark.skipif(not os.environ.get("MQE_SOAK"), reason="a minute for each task: MQE_SOAK=1 runs it")
+@pytest.mark.soak
 @pytest.mark.parametrize("task", list(TASKS))
 def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
     """Standing robots and worlds in play under random joint targets: contacts make small differences grow."""

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import subprocess
 import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
-from tests.worlds import placed, readings
+from mqe_jax.envs import TASKS, QuadrupedEnv, Randomization, State, VectorEnv, make, replay
+from mqe_jax.envs.gate import GateParams
+from mqe_jax.envs.observation import Block, ObservationLayout
+from mqe_jax.errors import InputError
+from tests.states import made, placed, robot_state
 
 Array = jax.Array
 
 
 @pytest.fixture(scope="module")
 def gate() -> QuadrupedEnv:
-    return make("go1gate", impl="c", control="position")
+    return made("go1gate")
 
 
 @pytest.fixture(scope="module")
@@ -30,35 +33,24 @@ def gate_step(gate: QuadrupedEnv) -> Any:
     return jax.jit(gate.step)
 
 
-# Observation sizes of the paper's tasks (SPEC of the released system); one-hots of matches are within the team.
-OBSERVATION = {
-    "go1plane": 14, "go1gate": 16, "go1seesaw": 14, "go1sheep-easy": 18, "go1sheep-hard": 34, "go1pushbox": 22,
-    "go1football-defender": 20, "go1tug": 10, "go1revolvingdoor": 12, "go1wrestling": 12, "go1bridge": 12,
-    "go1football-1vs1": 19, "go1football-2vs2": 32,
-}  # fmt: skip
-
-
+@pytest.mark.parametrize(("count", "steps"), [(8, 200), pytest.param(32, 1000, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("task", list(TASKS))
-def test_contract(task: str) -> None:
-    """Random steps: shapes, finite numbers, same key same result, one trace, clean auto-reset.
-
-    8 worlds and 200 steps, or with MQE_SOAK=1 32 worlds and 1000 steps.
-    """
-    count, steps = (32, 1000) if os.environ.get("MQE_SOAK") else (8, 200)
-    env = make(task, impl="c", control="position")
-    worlds = VectorEnv(env, count)
+def test_contract(task: str, count: int, steps: int) -> None:
+    """Random steps: shapes, finite numbers, same key same result, one trace, clean auto-reset."""
+    env = made(task)
+    batch = VectorEnv(env, count)
     shape = (count, env.num_agents, env.action_size)
     traces = []
 
     @jax.jit
     def step(state: State, key: Array) -> tuple[State, Array]:
         traces.append(1)
-        state = worlds.step(state, jax.random.uniform(key, shape, minval=-1.0))
+        state = batch.step(state, jax.random.uniform(key, shape, minval=-1.0))
         shown = (state.obs, state.final_obs, state.privileged_obs, state.reward, *state.metrics.values())
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in (*shown, state.data.qpos, state.data.qvel)]
         return state, jnp.all(jnp.stack(finite))
 
-    reset = jax.jit(worlds.reset)
+    reset = jax.jit(batch.reset)
     keys = list(jax.random.split(jax.random.PRNGKey(1), steps))
 
     def play() -> State:
@@ -69,7 +61,7 @@ def test_contract(task: str) -> None:
 
     state = play()
     jax.tree.map(np.testing.assert_array_equal, state, play())
-    assert env.observation_size == OBSERVATION[task]
+    assert env.observation_size == sum(block.width for block in env.observation_layout.blocks)
     assert [agent for team in env.teams for agent in team] == list(range(env.num_agents))
     assert state.obs.shape == (count, env.num_agents, env.observation_size)
     assert state.privileged_obs.shape == (count, env.privileged_observation_size)
@@ -77,7 +69,7 @@ def test_contract(task: str) -> None:
     assert env.action_space.shape == (env.num_agents, env.action_size)
     assert state.reward.shape == (count, env.num_agents)
 
-    # Every other world is at its time limit: it starts over, and its last observation is kept.
+    # Every other environment is at its time limit: it is reset, and its last observation is kept.
     late = jnp.where(jnp.arange(count) % 2 == 0, env.max_steps - 1, state.step)
     state, _ = step(dataclasses.replace(state, step=late), keys[10])
     ended = np.asarray(state.terminated | state.truncated)
@@ -85,7 +77,7 @@ def test_contract(task: str) -> None:
     np.testing.assert_array_equal(np.asarray(state.step) == 0, ended)
     assert np.all(np.abs(np.asarray(state.obs - state.final_obs)).max((1, 2))[ended] > 0)
     np.testing.assert_array_equal(np.asarray(state.obs)[~ended], np.asarray(state.final_obs)[~ended])
-    spawned = np.asarray(state.data.qpos)[ended][:, env.robot.base_qpos[:, 2]]
+    spawned = np.asarray(state.data.qpos)[ended][:, env.index.base_qpos[:, 2]]
     np.testing.assert_allclose(spawned, env.params.spawn_height, atol=1e-6)
 
     fine, diverged = [], []
@@ -97,28 +89,41 @@ def test_contract(task: str) -> None:
     assert len(traces) == 1
 
 
-# Scenes that between them have every kind of object: compiled for MJX-JAX, which takes half a minute each. The others
-# are only traced, unless MQE_SOAK=1.
-COMPILED = ("go1seesaw", "go1sheep-easy", "go1pushbox", "go1tug", "go1revolvingdoor", "go1bridge", "go1football-1vs1")
+# Observation sizes in the paper and the released system; one-hots of matches are within the team.
+@pytest.mark.parametrize(
+    ("task", "size"),
+    [
+        ("go1plane", 14),
+        ("go1gate", 16),
+        ("go1seesaw", 14),
+        ("go1sheep-easy", 18),
+        ("go1sheep-hard", 34),
+        ("go1pushbox", 22),
+        ("go1football-defender", 20),
+        ("go1tug", 10),
+        ("go1revolvingdoor", 12),
+        ("go1wrestling", 12),
+        ("go1bridge", 12),
+        ("go1football-1vs1", 19),
+        ("go1football-2vs2", 32),
+    ],
+)
+def test_observation_sizes_are_those_of_the_paper(task: str, size: int) -> None:
+    assert made(task).observation_size == size
 
 
-@pytest.mark.parametrize("task", list(TASKS))
+# Scenes that together contain every kind of object; compiling one for MJX-JAX takes half a minute.
+EVERY_OBJECT = {"go1seesaw", "go1sheep-easy", "go1pushbox", "go1tug", "go1revolvingdoor", "go1football-1vs1"}
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a single step
+
+
+@pytest.mark.parametrize(
+    "task", [task if task in EVERY_OBJECT else pytest.param(task, marks=pytest.mark.soak) for task in TASKS]
+)
 def test_two_engines_step_alike(task: str) -> None:
-    """Fresh worlds under jit and vmap: MuJoCo's C engine and MJX-JAX lead to the same observations and rewards."""
-    envs = [make(task, impl=impl, control="position", num_envs=2) for impl in ("c", "jax")]
-    state = jax.jit(jax.vmap(envs[0].reset))(jax.random.split(jax.random.PRNGKey(3), 2))
-    action = jax.random.uniform(jax.random.PRNGKey(4), (2, envs[0].num_agents, 12), minval=-1.0)
-    parts = [getattr(state.data, name) for name in ("qpos", "qvel", "mocap_pos", "ctrl")]
-    starts = [dataclasses.replace(state, data=jax.vmap(env.physics.init)(*parts)) for env in envs]
-    first, second = (jax.jit(jax.vmap(env.step)).lower(start, action) for env, start in zip(envs, starts, strict=True))
-    shapes = [jax.tree.map(lambda x: x.shape, dataclasses.replace(low.out_info, data=None)) for low in (first, second)]
-    assert shapes[0] == shapes[1]
-    if task not in COMPILED and not os.environ.get("MQE_SOAK"):
-        return
-    quick = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a single step
-    after = [
-        low.compile(compiler_options=quick)(start, action) for low, start in zip((first, second), starts, strict=True)
-    ]
+    """MuJoCo's C engine and MJX-JAX lead from the same states to the same observations and rewards."""
+    lowered, starts, action = lowered_on_both(task)
+    after = [low.compile(compiler_options=QUICK)(start, action) for low, start in zip(lowered, starts, strict=True)]
     for name in ("obs", "privileged_obs", "reward"):
         expected, actual = (np.asarray(getattr(state, name)) for state in after)
         assert np.all(np.isfinite(actual))
@@ -126,10 +131,28 @@ def test_two_engines_step_alike(task: str) -> None:
     np.testing.assert_array_equal(after[0].terminated, after[1].terminated)
 
 
+@pytest.mark.parametrize("task", [task for task in TASKS if task not in EVERY_OBJECT])
+def test_two_engines_return_the_same_shapes(task: str) -> None:
+    lowered, _, _ = lowered_on_both(task)
+    shapes = [jax.tree.map(lambda x: x.shape, dataclasses.replace(low.out_info, data=None)) for low in lowered]
+    assert shapes[0] == shapes[1]
+
+
+def lowered_on_both(task: str) -> tuple[list[Any], list[State], Array]:
+    """The batched step lowered on both engines, the same initial states on each, and an action."""
+    envs = [made(task), make(task, impl="jax", control="position", num_envs=2)]
+    state = jax.jit(jax.vmap(envs[0].reset))(jax.random.split(jax.random.PRNGKey(3), 2))
+    action = jax.random.uniform(jax.random.PRNGKey(4), (2, envs[0].num_agents, 12), minval=-1.0)
+    parts = [getattr(state.data, name) for name in ("qpos", "qvel", "mocap_pos", "ctrl")]
+    starts = [dataclasses.replace(state, data=jax.vmap(env.physics.init)(*parts)) for env in envs]
+    lowered = [jax.jit(jax.vmap(env.step)).lower(start, action) for env, start in zip(envs, starts, strict=True)]
+    return lowered, starts, action
+
+
 def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv) -> None:
     state = gate.reset(jax.random.PRNGKey(0))
-    both = readings([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
-    state = dataclasses.replace(state, gates=jnp.array([[3.4, 0.2]]))
+    both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
+    state = dataclasses.replace(state, anchors=jnp.array([[3.4, 0.2]]))
     obs = gate.observation_layout.pack(gate.observe(state, both))
     first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
     second = [0, 1, 4, 5, 0.6, 0, 0, 0.2, 1, 2, 0.3, 0, 0, 0.1, 3.4, 0.2]
@@ -140,11 +163,11 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     from mqe_jax.envs.reward import weigh
 
     state = gate.reset(jax.random.PRNGKey(0))
-    before = readings([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
+    before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
     # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
-    task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.gates)
-    state = dataclasses.replace(state, gates=jnp.array([[3.5, 0.0]]), task=task)
-    after = readings([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
+    task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.anchors)
+    state = dataclasses.replace(state, anchors=jnp.array([[3.5, 0.0]]), task=task)
+    after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
     terms, _ = gate.rewards(state, after, jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
     assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
@@ -152,15 +175,15 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     assert float(terms["crowding"]) == 0
     reward, logged = weigh(terms, gate.params.rewards, 2)
     np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
-    near, _ = gate.rewards(state, readings([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
+    near, _ = gate.rewards(state, robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
     assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
     assert float(near["collision"]) == 0
     assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
 
 
 def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv) -> None:
-    state = dataclasses.replace(gate.reset(jax.random.PRNGKey(0)), gates=jnp.array([[3.5, 0.0]]))
-    both, one = readings([[3.8, 0, 0.3], [4.5, 0, 0.3]]), readings([[3.8, 0, 0.3], [3.7, 0, 0.3]])
+    state = dataclasses.replace(gate.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[3.5, 0.0]]))
+    both, one = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]]), robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
     fine = jnp.array(False)
     assert float(gate.outcome(state, both, fine)["success"]) == 1
     assert float(gate.outcome(state, both, ~fine)["success"]) == 0
@@ -182,13 +205,13 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     pitched = [[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]
     assert not gate_step(placed(gate, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched, state=state), still).terminated
     assert gate_step(placed(gate, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]], state=state), still).terminated
-    fallen = gate.fallen(readings([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
+    fallen = gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
     assert fallen.tolist() == [True, False]
     bumped = gate_step(placed(gate, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
 
 
-def test_diverged_world_ends_with_finite_numbers_and_is_counted(gate: QuadrupedEnv, gate_step: Any) -> None:
+def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(gate: QuadrupedEnv, gate_step: Any) -> None:
     state = gate.reset(jax.random.PRNGKey(0))
     broken = dataclasses.replace(state, data=state.data.replace(qvel=state.data.qvel.at[0].set(jnp.nan)))
     after = gate_step(broken, jnp.zeros((2, 12)))
@@ -199,32 +222,42 @@ def test_diverged_world_ends_with_finite_numbers_and_is_counted(gate: QuadrupedE
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
 
 
-def test_aid_holds_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:
+def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:
     plain = jax.vmap(gate.reset)(jax.random.split(jax.random.PRNGKey(0), 32))
-    assert not np.asarray(plain.hold).any()
-    aided = jax.vmap(lambda key: gate.reset(key, 1.0))(jax.random.split(jax.random.PRNGKey(0), 32))
-    hold = np.asarray(aided.hold)
-    assert np.all((hold > 0).sum(1) <= 1) and (hold[:, 0] > 0).any() and (hold[:, 1] > 0).any()
-    assert hold.max() <= gate.params.hold_time / gate.dt
+    assert not np.asarray(plain.frozen_steps).any()
+    assisted = jax.vmap(lambda key: gate.reset(key, 1.0))(jax.random.split(jax.random.PRNGKey(0), 32))
+    frozen = np.asarray(assisted.frozen_steps)
+    assert np.all((frozen > 0).sum(1) <= 1) and (frozen[:, 0] > 0).any() and (frozen[:, 1] > 0).any()
+    assert frozen.max() <= gate.params.frozen_time / gate.dt
 
 
 def test_randomisation_reaches_the_physics() -> None:
-    """Each world's friction, payload, motors, pushes and lag differ, and a heavier trunk sags more."""
+    """Each environment's friction, payload, motors, pushes and lag differ, and a heavier trunk sags more."""
     env = make(
-        "go1plane", impl="c", control="position", spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0), spawn_height=0.31,
+        "go1plane",
+        impl="c",
+        control="position",
+        spawn_velocity=0.0,
+        spawn_joint_scale=(1.0, 1.0),
+        spawn_height=0.31,
         randomization={
-            "friction": (0.5, 1.25), "payload": (0.0, 6.0), "center_of_mass": (-0.02, 0.02),
-            "motor_strength": (0.9, 1.1), "action_lag": 2, "push": 0.3, "observation_noise": 0.01,
+            "friction": (0.5, 1.25),
+            "payload": (0.0, 6.0),
+            "center_of_mass": (-0.02, 0.02),
+            "motor_strength": (0.9, 1.1),
+            "action_lag": 2,
+            "push": 0.3,
+            "observation_noise": 0.01,
         },
-    )  # fmt: skip
+    )
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
-    world = states.world
-    assert np.ptp(np.asarray(world.friction)) > 0.3 and set(np.asarray(world.action_lag).tolist()) == {0, 1, 2}
+    params = states.randomized
+    assert np.ptp(np.asarray(params.friction)) > 0.3 and set(np.asarray(params.action_lag).tolist()) == {0, 1, 2}
     step = jax.jit(jax.vmap(env.step))
     for _ in range(60):
         states = step(states, jnp.zeros((16, 2, 12)))
     height = np.asarray(jax.vmap(env.read)(states.data).position_w)[..., 2].ravel()
-    payload = np.asarray(world.payload).ravel()
+    payload = np.asarray(params.payload).ravel()
     assert np.corrcoef(height, payload)[0, 1] < -0.5
 
 
@@ -234,10 +267,23 @@ def test_randomisation_reaches_the_physics() -> None:
         (lambda: make("go1gat"), r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate"),
         (lambda: make("go1gate", impl="mjx"), r"impl: unknown engine 'mjx'.*allowed: auto, jax, warp, c"),
         (lambda: make("go1gate", control="comand"), r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
-        (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown parameter \(did you mean 'gate_width'\?\)"),
+        (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown name .*did you mean 'gate_width'"),
         (lambda: make("go1gate", rewards={"colision": 1.0}), r"rewards.colision.*did you mean 'collision'"),
-        (lambda: make("go1gate", gate_width="wide"), r"gate_width: 'wide' is not a number"),
-        (lambda: make("go1gate", gate_width=4.0), r"gate: width 4.0 must be between 0 and"),
+        (lambda: make("go1gate", gate_width="wide"), r"gate_width: 'wide' is not allowed; it must be a number"),
+        (lambda: make("go1gate", gate_width=-1), r"gate_width: -1 is not allowed; it must be a number greater than 0"),
+        (lambda: make("go1gate", gate_width=4.0), r"gate_width: 4.0 .* less than the width of the track, 3.0"),
+        (lambda: make("go1gate", gate_width=True), r"gate_width: True"),
+        (lambda: make("go1gate", episode_length=float("inf")), r"episode_length: inf"),
+        (lambda: make("go1gate", gate_random=(0.5, -0.1)), r"gate_random: \(0.5, -0.1\)|gate_random.*-0.1"),
+        (lambda: make("go1gate", min_height=2.0), r"min_height: 2.0 .* less than max_height, 1.5"),
+        (lambda: make("go1gate", randomization={"payload": (3, 1)}), r"randomization.payload: .*lowest"),
+        (lambda: make("go1gate", randomization={"payload": (-9, 1)}), r"randomization.payload: .*mass of the trunk"),
+        (lambda: make("go1gate", randomization={"friction": (0, 1)}), r"randomization.friction: .*greater than 0"),
+        (lambda: make("go1gate", randomization={"action_lag": 1.5}), r"randomization.action_lag: 1.5 .*an integer"),
+        (lambda: make("go1seesaw", plank_start=-0.3), r"plank_start: -0.3 .*within \+-plank_limit"),
+        (lambda: make("go1tug", radius=3.0), r"radius: 3.0 .*less than half of the arena"),
+        (lambda: make("go1revolvingdoor", gap=1.5), r"door_size: .*narrower than the gap, 1.5"),
+        (lambda: make("go1bridge", platform_x=(3.0, 4.0)), r"platform_x: .*more than a platform's length"),
         (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate is for 2"),
         (lambda: make("go1gate", num_envs=0), r"num_envs: 0 must be at least 1"),
         (lambda: make("go1plane", gait="gallop"), r"gait: unknown name 'gallop'"),
@@ -246,7 +292,7 @@ def test_randomisation_reaches_the_physics() -> None:
     ],
 )
 def test_bad_parameters_are_named(call: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(InputError, match=message):
         call()
 
 
@@ -256,7 +302,7 @@ def test_bad_actions_are_named(gate: QuadrupedEnv) -> None:
         gate.step(state, jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"action: dtype int32"):
         gate.step(state, jnp.zeros((2, 12), jnp.int32))
-    with pytest.raises(ValueError, match=r"action: holds NaN"):
+    with pytest.raises(ValueError, match=r"action: contains NaN"):
         gate.step(state, jnp.full((2, 12), jnp.nan))
     with pytest.raises(ValueError, match="num_envs: 0"):
         VectorEnv(gate, 0)
@@ -277,8 +323,181 @@ def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip().splitlines()[-1] == "[]"
-    assert mqe_jax.tasks() == (
-        "go1plane", "go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender",
-        "go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2",
-    )  # fmt: skip
+    assert set(mqe_jax.tasks()) == set(TASKS)
     assert type(make("go1bridgewrestling", impl="c", control="position")) is TASKS["go1wrestling"]
+
+
+# -- actions, noise, layouts ------------------------------------------------------------------------------------------
+
+
+def test_a_captured_constant_action_is_stepped_in_compiled_code(gate: QuadrupedEnv) -> None:
+    action = jnp.zeros((2, 12))
+    state = gate.reset(jax.random.PRNGKey(0))
+    after = jax.jit(lambda state: jax.lax.scan(lambda state, _: (gate.step(state, action), None), state, None, 2)[0])
+    assert int(after(state).step) == 2
+
+
+def test_observation_noise_spares_the_one_hots() -> None:
+    env = make("go1gate", impl="c", control="position", randomization={"observation_noise": 0.1})
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 8))
+    blocks = env.observation_layout.split(state.obs)
+    np.testing.assert_array_equal(blocks["one_hot"], np.tile(np.eye(2), (8, 1, 1)))
+    exact = jax.vmap(lambda state: env.observe(state, env.read(state.data))["gate"])(state)
+    error = np.asarray(blocks["gate"] - exact)
+    assert 0.05 < error.std() < 0.2
+
+
+def test_every_one_hot_is_marked_as_categorical() -> None:
+    for task in TASKS:
+        layout = made(task).observation_layout
+        assert [block.name for block in layout.blocks if block.categorical] == [
+            name for name in layout.names if name == "one_hot"
+        ]
+
+
+def test_a_layout_slices_packs_and_splits() -> None:
+    layout = ObservationLayout((Block("id", 1, categorical=True), Block("place", 2), Block("speed", 3)))
+    values = {"id": jnp.ones((4, 1)), "place": jnp.full((4, 2), 2.0), "speed": jnp.full((4, 3), 3.0)}
+    packed = layout.pack(values)
+    assert packed.shape == (4, 6) and layout.slice("place") == slice(1, 3) and layout.slice("speed") == slice(3, 6)
+    np.testing.assert_array_equal(packed[:, layout.slice("place")], values["place"])
+    jax.tree.map(np.testing.assert_array_equal, layout.split(packed), values)
+    np.testing.assert_array_equal(layout.continuous, [0, 1, 1, 1, 1, 1])
+    with pytest.raises(KeyError, match="unknown name 'plaice'; allowed: id, place, speed"):
+        layout.slice("plaice")
+
+
+# -- privileged observation and randomised physics --------------------------------------------------------------------
+
+
+def test_the_privileged_observation_contains_the_randomised_physics_and_gait_phase() -> None:
+    env = make(
+        "go1gate",
+        impl="c",
+        num_envs=1,
+        privileged_contact_forces=True,
+        randomization=Randomization(
+            friction=(0.5, 1.25),
+            payload=(0.0, 2.0),
+            center_of_mass=(-0.02, 0.02),
+            motor_strength=(0.9, 1.1),
+            action_lag=3,
+        ),
+    )
+    state = env.reset(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
+    for _ in range(60):  # 1.2 s: the robots have landed, and the gait of 3 Hz is at 0.6 of a cycle
+        state = step(state, jnp.zeros((2, 3)))
+    blocks = env.privileged_layout.split(state.privileged_obs)
+    assert state.privileged_obs.shape == (env.privileged_observation_size,)
+    for name in ("friction", "payload", "motor_strength"):
+        np.testing.assert_allclose(blocks[name], getattr(state.randomized, name), rtol=1e-6)
+    np.testing.assert_allclose(blocks["center_of_mass"], np.ravel(state.randomized.center_of_mass), rtol=1e-6)
+    assert float(blocks["action_lag"][0]) == int(state.randomized.action_lag)
+    angle = 2 * np.pi * 0.6
+    np.testing.assert_allclose(blocks["gait_phase"], [np.sin(angle), np.cos(angle)] * 2, atol=1e-4)
+    force = np.asarray(blocks["contact_force"]).reshape(2, 5)
+    assert np.all(force[:, 0] == 0) and np.all(force[:, 1:].sum(1) > 20)  # N; a Go1 weighs 111 N
+    np.testing.assert_allclose(blocks["robot1/position"], env.read(state.data).position_w[1], rtol=1e-6)
+
+
+def test_a_payload_moves_the_robot_as_mujoco_compiled_with_it() -> None:
+    """A payload scales the trunk's mass and inertia: free fall under motor torques as in a model so compiled."""
+    payload, env = 3.0, made("go1plane")
+    assert env.physics.impl == "c"
+    heavy = make("go1plane", impl="c", control="position", randomization={"payload": (payload, payload)})
+    state = heavy.reset(jax.random.PRNGKey(0))
+    fields = heavy.randomizer.fields(state.randomized)
+    trunk, model = heavy.index.trunk_body, heavy.compiled.model
+    factor = 1 + payload / model.body_mass[trunk[0]]
+    np.testing.assert_allclose(fields["body_inertia"][trunk], factor * model.body_inertia[trunk], rtol=1e-5)
+
+    compiled = model.__copy__()
+    compiled.body_mass[trunk] += payload
+    compiled.body_inertia[trunk] *= factor
+    data = mujoco.MjData(compiled)
+    mujoco.mj_setConst(compiled, data)
+    data.qpos[:], data.qvel[:] = state.data.qpos, state.data.qvel
+    data.qpos[heavy.index.base_qpos[:, 2]] = 2.0  # in the air
+    qpos = state.data.qpos.at[heavy.index.base_qpos[:, 2]].set(2.0)
+    data.ctrl[:] = state.data.ctrl
+    mujoco.mj_step(compiled, data, 20)
+    start = state.data.replace(qpos=qpos)
+    after = heavy.physics.step(start, state.data.ctrl, fields=fields, num_substeps=20)
+    light = heavy.physics.step(start, state.data.ctrl, num_substeps=20)
+    np.testing.assert_allclose(after.qvel, data.qvel, atol=2e-4)
+    assert np.abs(np.asarray(light.qvel) - data.qvel).max() > 1e-2
+
+
+def test_a_step_that_fills_the_contact_buffer_is_counted() -> None:
+    """Two contacts per environment on MJX-JAX, with eight feet on the ground and with none."""
+    env = make("go1gate", impl="jax", control="position", num_envs=1, contacts_per_robot=1)
+    stand = [[1.0, -0.75, 0.30], [1.0, 0.75, 0.30]]
+    standing, flying = placed(env, stand), placed(env, np.add(stand, [0, 0, 1]))
+    start = jax.tree.map(lambda *leaves: jnp.stack(leaves), standing, flying)
+    after = (
+        jax.jit(jax.vmap(env.step))
+        .lower(start, jnp.zeros((2, 2, 12)))
+        .compile(compiler_options=QUICK)(start, jnp.zeros((2, 2, 12)))
+    )
+    assert after.metrics["overflow"].tolist() == [1.0, 0.0]
+
+
+def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
+    class Fast(TASKS["go1plane"]):
+        def scene(self) -> Any:
+            return dataclasses.replace(super().scene(), timestep=0.004)
+
+    with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
+        Fast(impl="c")
+    assert Fast(impl="c", control="position").dt == pytest.approx(0.016)
+
+
+# -- recordings -------------------------------------------------------------------------------------------------------
+
+
+def test_a_divergence_is_recorded_and_replayed(gate: QuadrupedEnv, tmp_path: Any) -> None:
+    """A trunk with a huge velocity diverges, and again from the file, which holds the last episode only."""
+    actions = jax.random.uniform(jax.random.PRNGKey(0), (12, 2, 12), minval=-1.0)
+    late = dataclasses.replace(gate.reset(jax.random.PRNGKey(1)), step=jnp.int32(gate.max_steps - 2))
+    before = replay.trajectory(gate, late, actions)
+    assert np.asarray(before.step[:4]).tolist() == [498, 499, 0, 1]
+    qvel = before.data.qvel.at[2, gate.index.base_qvel[0, 0]].set(990.0)
+    thrown = dataclasses.replace(before, data=before.data.replace(qvel=qvel))
+    after = replay.trajectory(gate, jax.tree.map(lambda leaf: leaf[2], thrown), actions[2:])
+    end = int(np.flatnonzero(np.asarray(after.metrics["diverged"]))[0])  # metrics belong to the step before
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[:2], rest[:end]]), before, after)
+
+    file = tmp_path / "diverged.npz"
+    replay.save_recording(file, gate, states, actions[: 2 + end])
+    recording = replay.load_recording(file)
+    assert recording.task == "go1gate" and recording.states["step"].tolist() == list(range(end))
+    again = replay.replay(recording)
+    assert np.asarray(again.metrics["diverged"]).tolist() == [0.0] * (end - 1) + [1.0]
+    np.testing.assert_array_equal(again.data.qpos[:-1], after.data.qpos[1:end])
+    assert [path.name for path in tmp_path.iterdir()] == ["diverged.npz"]
+
+
+def test_bad_recordings_are_named(gate: QuadrupedEnv, tmp_path: Any) -> None:
+    with pytest.raises(InputError, match=r"none.npz: cannot be read as a recording"):
+        replay.load_recording(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("nothing")
+    with pytest.raises(InputError, match=r"text.npz: cannot be read as a recording"):
+        replay.load_recording(tmp_path / "text.npz")
+    states = replay.trajectory(gate, gate.reset(jax.random.PRNGKey(0)), jnp.zeros((2, 2, 12)))
+    replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
+    recording = replay.load_recording(tmp_path / "gate.npz")
+    with pytest.raises(InputError, match=r"recording of go1gate: data/qpos has shape \(38,\); expected shape"):
+        replay.replay(recording, made("go1seesaw"))
+
+
+def test_parameters_are_made_by_keyword() -> None:
+    assert GateParams(gate_width=0.7).gate_width == 0.7
+    with pytest.raises(InputError, match="gate_width: 0 is not allowed"):
+        GateParams(gate_width=0)
+    assert (
+        make(
+            "go1gate", impl="c", control="position", num_envs=np.int64(2), gate_width=np.float32(0.5)
+        ).params.gate_width
+        == 0.5
+    )

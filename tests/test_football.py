@@ -14,9 +14,8 @@ import pytest
 from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
-from mqe_jax.planners import PLANNERS
-from mqe_jax.walk_policy import default_commands
-from tests.worlds import observation, placed, still, with_object
+from mqe_jax.planners import scripted_policy
+from tests.states import made, observation, placed, stepper, still, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -24,19 +23,19 @@ TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
 
 @pytest.fixture(scope="module")
 def envs() -> dict[str, Any]:
-    return {task: make(task, impl="c", control="position") for task in TASKS}
+    return {task: made(task) for task in TASKS}
 
 
 @pytest.fixture(scope="module")
 def drawn(envs: dict[str, Any]) -> dict[str, State]:
-    """64 fresh worlds of every task."""
+    """64 initial states of every task."""
     keys = jax.random.split(jax.random.PRNGKey(0), 64)
     return {task: jax.jit(jax.vmap(env.reset))(keys) for task, env in envs.items()}
 
 
 @pytest.fixture(scope="module")
 def fresh(drawn: dict[str, State]) -> dict[str, State]:
-    """A fresh world of every task."""
+    """An initial state of every task."""
     return {task: jax.tree.map(lambda x: x[0], states) for task, states in drawn.items()}
 
 
@@ -47,7 +46,7 @@ def duel(envs: dict[str, Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def duel_step(duel: Any) -> Any:
-    return jax.jit(duel.step)
+    return stepper(duel.name)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +56,7 @@ def attack(envs: dict[str, Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def attack_step(attack: Any) -> Any:
-    return jax.jit(attack.step)
+    return stepper(attack.name)
 
 
 def with_ball(env: QuadrupedEnv, state: State, position: Any, velocity: Any = (0.0, 0.0, 0.0)) -> State:
@@ -99,8 +98,8 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
 def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
     """Rays at the height of the ball, from the field's middle outwards, end where the listed walls are."""
     model, data = duel.compiled.model, mujoco.MjData(duel.compiled.model)
-    data.qpos[duel.robot.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
-    data.qpos[duel.robot.base_qpos[:, 0]] = [3.0, 4.0]
+    data.qpos[duel.index.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
+    data.qpos[duel.index.base_qpos[:, 0]] = [3.0, 4.0]
     data.qpos[duel.objects["ball"].qpos[:3]] = [11.0, -4.0, 0.1]
     mujoco.mj_forward(model, data)
 
@@ -195,15 +194,23 @@ def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> No
 @pytest.mark.parametrize(
     ("ball", "goals"),
     [
-        ((12.01, 0.0), (1, 0)), ((12.01, 0.99), (1, 0)), ((12.9, -0.9), (1, 0)), ((11.99, 0.0), (0, 0)),
-        ((12.01, 1.01), (0, 0)), ((12.01, -1.01), (0, 0)), ((1.99, 0.0), (0, 1)), ((1.99, -0.99), (0, 1)),
-        ((2.01, 0.0), (0, 0)), ((1.99, 1.01), (0, 0)), ((7.0, 0.0), (0, 0)),
+        ((12.01, 0.0), (1, 0)),
+        ((12.01, 0.99), (1, 0)),
+        ((12.9, -0.9), (1, 0)),
+        ((11.99, 0.0), (0, 0)),
+        ((12.01, 1.01), (0, 0)),
+        ((12.01, -1.01), (0, 0)),
+        ((1.99, 0.0), (0, 1)),
+        ((1.99, -0.99), (0, 1)),
+        ((2.01, 0.0), (0, 0)),
+        ((1.99, 1.01), (0, 0)),
+        ((7.0, 0.0), (0, 0)),
     ],
-)  # fmt: skip
+)
 def test_goals_at_both_ends(duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
     state = with_ball(duel, fresh[duel.name], ball)
     robots = duel.read(state.data)
-    np.testing.assert_array_equal(duel.ahead(state, robots), np.array(goals, bool))
+    np.testing.assert_array_equal(duel.leading(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
     outcome = duel.outcome(state, robots, NO)
     assert [float(outcome[f"team{team}/win"]) for team in (0, 1)] == list(goals)
@@ -217,7 +224,7 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
     env = envs["go1football-2vs2"]
     state = fresh[env.name]
     before = with_ball(env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0))
-    task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.gates)
+    task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.anchors)
     np.testing.assert_allclose(task.goal, [5, 5], atol=1e-5)
     np.testing.assert_allclose(task.robot, [2, 3], atol=1e-5)
     # The ball at (8, 0): 4 m from team 0's goal (+1), 6 m from team 1's (-1): 1 - (-1) = 2.
@@ -290,14 +297,14 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
         ((11.0, 0.0), np.pi, (7.0, 0.0), (0.5, 0.0, 0.0)),
         # The ball is behind it, 1 m from the goal: back to 0.6 m.
         ((9.0, 0.0), np.pi, (11.0, 0.0), (-0.5, 0.0, 0.0)),
-        # Facing +x of the world it must turn, the short way and at full rate.
+        # Facing +x it must turn, the short way and at full rate.
         ((9.0, 0.0), 0.1, (7.0, 0.0), (0.0, 0.0, 1.0)),
         ((9.0, 0.0), -0.1, (7.0, 0.0), (0.0, 0.0, -1.0)),
         # 0.15 rad off: half of full rate, also across the cut at pi.
         ((9.0, 0.0), np.pi - 0.15, (7.0, 0.0), (0.0, 0.0, 0.5)),
         ((9.0, 0.0), -np.pi + 0.15, (7.0, 0.0), (0.0, 0.0, -0.5)),
     ],
-)  # fmt: skip
+)
 def test_the_law_of_the_defender_by_hand(position: Any, yaw: float, ball: Any, move: Any) -> None:
     law = defend(jnp.array(position), jnp.array(yaw), jnp.array(ball), jnp.array([12.0, 0.0]))
     np.testing.assert_allclose(law, move, atol=1e-5)
@@ -327,11 +334,11 @@ def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, at
         assert np.linalg.norm(place - target) < 0.35
 
 
-def test_an_idle_defender_is_told_to_stand(attack: Any, fresh: Any) -> None:
+def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> None:
     state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
     idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
     robots = attack.read(state.data)
-    rest = default_commands()
+    rest = idle.controller.default_commands
     np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
     told = np.asarray(attack.npc_commands(state, robots))[0]
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
@@ -362,16 +369,16 @@ def test_wrong_numbers_of_robots_are_named() -> None:
 
 def test_the_planner_dribbles_to_the_goal() -> None:
     """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --planner scripted` measures many."""
-    worlds = make("go1football-1vs1", impl="c", num_envs=4)
-    plan = jax.vmap(PLANNERS[worlds.name])
+    env = make("go1football-1vs1", impl="c", num_envs=4)
+    plan = jax.vmap(scripted_policy(env))
 
     def step(state: State, _: None) -> tuple[State, jax.Array]:
-        state = jax.vmap(worlds.step)(state, plan(state.obs).at[:, 1].set(0.0))
-        return state, jax.vmap(worlds.object_pose, (0, None))(state.data, "ball")[:, 0]
+        state = jax.vmap(env.step)(state, plan(state.obs).at[:, 1].set(0.0))
+        return state, jax.vmap(env.object_pose, (0, None))(state.data, "ball")[:, 0]
 
     @jax.jit
     def play(key: jax.Array) -> jax.Array:
-        return jax.lax.scan(step, jax.vmap(worlds.reset)(jax.random.split(key, 4)), None, 400)[1]
+        return jax.lax.scan(step, jax.vmap(env.reset)(jax.random.split(key, 4)), None, 400)[1]
 
     furthest = np.asarray(play(jax.random.PRNGKey(0))).max(0)
     assert np.median(furthest) > 11.0  # from 7.0, past the opponent at 10.0

@@ -15,25 +15,15 @@ from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.objects import Cylinder, Door
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import observation, placed, still, terms_of
+from mqe_jax.terrain import Plane, SpawnArea, Track
+from tests.states import made, observation, placed, stepper, still, terms_of
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
-ENVS: dict[str, Any] = {}
-STEPS: dict[str, Any] = {}
 PI = np.pi
 
 
-def env_of(task: str) -> Any:
-    """The task on the C engine, made once."""
-    if task not in ENVS:
-        ENVS[task] = make(task, impl="c", control="position")
-        STEPS[task] = jax.jit(ENVS[task].step)
-    return ENVS[task]
-
-
 def stepped(env: QuadrupedEnv, state: Any) -> Any:
-    return STEPS[env.name](state, still(env))
+    return stepper(env.name)(state, still(env))
 
 
 def result(env: Any, state: Any) -> tuple[float, float]:
@@ -47,21 +37,21 @@ def result(env: Any, state: Any) -> tuple[float, float]:
 
 @pytest.mark.parametrize("task", MATCHES)
 def test_teams_and_zero_sum(task: str) -> None:
-    env = env_of(task)
+    env = made(task)
     half = env.num_agents // 2
     assert env.teams == (tuple(range(half)), tuple(range(half, 2 * half)))
     state = env.reset(jax.random.PRNGKey(0))
     for seed in range(3):
         action = jax.random.uniform(jax.random.PRNGKey(seed), (env.num_agents, 12), minval=-1.0)
-        state = STEPS[task](state, action)
+        state = stepper(task)(state, action)
         assert float(jnp.sum(state.reward)) == pytest.approx(0.0, abs=1e-5)
         assert np.abs(np.asarray(state.reward)).max() < 1
 
 
 @pytest.mark.parametrize("task", MATCHES)
-def test_both_sides_see_the_same_of_a_mirrored_world(task: str) -> None:
+def test_both_sides_observe_the_same_of_a_mirrored_state(task: str) -> None:
     """Robots and objects half turned (or reflected) and the teams swapped: the observations are swapped."""
-    env = env_of(task)
+    env = made(task)
     random = np.random.default_rng(0)
     agents = env.num_agents
     position = random.uniform([1, -2, 0.3], [4, 2, 0.5], (agents, 3))
@@ -91,15 +81,15 @@ def test_both_sides_see_the_same_of_a_mirrored_world(task: str) -> None:
 def test_actions_are_mirrored_where_left_and_right_are_swapped() -> None:
     command = TASKS["go1revolvingdoor"](impl="c")
     np.testing.assert_allclose(
-        command.to_world(jnp.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]])), [[0.1, 0.2, 0.3], [0.1, -0.2, -0.3]]
+        command.unmirror_action(jnp.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]])), [[0.1, 0.2, 0.3], [0.1, -0.2, -0.3]]
     )
-    env = env_of("go1revolvingdoor")
+    env = made("go1revolvingdoor")
     legs = jnp.arange(12.0)[None] / 12
-    mirrored = 12 * np.asarray(env.to_world(jnp.tile(legs, (2, 1))))
+    mirrored = 12 * np.asarray(env.unmirror_action(jnp.tile(legs, (2, 1))))
     np.testing.assert_allclose(mirrored[0], np.arange(12))
     np.testing.assert_allclose(mirrored[1], [-3, 4, 5, -0, 1, 2, -9, 10, 11, -6, 7, 8], atol=1e-5)
-    turned = env_of("go1tug")
-    np.testing.assert_allclose(turned.to_world(jnp.tile(legs, (2, 1)))[1], legs[0])
+    turned = made("go1tug")
+    np.testing.assert_allclose(turned.unmirror_action(jnp.tile(legs, (2, 1)))[1], legs[0])
 
 
 # ---------------------------------------------------------------- Push Cylinder
@@ -115,7 +105,7 @@ def tug_state(env: Any, y: float) -> Any:
 
 
 def test_tug_observation_and_rewards() -> None:
-    env = env_of("go1tug")
+    env = made("go1tug")
     state = tug_state(env, 0.13)
     obs = observation(env, state)
     np.testing.assert_allclose(obs[0], [1.6, -1.3, 0.3, 0, 0, PI / 2, 0.13, 0, 1.43, 0.08], atol=1e-5)
@@ -132,7 +122,7 @@ def test_tug_observation_and_rewards() -> None:
 
 
 def test_tug_result_and_end() -> None:
-    env = env_of("go1tug")
+    env = made("go1tug")
     assert result(env, tug_state(env, 0.13)) == (1, 0)
     assert result(env, tug_state(env, -0.13)) == (0, 1)
     assert result(env, tug_state(env, 0.05)) == (0, 0)
@@ -154,7 +144,7 @@ def test_the_arena_moves_the_middle_and_spawn_noise_counts() -> None:
 
 
 def test_a_diverged_match_is_a_draw() -> None:
-    env = env_of("go1wrestling")
+    env = made("go1wrestling")
     state = env.reset(jax.random.PRNGKey(0))
     state = dataclasses.replace(state, data=state.data.replace(qvel=jnp.full_like(state.data.qvel, jnp.nan)))
     after = stepped(env, state)
@@ -165,7 +155,7 @@ def test_a_diverged_match_is_a_draw() -> None:
 
 @pytest.mark.parametrize("task", ["go1revolvingdoor", "go1wrestling", "go1bridge"])
 def test_a_duel_is_seen_by_both_in_their_own_frames(task: str) -> None:
-    env = env_of(task)
+    env = made(task)
     obs = observation(env, placed(env, [[1.0, -0.5, 0.3], [2.0, 0.7, 0.4]], [[0.1, 0.2, 0.3], [0, 0, -1.0]]))
     first, second = [1.0, -0.5, 0.3, 0.1, 0.2, 0.3], [2.0, 0.7, 0.4, 0, 0, -1.0]
     x = 2 * env.center[0]
@@ -185,7 +175,7 @@ def test_a_platform_above_the_robots_is_refused(task: str, top: str) -> None:
 
 def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_the_arena() -> None:
     scene = compile_scene(
-        Scene(Track((Init(2.0),), walled=False), num_robots=1, objects=(Cylinder("can", position=(9.0, 0.0)),))
+        Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects=(Cylinder("can", position=(9.0, 0.0)),))
     )
     index = scene.objects["can"]
     way = {}
@@ -203,7 +193,7 @@ def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_t
 
 
 def test_door_rewards_result_and_end() -> None:
-    env = env_of("go1revolvingdoor")
+    env = made("go1revolvingdoor")
     state = placed(env, [[3.9, 0.0, 0.3], [3.0, 0.5, 0.3]])
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, distance=jnp.array([0.08, 1.0])))
     terms, reward = terms_of(env, state)
@@ -224,7 +214,11 @@ def test_door_rewards_result_and_end() -> None:
 
 def test_a_door_turns_about_its_middle_and_lets_one_side_through_at_a_time() -> None:
     scene = compile_scene(
-        Scene(Track((Init(2.0), Plane(4.0)), walled=False), num_robots=1, objects=(Door("door", position=(4.0, 0.0)),))
+        Scene(
+            Track((SpawnArea(2.0), Plane(4.0)), walled=False),
+            num_robots=1,
+            objects=(Door("door", position=(4.0, 0.0)),),
+        )
     )
     index, data = scene.objects["door"], mujoco.MjData(scene.model)
     body = scene.model.body(index.body)
@@ -245,7 +239,7 @@ def ring(env: Any, first: Any, second: Any, roll: float = 0.0) -> Any:
 
 
 def test_wrestling_rewards_result_and_end() -> None:
-    env = env_of("go1wrestling")
+    env = made("go1wrestling")
     inside, out = [3.1, -0.5, 0.7], [3.1, 1.75, 0.7]
     play = ring(env, inside, [3.1, 0.6, 0.7])
     assert result(env, play) == (0, 0) and not stepped(env, play).terminated
@@ -261,7 +255,7 @@ def test_wrestling_rewards_result_and_end() -> None:
 
 
 def test_the_ring_carries_robots_and_its_platform_is_as_large_as_listed() -> None:
-    env = env_of("go1wrestling")
+    env = made("go1wrestling")
     geom = env.compiled.model.geom(env.objects["platform"].geom)
     np.testing.assert_allclose(2 * geom.size, [4.37, 4.37, 0.5])
     state = ring(env, [3.1, -1.0, 0.74], [3.1, 1.0, 0.74])
@@ -275,7 +269,7 @@ def test_the_ring_carries_robots_and_its_platform_is_as_large_as_listed() -> Non
 
 
 def test_bridge_rewards_result_and_end() -> None:
-    env = env_of("go1bridge")
+    env = made("go1bridge")
     facing = [[0, 0, 0], [0, 0, PI]]
     apart = placed(env, [[3.1, 0, 1.32], [6.9, 0, 1.32]], facing)
     np.testing.assert_allclose(terms_of(env, apart)[1], [0, 0])
@@ -295,7 +289,7 @@ def test_bridge_rewards_result_and_end() -> None:
 
 
 def test_the_bridge_carries_a_robot_and_its_side_does_not() -> None:
-    env = env_of("go1bridge")
+    env = made("go1bridge")
     model = env.compiled.model
     np.testing.assert_allclose(2 * model.geom(env.objects["platform0"].geom).size, [1.3, 2.5, 1.02])
     np.testing.assert_allclose(2 * model.geom(env.objects["deck"].geom).size[:2], [4.0, 0.7])  # from 3.0 to 7.0
@@ -312,7 +306,7 @@ def test_the_bridge_carries_a_robot_and_its_side_does_not() -> None:
     [("go1tug", (0, 2)), ("go1revolvingdoor", (0, 2)), ("go1wrestling", (0, 2)), ("go1bridge", (0, 2))],
 )
 def test_robots_start_as_listed(task: str, colors: tuple[int, int]) -> None:
-    env = env_of(task)
+    env = made(task)
     spawn = np.asarray(jax.vmap(env.spawn)(jax.random.split(jax.random.PRNGKey(0), 64)))
     mean = {
         "go1tug": [[1.6, -2.5, 0.34, PI / 2], [1.6, 2.5, 0.34, -PI / 2]],

@@ -16,26 +16,26 @@ from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import flock
 from mqe_jax.objects import Ball, Box, Sheep
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import scripted_policy
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import with_object
+from mqe_jax.terrain import Plane, SpawnArea, Track
+from tests.states import made, with_object
 
 STEP = 0.02
 
 
 @pytest.fixture(scope="module")
 def box_env() -> QuadrupedEnv:
-    return make("go1pushbox", impl="c", control="position")
+    return made("go1pushbox")
 
 
 @pytest.fixture(scope="module")
 def herd() -> Any:
-    return make("go1sheep-hard", impl="c", control="position")
+    return made("go1sheep-hard")
 
 
 def plain(*objects: objects.Object) -> Any:
-    return compile_scene(Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
+    return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
 
 
 def test_a_ball_that_was_kicked_rolls_and_comes_to_rest() -> None:
@@ -90,26 +90,34 @@ def test_one_sheep_flees_from_a_dog_at_08_m_and_not_at_2_m() -> None:
 def test_the_law_of_the_flock_by_hand() -> None:
     """One sheep at rest 0.5 m from a dog: q = 0.25, 0.2 * 0.5 / 0.25^1.4 = 0.6964 m/s, less 0.0981 m/s of friction."""
     velocity = flock(
-        jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)), jnp.array([[0.5, 0.0]]),
-        restlessness=0.0, step=STEP,
-    )  # fmt: skip
+        jax.random.PRNGKey(0),
+        jnp.array([[1.0, 0.0]]),
+        jnp.zeros((1, 2)),
+        jnp.array([[0.5, 0.0]]),
+        restlessness=0.0,
+        step=STEP,
+    )
     np.testing.assert_allclose(velocity, [[0.2 * 0.5 / 0.25**1.4 - 0.0981, 0.0]], atol=1e-4)
     fast = flock(
-        jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)), jnp.array([[0.9, 0.0]]),
-        restlessness=0.0, step=STEP,
-    )  # fmt: skip
+        jax.random.PRNGKey(0),
+        jnp.array([[1.0, 0.0]]),
+        jnp.zeros((1, 2)),
+        jnp.array([[0.9, 0.0]]),
+        restlessness=0.0,
+        step=STEP,
+    )
     np.testing.assert_allclose(fast, [[2.0 - 0.0981, 0.0]], atol=1e-4)  # the top speed
 
 
 def test_a_sheep_by_itself_wanders() -> None:
-    restlessness = make("go1sheep-easy", impl="c", control="position").params.restlessness
+    restlessness = made("go1sheep-easy").params.restlessness
     track = [run_flock([[0.0, 0.0]], [[-20.0, 0.0]], 750, restlessness, seed)[:, 0] for seed in range(8)]
     ways = [np.linalg.norm(way[-1] - way[0]) for way in track]
     assert 0.03 < np.mean(ways) < 1.0
 
 
 def test_sheep_observation(herd: Any) -> None:
-    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), gates=jnp.array([[8.5, 0.4]]))
+    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[8.5, 0.4]]))
     for number in range(9):
         state = with_object(herd, state, f"sheep{number}", [number, -0.1 * number])
     robots = herd.read(state.data)
@@ -134,7 +142,7 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     env: Any = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
     state = env.reset(jax.random.PRNGKey(0))
     state = with_object(env, state, "sheep0", [2.0, 1.0])
-    index = env.robot.base_qpos
+    index = env.index.base_qpos
     qpos = state.data.qpos.at[index[0, :2]].set(jnp.array([1.2, 1.0])).at[index[1, :2]].set(jnp.array([0.5, -1.5]))
     state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
     step = jax.jit(env.step)
@@ -151,7 +159,7 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
 
 
 def test_pushbox_rewards_and_success(box_env: Any) -> None:
-    state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), gates=jnp.array([[4.5, 0.2]]))
+    state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[4.5, 0.2]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.float32(4.47)))
     robots, no = box_env.read(state.data), jnp.array(False)
     before = with_object(box_env, state, "box", [4.49, 0.2, 0.5, 1, 0, 0, 0])
@@ -163,9 +171,9 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
     reward, _ = weigh(box_env.rewards(behind, robots, no)[0], box_env.params.rewards, 2)
     np.testing.assert_allclose(reward, [10 * 0.05 + 1] * 2, atol=1e-4)
     assert float(box_env.outcome(behind, robots, no)["success"]) == 1
-    # 4.47 m is where the box was last; it is told how far that is from where it started.
+    # The box was last at 4.47 m; its displacement counts from its initial position.
     start = dataclasses.replace(behind, task=dataclasses.replace(behind.task, start=jnp.float32(2.2)))
-    assert float(box_env.outcome(start, robots, no)["success/way"]) == pytest.approx(2.27, abs=1e-4)
+    assert float(box_env.outcome(start, robots, no)["success/distance"]) == pytest.approx(2.27, abs=1e-4)
 
 
 def test_pushbox_observation(box_env: Any) -> None:
@@ -174,20 +182,20 @@ def test_pushbox_observation(box_env: Any) -> None:
     obs = np.asarray(box_env.observation_layout.pack(box_env.observe(state, robots)))
     info = np.asarray(robots.base_info)
     for agent in range(2):
-        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.gates[0])]
+        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.anchors[0])]
         np.testing.assert_allclose(obs[agent], [*expected, 3.0, 0.4, 0.8, 0, 0, 0.6], atol=1e-6)
 
 
 def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
-    easy: Any = make("go1sheep-easy", impl="c", control="position")
-    state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), gates=jnp.array([[5.0, 0.3]]))
+    easy = made("go1sheep-easy")
+    state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[5.0, 0.3]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.array([4.98])))
     state = with_object(easy, state, "sheep0", [5.01, 0.3])
     robots, no = easy.read(state.data), jnp.array(False)
     reward, _ = weigh(easy.rewards(state, robots, no)[0], easy.params.rewards, 2)
     np.testing.assert_allclose(reward, [1 + 2 * 0.03] * 2, atol=1e-4)
 
-    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), gates=jnp.array([[8.5, 0.0]]))
+    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[8.5, 0.0]]))
     for number in range(9):  # two are through; the others stand 3 m and 4 m away from the gate: hypot = 5
         state = with_object(herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0])
     reward, _ = weigh(herd.rewards(state, herd.read(state.data), no)[0], herd.params.rewards, 2)
@@ -201,7 +209,7 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
     rows = np.stack(np.meshgrid([3.5, 5.0, 6.5], [-1.5, 0.0, 1.5], indexing="ij"), -1).reshape(9, 2)
     assert np.abs(sheep - rows).max() <= 0.3 and np.abs(sheep - rows).max() > 0.25
     assert herd.observation_size == 34
-    assert np.all(np.abs(np.asarray(states.gates)[:, 0] - [8.5, 0.0]) <= [0.0, 1.0])
+    assert np.all(np.abs(np.asarray(states.anchors)[:, 0] - [8.5, 0.0]) <= [0.0, 1.0])
 
 
 @pytest.mark.parametrize(("task", "share"), [("go1gate", 0.9), ("go1sheep-hard", 0.6)])
@@ -209,9 +217,9 @@ def test_the_planner_wins(task: str, share: float) -> None:
     """Through the walk policy, over a few episodes; `mqe eval TASK --planner scripted` measures many."""
     from mqe_jax.train.evaluate import evaluate
 
-    worlds = VectorEnv(make(task, impl="c", num_envs=16), 16)
-    plan = jax.vmap(PLANNERS[task])
-    result = evaluate(worlds, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
+    batch = VectorEnv(make(task, impl="c", num_envs=16), 16)
+    plan = jax.vmap(scripted_policy(batch.env))
+    result = evaluate(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
     assert result.to_dict()["success_rate"] >= share
 
 
@@ -227,5 +235,5 @@ def test_two_robots_push_the_box_clearly_faster_than_one() -> None:
     from pathlib import Path
 
     pushed = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "push_box_alone.py"))["pushed"]
-    alone, together = pushed(1, worlds=8), pushed(2, worlds=8)
+    alone, together = pushed(1, num_envs=8), pushed(2, num_envs=8)
     assert 0.1 < alone < 0.7 * together

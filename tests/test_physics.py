@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import jax
@@ -11,17 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import make, physics, robots
+from mqe_jax import make, physics
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
+from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 
 NEEDS_GPU = pytest.mark.gpu
 IMPLS = ["c", "jax", pytest.param("warp", marks=NEEDS_GPU)]
-# The acceptance run is MQE_SOAK=64x2000; by default a short one.
-SOAK = tuple(int(n) for n in os.environ.get("MQE_SOAK", "8x60").split("x"))
 
 
 @pytest.fixture(scope="module")
@@ -33,40 +30,28 @@ def standing(scene: CompiledScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A robot that has settled on its feet on MuJoCo itself: qpos, qvel, ctrl."""
     model = scene.model
     data = mujoco.MjData(model)
-    data.qpos[scene.robot.base_qpos[0]] = [0, 0, 0.33, 1, 0, 0, 0]
-    data.qpos[scene.robot.joint_qpos[0]] = go1.DEFAULT_JOINTS
-    data.ctrl[scene.robot.actuator[0]] = go1.DEFAULT_JOINTS
+    data.qpos[scene.index.base_qpos[0]] = [0, 0, 0.33, 1, 0, 0, 0]
+    data.qpos[scene.index.joint_qpos[0]] = GO1.default_joints
+    data.ctrl[scene.index.actuator[0]] = GO1.default_joints
     mujoco.mj_step(model, data, 300)
     return data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()
 
 
 def test_robot_has_the_masses_and_inertias_of_a_go1(plane: CompiledScene) -> None:
     model = plane.model
-    assert model.body_mass.sum() == pytest.approx(11.31, abs=0.05)
     trunk = model.body("robot0/trunk")
     assert trunk.mass[0] == pytest.approx(4.8)
     tensor = np.diag(trunk.inertia)
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, trunk.iquat)
     turn = turn.reshape(3, 3)
-    np.testing.assert_allclose(turn @ tensor @ turn.T, go1.TRUNK.matrix(), atol=1e-6)
+    np.testing.assert_allclose(turn @ tensor @ turn.T, GO1.trunk.matrix(), atol=1e-6)
     left, right = model.body("robot0/FL_thigh"), model.body("robot0/FR_thigh")
     np.testing.assert_allclose(left.ipos, [-0.0035, -0.0189, -0.0327])
     np.testing.assert_allclose(right.ipos, [-0.0035, 0.0189, -0.0327])
     calf = model.body("robot0/RL_calf")
     assert calf.mass[0] == pytest.approx(0.158 + 0.06)
     assert calf.ipos[2] == pytest.approx((0.158 * -0.1223 + 0.06 * -0.213) / 0.218)
-
-
-def test_closed_form_feet_are_where_mujoco_puts_them(plane: CompiledScene) -> None:
-    model, index = plane.model, plane.robot
-    data = mujoco.MjData(model)
-    joints = np.random.default_rng(0).uniform(go1.JOINT_LOWER, go1.JOINT_UPPER)
-    data.qpos[index.base_qpos[0]] = [1.0, 2.0, 3.0, 1, 0, 0, 0]
-    data.qpos[index.joint_qpos[0]] = joints
-    mujoco.mj_kinematics(model, data)
-    expected = data.geom_xpos[index.foot_geom[0]] - [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(robots.foot_positions(jnp.asarray(joints)), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("impl", IMPLS)
@@ -89,21 +74,29 @@ def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> N
 
 def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
     """Trunk x, y, z of all robots (N, A, 3) and gate centres (N, 1, 2)."""
-    position = np.asarray(state.data.qpos)[:, env.robot.base_qpos[:, :3]]
-    return position, np.asarray(state.gates)
+    position = np.asarray(state.data.qpos)[:, env.index.base_qpos[:, :3]]
+    return position, np.asarray(state.anchors)
 
 
-@pytest.mark.parametrize("impl", IMPLS)
-def test_random_actions_break_nothing(impl: str) -> None:
+@pytest.mark.parametrize(
+    ("impl", "num_envs", "steps"),
+    [
+        ("c", 8, 60),
+        ("jax", 2, 20),
+        pytest.param("warp", 8, 60, marks=NEEDS_GPU),
+        *(pytest.param(impl, 64, 2000, marks=pytest.mark.soak) for impl in ("c", "jax")),
+        pytest.param("warp", 64, 2000, marks=[NEEDS_GPU, pytest.mark.soak]),
+    ],
+)
+def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> None:
     """No NaN, and no robot passes through a wall or the floor, under full-range joint targets."""
-    worlds, steps = SOAK if impl != "jax" or "MQE_SOAK" in os.environ else (2, 20)
-    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=worlds)
-    vector = VectorEnv(env, worlds)
+    env = make("go1gate", impl=impl, control="position", end_on_collision=False, num_envs=num_envs)
+    vector = VectorEnv(env, num_envs)
 
     def advance(state: Any, key: jax.Array) -> tuple[Any, Any]:
-        action = jax.random.uniform(key, (worlds, 2, 12), minval=-1.0, maxval=1.0)
+        action = jax.random.uniform(key, (num_envs, 2, 12), minval=-1.0, maxval=1.0)
         state = vector.step(state, action)
-        position = state.data.qpos[:, env.robot.base_qpos[:, :3]]
+        position = state.data.qpos[:, env.index.base_qpos[:, :3]]
         overflow = jnp.any(jax.vmap(vector.env.physics.overflow)(state.data))
         return state, (position, state.metrics["diverged"], jnp.all(jnp.isfinite(state.obs)), overflow)
 
@@ -121,25 +114,25 @@ def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
     """Two robots that overlap touch each other; a robot lying on its belly feels the ground."""
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
     state = env.reset(jax.random.PRNGKey(0))
-    index = env.robot
+    index = env.index
     near = state.data.qpos.at[index.base_qpos[0, :3]].set(jnp.array([1.0, 0.0, 0.30]))
     near = near.at[index.base_qpos[1, :3]].set(jnp.array([1.0, 0.10, 0.30]))
     low = state.data.qpos.at[index.base_qpos[0, 2]].set(0.05)
     both = jax.vmap(lambda qpos: env.reset(jax.random.PRNGKey(0)).data.replace(qpos=qpos))(jnp.stack([near, low]))
     ctrl = jnp.asarray(state.data.ctrl)
     after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)))(both)
-    readings = jax.vmap(env.read)(after)
-    assert bool(readings.touching[0, 0, 1]) and bool(readings.touching[0, 1, 0])
-    assert float(readings.trunk_force[0].min()) > 1.0
-    assert not bool(readings.touching[1].any())
-    assert float(readings.trunk_force[1, 0]) > 1.0 and float(readings.trunk_force[1, 1]) == 0.0
+    robot_state = jax.vmap(env.read)(after)
+    assert bool(robot_state.touching[0, 0, 1]) and bool(robot_state.touching[0, 1, 0])
+    assert float(robot_state.trunk_force[0].min()) > 1.0
+    assert not bool(robot_state.touching[1].any())
+    assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
 
 
 def test_gate_moves_with_the_world() -> None:
     """Walls stand where each world's gate was drawn, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
-    gap = states.gates[:, 0]
+    gap = states.anchors[:, 0]
     assert len(np.unique(np.asarray(gap[:, 0]))) == 3
     assert np.all(np.abs(np.asarray(gap) - [3.5, 0.0]) <= 0.5)
     right, left = states.data.mocap_pos[:, 0], states.data.mocap_pos[:, 1]

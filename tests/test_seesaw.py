@@ -16,10 +16,10 @@ from mqe_jax.envs import State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
-from mqe_jax.terrain import Init, Plane, Track
-from tests.worlds import angles, placed, readings
+from mqe_jax.terrain import Plane, SpawnArea, Track
+from tests.states import angles, made, placed, robot_state, stepper
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
@@ -27,12 +27,12 @@ WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
 
 @pytest.fixture(scope="module")
 def env() -> Any:
-    return make("go1seesaw", impl="c", control="position")
+    return made("go1seesaw")
 
 
 @pytest.fixture(scope="module")
 def step(env: Any) -> Any:
-    return jax.jit(env.step)
+    return stepper(env.name)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def angle(env: Any, state: State) -> float:
 def test_the_scene_is_as_listed(env: Any) -> None:
     model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
-    start = np.asarray(states.data.qpos)[:, env.robot.base_qpos[:, :3]]
+    start = np.asarray(states.data.qpos)[:, env.index.base_qpos[:, :3]]
     assert np.abs(start - [[1.0, -0.75, 0.42], [1.0, 0.75, 0.42]]).max((0, 1)) == pytest.approx([0.1, 0.1, 0], abs=0.02)
     assert env.params.gait == "pace" and env.params.episode_length == 10
     assert env.compiled.layout.anchors == () and env._scene.track.length == 10 and env._scene.track.width == 3
@@ -73,7 +73,9 @@ def test_the_scene_is_as_listed(env: Any) -> None:
 def test_what_turns_has_its_centre_of_mass_in_its_hinge(env: Any) -> None:
     scenes = [(env.compiled, "seesaw", 100.0)]
     door = Door("door", position=(2.6, 0.3))
-    scenes.append((compile_scene(Scene(Track((Init(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0))
+    scenes.append(
+        (compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0)
+    )
     for compiled, name, mass in scenes:
         model, body = compiled.model, compiled.objects[name].body
         assert model.body_mass[body] == mass
@@ -82,7 +84,7 @@ def test_what_turns_has_its_centre_of_mass_in_its_hinge(env: Any) -> None:
 
 
 def test_observation(env: Any, fresh: State) -> None:
-    both = readings([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], pitch=(-0.2, 0.0), yaw=(0.0, 0.4))
+    both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], pitch=(-0.2, 0.0), yaw=(0.0, 0.4))
     obs = env.observation_layout.pack(env.observe(fresh, both))
     first, second = [1, 2, 0.3, 0, -0.2, 0], [4, 5, 0.6, 0, 0, 0.4]
     np.testing.assert_allclose(obs, [[1, 0, *first, *second], [0, 1, *second, *first]], atol=1e-6)
@@ -93,37 +95,39 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
     no, yes = jnp.array(False), jnp.array(True)
     state = dataclasses.replace(fresh, task=dataclasses.replace(fresh.task, x=jnp.array([7.70, 3.90])))
 
-    def reward(after: RobotReadings, collision: Any = no) -> tuple[Any, Any]:
+    def reward(after: RobotState, collision: Any = no) -> tuple[Any, Any]:
         terms, task = env.rewards(state, after, collision)
         total, logged = weigh(terms, env.params.rewards, 2)
         assert float(logged["average_step_reward"]) == float(total[0]) == float(total[1])
         return total[0], (terms, task)
 
     # One stands on the platform: heights 1.3 + 0.45 - 0.56; ways 0.02 - 0.01; squares 0.01 + 0.04 - 0.5.
-    up = readings([[7.72, 0.1, 1.3], [3.89, -0.2, 0.45]])
+    up = robot_state([[7.72, 0.1, 1.3], [3.89, -0.2, 0.45]])
     total, (_, task) = reward(up)
     assert float(total) == pytest.approx(10 + 1.19 + 5 * 0.01 + 0.5 * 0.45, abs=1e-4)
     np.testing.assert_allclose(task.x, [7.72, 3.89], rtol=1e-6)
     assert float(reward(up, yes)[0]) == pytest.approx(11.465 - 2, abs=1e-4)
     # Before the platform, or too low: nothing for success. Both on it: twice.
     for position, count in (
-        ([[7.68, 0, 1.3], [3.9, 0, 0.4]], 0), ([[7.8, 0, 1.15], [3.9, 0, 0.4]], 0), ([[7.8, 0, 1.3]] * 2, 2)
-    ):  # fmt: skip
-        assert float(reward(readings(position))[1][0]["success"]) == count
+        ([[7.68, 0, 1.3], [3.9, 0, 0.4]], 0),
+        ([[7.8, 0, 1.15], [3.9, 0, 0.4]], 0),
+        ([[7.8, 0, 1.3]] * 2, 2),
+    ):
+        assert float(reward(robot_state(position))[1][0]["success"]) == count
     # A fall, by roll and by nothing less.
-    assert float(reward(readings(SPAWN, roll=(0.0, 0.81)))[1][0]["fall"]) == 1
-    assert float(reward(readings(SPAWN, roll=(-0.79, 0.0), pitch=(0.9, 0.0)))[1][0]["fall"]) == 0
-    fallen = readings([[7.70, 0.5, 0.28], [3.90, -0.5, 0.28]], roll=(0.9, 0.0))
+    assert float(reward(robot_state(SPAWN, roll=(0.0, 0.81)))[1][0]["fall"]) == 1
+    assert float(reward(robot_state(SPAWN, roll=(-0.79, 0.0), pitch=(0.9, 0.0)))[1][0]["fall"]) == 0
+    fallen = robot_state([[7.70, 0.5, 0.28], [3.90, -0.5, 0.28]], roll=(0.9, 0.0))
     assert float(reward(fallen)[0]) == pytest.approx(-2, abs=1e-4)
     # 0.3 m and 0.4 m from each other is 0.5 m, which is not closer; 0.4 m is: -0.25 / 0.16.
-    assert float(reward(readings([[4.0, 0, 0.3], [4.31, 0.4, 0.3]]))[1][0]["crowding"]) == 0
-    close = readings([[7.70, 0.5, 0.28], [7.30, 0.5, 0.28]])
+    assert float(reward(robot_state([[4.0, 0, 0.3], [4.31, 0.4, 0.3]]))[1][0]["crowding"]) == 0
+    close = robot_state([[7.70, 0.5, 0.28], [7.30, 0.5, 0.28]])
     assert float(reward(close)[0]) == pytest.approx(5 * (7.30 - 3.90) - 0.25 / 0.16, abs=1e-3)
 
 
 def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: State) -> None:
     fine = jnp.array(False)
-    up, below = readings([[3.9, 0, 0.45], [8.0, 0, 1.3]]), readings([[3.9, 0, 0.45], [8.0, 0, 0.3]])
+    up, below = robot_state([[3.9, 0, 0.45], [8.0, 0, 1.3]]), robot_state([[3.9, 0, 0.45], [8.0, 0, 0.3]])
     assert float(env.outcome(fresh, up, fine)["success"]) == 1
     assert float(env.outcome(fresh, up, ~fine)["success"]) == 0
     assert float(env.outcome(fresh, below, fine)["success"]) == 0
@@ -147,14 +151,14 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
     low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
-    qpos = low.data.qpos.at[env.robot.joint_qpos[0, 1::3]].set(np.pi)
+    qpos = low.data.qpos.at[env.index.joint_qpos[0, 1::3]].set(np.pi)
     low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still)
     assert low.terminated and float(low.metrics["collision"]) == 0 and float(low.metrics["reward/fall"]) == 0
 
 
 def plank() -> Any:
     scene = compile_scene(
-        Scene(Track((Init(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
+        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
     )
     return scene.model, scene.objects["seesaw"]
 
@@ -206,13 +210,15 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
 
 
 def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
-    """Through the walk policy, in a few worlds; examples/seesaw_alone.py measures many."""
+    """Through the walk policy, in a few environments; examples/seesaw_alone.py measures many."""
     env, count = make("go1seesaw", impl="c", num_envs=20), 10
     partner = (jnp.arange(2 * count) < count)[:, None, None]
+    layout = env.observation_layout
 
     def one_step(carry: Any, _: None) -> Any:
         state, over, won = carry
-        action = jnp.where(partner, jax.vmap(plan_seesaw)(state.obs), jax.vmap(plan_seesaw_alone)(state.obs))
+        blocks = layout.split(state.obs)
+        action = jnp.where(partner, jax.vmap(plan_seesaw)(blocks), jax.vmap(plan_seesaw_alone)(blocks))
         state = jax.vmap(env.step)(state, action)
         ends = (state.terminated | state.truncated) & ~over
         return (state, over | ends, won | (ends & (state.metrics["success"] > 0))), None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import csv
+import dataclasses
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,13 +19,14 @@ from jax.experimental.compilation_cache import compilation_cache
 from probes import Probe
 from safetensors.numpy import save_file
 
+from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import build, override
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train.checkpoint import latest, list_checkpoints, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.policy import load_policy
+from mqe_jax.train.policy import load_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -131,6 +134,78 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
     with pytest.raises(ValueError, match=r"ppo.gamma: 0\.5 differs from the run"):
         train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     assert load_run_config(run_dir) == settings()
+
+
+@pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml"])
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: bool, tmp_path: Path) -> None:
+    (tmp_path / left).write_text("a user's work")
+    with pytest.raises(InputError, match=f"{left}.*name another folder"):
+        train(PROBE, settings(), tmp_path, resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == [left]
+    assert (tmp_path / left).read_text() == "a user's work"
+
+
+def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None:
+    def again(state: TrainState, row: dict[str, float]) -> None:
+        for resume in (False, True):
+            with pytest.raises(InputError, match=r"already holds a run|in use by another training"):
+                train(PROBE, settings(), tmp_path, resume=resume)
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(PROBE, settings(), tmp_path, on_update=again)
+
+
+def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path) -> None:
+    def kill(state: TrainState, row: dict[str, float]) -> None:
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(PROBE, settings(), tmp_path, on_update=kill)
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["step_000000000000.safetensors"]
+    train(PROBE, settings(), tmp_path, resume=True)
+    assert len(rows(tmp_path)) == 5
+
+
+def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays NaN where an action is above 3 standard deviations or so."""
+    return jnp.where(action[:, 0, 0] > 2.0, jnp.nan, 0.0)
+
+
+def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path) -> None:
+    env = Probe(probes.show_hidden_first, pay_nan_later, num_envs=4)
+    with pytest.raises(NonFiniteError, match=r"update \d+ \(\d+ environment steps\) made loss/"):
+        train(env, settings(total_steps=100 * 16, network={"recurrent": False, "log_std_init": -0.5}), tmp_path)
+    logged = rows(tmp_path)
+    assert len(logged) >= 1 and all(row["loss/value"] != "nan" for row in logged)
+    newest = latest(tmp_path)
+    assert newest is not None and int(newest.stem.removeprefix("step_")) <= int(logged[-1]["env_steps"])
+    load_policy(tmp_path)
+
+
+def spoil(path: Path, kind: str) -> None:
+    """Writes NaN into the first weight of a saved file."""
+    arrays, metadata = checkpoints._read(path, kind)
+    arrays[next(name for name in arrays if name.endswith("weight"))][0] = np.nan
+    save_tree(path, arrays, metadata, kind=kind)
+
+
+def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    shutil.copytree(straight[0], run_dir)
+    newest = latest(run_dir)
+    assert newest is not None
+    spoil(newest, "checkpoint")
+    spoil(run_dir / "policy.safetensors", "policy")
+    with pytest.raises(InputError, match=r"policy.safetensors: .*weight holds NaN"):
+        load_policy(run_dir)
+    with pytest.raises(InputError, match=r"step_000000000080.safetensors: .*weight holds NaN"):
+        train(PROBE, settings(), run_dir, resume=True)
+    policy = load_policy(straight[0])
+    broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))
+    with pytest.raises(NonFiniteError):
+        save_policy(tmp_path, broken)
 
 
 def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import pathlib
 import pickle
@@ -13,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import control, walk_policy
-from mqe_jax.robots import go1
-from mqe_jax.walk import convert
+from mqe_jax import control, robots, walk_policy
+from mqe_jax.errors import InputError
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.walk import convert, training
 from mqe_jax.walk.env import WalkEnv, WalkTask, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.training import windows
@@ -126,7 +128,7 @@ def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.P
     write_torchscript(tmp_path / "b.jit", body)
     params = convert.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     walk_policy.save_params(params, tmp_path / "walk.safetensors")
-    params = walk_policy.load_params(tmp_path / "walk.safetensors")
+    params = walk_policy.load_params(GO1, tmp_path / "walk.safetensors")
     history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
     latent = apply(adaptation, history)
     np.testing.assert_allclose(walk_policy.infer_latent(params, jnp.asarray(history)), latent, atol=2e-5)
@@ -165,10 +167,10 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     memory = walk_policy.WalkMemory(jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(()))
-    commands = default_commands("trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
-    joints = go1.DEFAULT_JOINTS + np.arange(12)
+    commands = default_commands(GO1, "trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
+    joints = GO1.default_joints + np.arange(12)
     obs = walk_policy.observe(
-        memory, jnp.asarray(commands), jnp.array([0.0, 0.0, -1.0]), jnp.asarray(joints), jnp.full(12, 2.0)
+        GO1, memory, jnp.asarray(commands), jnp.array([0.0, 0.0, -1.0]), jnp.asarray(joints), jnp.full(12, 2.0)
     )
     scaled = [2.0, -1.0, 0.1, 0, 3.0, 0.5, 0, 0, 0.5, 0.012, 0, 0, 0.25, 0.428, 0]
     np.testing.assert_allclose(obs[:18], [0, 0, -1, *scaled], atol=1e-6)
@@ -183,7 +185,7 @@ def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     [("trot", [(0, 3), (1, 2)]), ("pace", [(0, 2), (1, 3)]), ("bound", [(0, 1), (2, 3)]), ("pronk", [(0, 1, 2, 3)])],
 )
 def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int, ...]]) -> None:
-    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(default_commands(gait))))
+    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(default_commands(GO1, gait))))
     for group in together:
         assert np.ptp(phases[list(group)]) < 1e-6
     if len(together) == 2:
@@ -191,7 +193,7 @@ def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int,
 
 
 def test_phases_are_warped_by_the_duration() -> None:
-    commands = jnp.asarray(default_commands("pronk", duration=0.8))
+    commands = jnp.asarray(default_commands(GO1, "pronk", duration=0.8))
     assert float(walk_policy.foot_phases(jnp.float32(0.4), commands)[0]) == pytest.approx(0.25)
     assert float(walk_policy.foot_phases(jnp.float32(0.9), commands)[0]) == pytest.approx(0.75)
     contact = desired_contact(jnp.array([0.25, 0.75]))
@@ -199,41 +201,64 @@ def test_phases_are_warped_by_the_duration() -> None:
 
 
 def test_memory_shifts_and_advances() -> None:
-    params = walk_policy.load_params()
+    params = walk_policy.load_params(GO1)
     memory = walk_policy.initial_memory()
-    still = jnp.asarray(default_commands()), jnp.array([0.0, 0, -1]), jnp.asarray(go1.DEFAULT_JOINTS), jnp.zeros(12)
-    target, memory = walk_policy.walk(params, memory, *still)
+    still = jnp.asarray(default_commands(GO1)), jnp.array([0.0, 0, -1]), jnp.asarray(GO1.default_joints), jnp.zeros(12)
+    target, memory = walk_policy.walk(GO1, params, memory, *still)
     assert target.shape == (12,) and float(memory.gait) == pytest.approx(0.06)
     assert not np.asarray(memory.history[:-1]).any() and np.asarray(memory.history[-1]).any()
     first = np.asarray(memory.action)
-    np.testing.assert_allclose(target, go1.DEFAULT_JOINTS + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5)
-    _, memory = walk_policy.walk(params, memory, *still)
+    np.testing.assert_allclose(target, GO1.default_joints + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5)
+    _, memory = walk_policy.walk(GO1, params, memory, *still)
     np.testing.assert_array_equal(memory.previous_action, first)
 
 
 def test_windows_are_the_histories_of_the_rollout() -> None:
     """The 30-step windows gathered from single observations equal the histories kept step by step."""
     random = np.random.default_rng(0)
-    steps, worlds = 40, 3
-    obs = random.normal(size=(steps, worlds, 70)).astype(np.float32)
-    age = np.arange(steps)[:, None] + np.zeros((1, worlds), int)
-    age[10:, 1] = np.arange(steps - 10)  # world 1 is reset at step 10
-    history, kept = np.zeros((worlds, 30, 70), np.float32), []
+    steps, envs = 40, 3
+    obs = random.normal(size=(steps, envs, 70)).astype(np.float32)
+    age = np.arange(steps)[:, None] + np.zeros((1, envs), int)
+    age[10:, 1] = np.arange(steps - 10)  # environment 1 is reset at step 10
+    history, kept = np.zeros((envs, 30, 70), np.float32), []
     for t in range(steps):
         history = np.concatenate([np.where(age[t][:, None, None] == 0, 0, history[:, 1:]), obs[t][:, None]], axis=1)
         kept.append(history)
-    buffer = jnp.concatenate([jnp.zeros((29, worlds, 70)), jnp.asarray(obs)])
-    t, n = np.meshgrid(np.arange(steps), np.arange(worlds), indexing="ij")
+    buffer = jnp.concatenate([jnp.zeros((29, envs, 70)), jnp.asarray(obs)])
+    t, n = np.meshgrid(np.arange(steps), np.arange(envs), indexing="ij")
     found = windows(buffer, jnp.asarray(age), jnp.asarray(t.ravel()), jnp.asarray(n.ravel()))
-    np.testing.assert_array_equal(found, np.stack(kept).reshape(steps * worlds, -1))
+    np.testing.assert_array_equal(found, np.stack(kept).reshape(steps * envs, -1))
+
+
+def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pathlib.Path) -> None:
+    """Weights, learning rate, iteration and key are exact, Adam's second moments to 8 bits; at most 16 MB a file."""
+    config = training.WalkConfig()
+    learner = training.init_learner(jax.random.PRNGKey(0), config, 110)
+    square = jax.tree.map(lambda x: jnp.square(x) + 1e-7, learner.params)
+    learner = dataclasses.replace(
+        learner,
+        optimizer=learner.optimizer._replace(square=square, updates=jnp.int32(40)),
+        learning_rate=jnp.float32(3e-4),
+        iteration=jnp.int32(7),
+    )
+    path = training.save(tmp_path, learner, GO1, config)
+    assert path.stat().st_size < 16e6
+    fresh = training.init_learner(jax.random.PRNGKey(1), config, 110)
+    found = training.restore(tmp_path, fresh, GO1)
+    jax.tree.map(np.testing.assert_array_equal, found.params, learner.params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1 / 128), found.optimizer.square, square)
+    assert int(found.optimizer.updates) == 40 and int(found.iteration) == 7
+    assert float(found.learning_rate) == pytest.approx(3e-4)
+    with pytest.raises(InputError, match=r"trained on go1; resume it with --robot go1, not go2"):
+        training.restore(tmp_path, fresh, robots.get("go2"))
 
 
 def test_command_actions_are_the_papers() -> None:
     action = jnp.array([[0.25, -1.0, 0.5], [1.0, 0.0, 0.0]])
-    commands = control.commands_from_action(action, ("vx", "vy", "yaw_rate"), default_commands())
+    commands = control.commands_from_action(action, ("vx", "vy", "yaw_rate"), default_commands(GO1))
     np.testing.assert_allclose(commands[0, :3], [0.5, -0.5, 0.25])
     assert float(commands[1, 0]) == 1.0
-    np.testing.assert_allclose(commands[:, 3:], np.tile(default_commands()[3:], (2, 1)))
+    np.testing.assert_allclose(commands[:, 3:], np.tile(default_commands(GO1)[3:], (2, 1)))
 
 
 def test_slope_turns_gravity() -> None:
@@ -247,8 +272,8 @@ def test_shipped_policy_walks() -> None:
     from mqe_jax.walk.evaluation import Scenario, measure
 
     task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
-    env = WalkEnv(task, impl="c", num_envs=4)
-    figures = measure(env, walk_policy.load_params(), Scenario(duration=3.0, velocity=(0.8, 0.0, 0.0)), 4)
+    env = WalkEnv(GO1, task, impl="c", num_envs=4)
+    figures = measure(env, walk_policy.load_params(GO1), Scenario(duration=3.0, velocity=(0.8, 0.0, 0.0)), 4)
     assert figures["fall_rate"] == 0
     assert figures["speed"] == pytest.approx(0.8, abs=0.12)
     assert figures["rms_vx"] < 0.15
@@ -257,9 +282,13 @@ def test_shipped_policy_walks() -> None:
 def test_actuator_network_computes_softsign_layers() -> None:
     random = np.random.default_rng(0)
     shapes: dict[str, tuple[int, ...]] = {
-        "0.weight": (32, 6), "0.bias": (32,), "2.weight": (32, 32), "2.bias": (32,),
-        "4.weight": (1, 32), "4.bias": (1,),
-    }  # fmt: skip
+        "0.weight": (32, 6),
+        "0.bias": (32,),
+        "2.weight": (32, 32),
+        "2.bias": (32,),
+        "4.weight": (1, 32),
+        "4.bias": (1,),
+    }
     flat = {name: random.normal(size=shape) for name, shape in shapes.items()}
     params: Any = {}
     for name, value in flat.items():

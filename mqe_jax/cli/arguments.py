@@ -73,6 +73,13 @@ Control = Annotated[
         "Default: command, or what the run was trained with.",
     ),
 ]
+Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
+TaskRobot = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or what the run was trained with."
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,7 @@ class Train:
     """Continue exactly from the newest checkpoint in the run folder."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     set: Set = field(default_factory=list)
     settings: Annotated[Any, tyro.conf.Suppress] = None
 
@@ -122,6 +130,7 @@ class Eval:
     """Number of parallel environments."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     seed: Seed = 0
     deterministic: bool = False
     """Use the policy's mean actions instead of sampling."""
@@ -163,6 +172,7 @@ class Render:
     """Frames per second. Default: 25 for .mp4, 12.5 for .gif."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     seed: Seed = 0
     sample: bool = False
     """Sample actions from the policy instead of using its mean."""
@@ -187,6 +197,7 @@ class Bench:
     """Number of timed calls; the median is reported."""
     impl: Impl = "auto"
     control: Control = None
+    robot: TaskRobot = None
     seed: Seed = 0
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Append the figures as a row to this file."""
@@ -227,6 +238,7 @@ class WalkTrain:
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time limit, after which the training stops with everything saved, s."""
     impl: Impl = "auto"
+    robot: Robot = "go1"
     seed: Seed = 1
 
     def run(self) -> dict[str, Any] | None:
@@ -245,6 +257,7 @@ class WalkEval:
     scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
     """Scenario, such as flat, kicks or slope_up; may be repeated. Default: all."""
     impl: Impl = "auto"
+    robot: Robot = "go1"
     seed: Seed = 0
 
     def run(self) -> dict[str, Any] | None:

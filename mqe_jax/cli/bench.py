@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.errors import InputError
+
 
 def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, float]:
     """Returns (seconds of the first call, which compiles; median seconds of `repeats` further calls).
@@ -43,7 +45,7 @@ def bench(
     """
     for name, value in (("steps", steps), ("repeats", repeats)):
         if value < 1:
-            raise ValueError(f"{name}: {value} is not allowed; it must be at least 1")
+            raise InputError(f"{name}: {value} is not allowed; it must be at least 1")
     count, agents, width = vector_env.num_envs, env.num_agents, env.action_size
 
     @jax.jit
@@ -90,13 +92,13 @@ def device_name() -> str:
 
 
 def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a CSV file, written whole; ValueError where the file has other columns."""
+    """Appends a row to a CSV file, written whole; InputError where the file has other columns."""
     rows: list[dict[str, Any]] = []
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
             if list(reader.fieldnames or []) != list(row):
-                raise ValueError(f"csv: {path} has other columns; it must have {', '.join(row)}")
+                raise InputError(f"csv: {path} has other columns; it must have {', '.join(row)}")
             rows = list(reader)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")

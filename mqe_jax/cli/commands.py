@@ -32,7 +32,7 @@ def is_run(target: str) -> bool:
 def find_player(arguments: Eval | Render, default: str) -> Player:
     """Reads RUN|TASK, --policy and --planner; `default` acts on a task where nobody is named."""
     target = arguments.target
-    given = parse_overrides(arguments.set) | ({} if arguments.control is None else {"control": arguments.control})
+    given = _overrides(arguments)
     if arguments.planner is not None and arguments.policy is not None:
         raise InputError("planner: give --planner or --policy, not both")
     for flag, name, allowed in (
@@ -56,6 +56,12 @@ def find_player(arguments: Eval | Render, default: str) -> Player:
     if default == "scripted" and task not in PLANNERS:
         default = "forward"
     return Player(task, env_values, arguments.planner or default, arguments.opponent)
+
+
+def _overrides(arguments: Train | Eval | Render | Bench) -> dict[str, Any]:
+    """Task parameters given by --set, --control and --robot."""
+    flags = {"control": arguments.control, "robot": arguments.robot}
+    return parse_overrides(arguments.set) | {name: value for name, value in flags.items() if value is not None}
 
 
 def _check_run(target: str) -> None:
@@ -93,9 +99,7 @@ def tasks(arguments: Tasks) -> dict[str, Any] | None:
 
 def train(arguments: Train) -> None:
     """Trains into the run folder."""
-    overrides = parse_overrides(arguments.set)
-    if arguments.control is not None:
-        overrides["control"] = arguments.control
+    overrides = _overrides(arguments)
     config = train_config(arguments.task, arguments.config, given(arguments.settings), overrides, arguments.algorithm)
     run_dir = arguments.run_dir or Path("runs") / arguments.task
     _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
@@ -172,9 +176,7 @@ def draw(
 
 def bench(arguments: Bench) -> dict[str, Any]:
     """Measures throughput and prints a table, or gives the object for `--json`."""
-    overrides = parse_overrides(arguments.set)
-    if arguments.control is not None:
-        overrides["control"] = arguments.control
+    overrides = _overrides(arguments)
     env, vector_env = make_env(arguments.task, arguments.impl, overrides, arguments.num_envs)
     key = jax.random.PRNGKey(arguments.seed)
     result = benchmark.bench(env, vector_env, key, steps=arguments.steps, repeats=arguments.repeats)

@@ -15,6 +15,7 @@ from mqe_jax.cli.output import say
 from mqe_jax.cli.players import Player
 from mqe_jax.cli.setup import make_env, train_config
 from mqe_jax.envs import VectorEnv
+from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy, runner
@@ -55,7 +56,7 @@ def demo(arguments: Demo) -> None:
     video = run_dir / "video.mp4"
     try:
         check_output(video)
-    except ValueError:
+    except InputError:
         video = run_dir / "video.gif"
     say("mqe demo: drawing an episode")
     draw(

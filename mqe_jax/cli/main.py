@@ -6,19 +6,18 @@ import contextlib
 import json
 import os
 import sys
-import traceback
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 from mqe_jax.cli.arguments import FIRST_STEPS, Command, parse
+from mqe_jax.errors import InputError, NonFiniteError
 
 
 @contextlib.contextmanager
 def _quiet_stdout(active: bool) -> Iterator[Any]:
-    """While active, everything written to standard output, from C too, goes to standard error.
+    """While active, redirects standard output, that of C code included, to standard error.
 
-    Gives a file that writes to the real standard output.
+    Yields a file that writes to the real standard output.
     """
     if not active:
         yield sys.stdout
@@ -34,12 +33,6 @@ def _quiet_stdout(active: bool) -> Iterator[Any]:
         os.close(real)
 
 
-def _is_ours(error: BaseException) -> bool:
-    """Whether the error was raised by this package's own code, that is, by a check of input."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and Path(frames[-1].filename).resolve().is_relative_to(Path(__file__).resolve().parent.parent)
-
-
 def _run(command: Command) -> None:
     as_json = bool(getattr(getattr(command, "action", command), "json", False))
     with _quiet_stdout(as_json) as out:
@@ -49,7 +42,11 @@ def _run(command: Command) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs `mqe`; returns the exit code: 0, 2 for bad input (one line on standard error), 130 for Ctrl-C."""
+    """Runs `mqe` and returns the exit code.
+
+    0; 1 for a training that became non-finite and 2 for bad input (InputError, OSError), with one line on standard
+    error; 130 for Ctrl-C. Any other exception is a defect and keeps its traceback.
+    """
     as_program = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments:
@@ -61,20 +58,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("mqe: interrupted", file=sys.stderr, flush=True)
         if as_program:
             sys.stdout.flush()
-            os._exit(130)  # an ordinary exit would wait for steps that JAX is still computing
+            os._exit(130)  # sys.exit would wait for computations that JAX is still running
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
-    except ValueError as error:
-        if not _is_ours(error):
-            raise
-        return _refuse(error)
-    except OSError as error:
-        return _refuse(error)
+    except (InputError, OSError) as error:
+        print(f"mqe: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except NonFiniteError as error:
+        print(f"mqe: {error}", file=sys.stderr)
+        return 1
     return 0
-
-
-def _refuse(error: BaseException) -> int:
-    print(f"mqe: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from mqe_jax.envs import TaskParams
 from mqe_jax.errors import InputError
-from mqe_jax.planners import PLANNERS
+from mqe_jax.planners import scripted_policy
 from mqe_jax.train import policy
 
 PLANNER_NAMES = ("scripted", "random", "idle", "forward")
@@ -49,13 +49,12 @@ def planner(name: str, env: Any) -> Act:
 
 def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
     """The task's planner for a batch of worlds: observations (N, A, O) to actions (N, A, 3)."""
-    if env.name not in PLANNERS:
-        raise InputError(f"planner: {env.name} has none that is scripted; allowed for: {', '.join(PLANNERS)}")
+    plan = scripted_policy(env)
     if env.control != "command":
         raise InputError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(f"commands: {env.params.commands}; planner 'scripted' gives {TaskParams.commands}")
-    return jax.vmap(PLANNERS[env.name])
+    return jax.vmap(plan)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,50 +7,53 @@ from typing import Any
 
 from mqe_jax.cli.arguments import WalkConvert, WalkEval, WalkTrain
 from mqe_jax.cli.output import print_table, say
-from mqe_jax.files import check_folder
-from mqe_jax.train.checkpoint import latest
+from mqe_jax.errors import InputError
+from mqe_jax.files import locked
+from mqe_jax.train.checkpoint import prepare_folder
 
 
 def walk_train(arguments: WalkTrain) -> None:
     """Trains the walk policy into the run folder."""
+    from mqe_jax import robots
     from mqe_jax.walk import training as walk
     from mqe_jax.walk.env import WalkEnv
 
     for name in ("num_envs", "iterations"):
         if getattr(arguments, name) < 1:
-            raise ValueError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
-    check_folder(arguments.run_dir)
-    if latest(arguments.run_dir) is not None and not arguments.resume:
-        raise ValueError(f"run_dir: {arguments.run_dir} already holds a run; resume it or name another folder")
-    env: Any = WalkEnv(impl=arguments.impl, num_envs=arguments.num_envs)
+            raise InputError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
+    prepare_folder(arguments.run_dir, arguments.resume, ("metrics.csv", "walk.safetensors"))
+    env: Any = WalkEnv(robots.get(arguments.robot), impl=arguments.impl, num_envs=arguments.num_envs)
     config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
 
     def report(iteration: int, row: dict[str, float]) -> None:
-        shown = ("reward", "episode_length", "kl", "level")
+        shown = ("reward", "episode_length", "kl", "difficulty")
         numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
         say(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
 
-    walk.train_walk(
-        env,
-        config,
-        arguments.run_dir,
-        resume=arguments.resume,
-        max_seconds=arguments.max_seconds,
-        report=report,
-    )
+    with locked(arguments.run_dir):
+        walk.train_walk(
+            env,
+            config,
+            arguments.run_dir,
+            resume=arguments.resume,
+            max_seconds=arguments.max_seconds,
+            report=report,
+        )
     say(f"mqe: {arguments.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 
 def walk_eval(arguments: WalkEval) -> dict[str, Any]:
     """Measures the walk policy and prints a table, or gives the object for `--json`."""
-    from mqe_jax import walk_policy
+    from mqe_jax import robots, walk_policy
     from mqe_jax.walk.evaluation import evaluate_walk
 
     def report(name: str, figures: Mapping[str, float]) -> None:
         say(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
 
+    robot = robots.get(arguments.robot)
     result = evaluate_walk(
-        walk_policy.load_params(arguments.weights),
+        robot,
+        walk_policy.load_params(robot, arguments.weights),
         impl=arguments.impl,
         episodes=arguments.episodes,
         seed=arguments.seed,
@@ -68,10 +71,10 @@ def walk_convert(arguments: WalkConvert) -> None:
     from mqe_jax.walk import convert
 
     if arguments.output.suffix != ".safetensors":
-        raise ValueError(f"output: {str(arguments.output)!r} is not allowed; it must end in .safetensors")
+        raise InputError(f"output: {str(arguments.output)!r} is not allowed; it must end in .safetensors")
     for path in (arguments.adaptation, arguments.body):
         if not path.is_file():
-            raise ValueError(f"{path}: no such file; it must be a TorchScript checkpoint")
+            raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
     params = convert.convert(arguments.adaptation, arguments.body)
     walk_policy.save_params(params, arguments.output)
     say(f"mqe: wrote {arguments.output}")

@@ -1,8 +1,7 @@
-"""The tasks, by their ids."""
+"""The tasks by id."""
 
 from __future__ import annotations
 
-import typing
 from typing import Any
 
 from mqe_jax.envs.autoreset import VectorEnv
@@ -12,7 +11,6 @@ from mqe_jax.envs.door import Go1RevolvingDoor
 from mqe_jax.envs.football import Go1Football1vs1, Go1Football2vs2
 from mqe_jax.envs.football_defender import Go1FootballDefender
 from mqe_jax.envs.gate import Go1Gate
-from mqe_jax.envs.overrides import override
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.pushbox import Go1PushBox
@@ -21,7 +19,8 @@ from mqe_jax.envs.seesaw import Go1Seesaw
 from mqe_jax.envs.sheep import Go1SheepEasy, Go1SheepHard
 from mqe_jax.envs.tug import Go1Tug
 from mqe_jax.envs.wrestling import Go1Wrestling
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.settings import override
 
 TASKS: dict[str, type[QuadrupedEnv]] = {
     task.name: task
@@ -42,55 +41,62 @@ TASKS: dict[str, type[QuadrupedEnv]] = {
     )
 }
 
-# Other names of tasks, from the released system.
+# Alternative ids, from the released system.
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
 
 def register_task(task: type[QuadrupedEnv]) -> type[QuadrupedEnv]:
-    """Adds a task class under its `name`, so that `make` and the command line know it; use as a decorator.
+    """Registers a task class under its `name` for `make` and the command line; use as a decorator.
 
     Raises:
-        ValueError: if the class has no name, or another task has it.
+        InputError: if the class has no name, or another class is registered under it.
     """
     if not task.name:
-        raise ValueError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
+        raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
     known = TASKS.get(task.name)
     if known is not None and (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
-        raise ValueError(f"task {task.__name__}: the id {task.name!r} is taken by {known.__name__}")
+        raise InputError(f"task {task.__name__}: the id {task.name!r} is taken by {known.__name__}")
     TASKS[task.name] = task
     return task
 
 
 def tasks() -> tuple[str, ...]:
-    """Returns the ids of all tasks."""
+    """Returns the ids of all registered tasks."""
     return tuple(TASKS)
 
 
 def make(
     task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
 ) -> QuadrupedEnv:
-    """Makes a task.
+    """Creates the environment of a task.
 
     Args:
-        task: its id, such as 'go1gate'.
+        task: id, such as 'go1gate'.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
-        control: what an action means: 'command', 'position' or 'torque'.
-        num_envs: how many worlds there will be at most (only Warp's contact buffer needs to know).
-        overrides: any parameter of the task by name; nested ones as mappings or, from a dict, dotted names:
+        control: action mode: 'command', 'position' or 'torque'.
+        num_envs: maximum batch size; sizes Warp's contact buffer.
+        overrides: task parameters by name; nested ones as mappings or, from a dict, by dotted names:
             `make("go1gate", gate_width=0.8, rewards={"collision": -5.0})`.
 
     Raises:
-        ValueError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
+        InputError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
     """
     task = ALIASES.get(task, task)
     if task not in TASKS:
-        raise ValueError(f"task: unknown id {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
+        raise InputError(f"task: unknown id {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
     cls = TASKS[task]
-    params = typing.cast(TaskParams, override(cls.Params(), overrides))
-    return cls(params, impl=impl, control=control, num_envs=num_envs)
+    return cls(override(cls.Params(), overrides), impl=impl, control=control, num_envs=num_envs)
 
 
 __all__ = [
-    "TASKS", "QuadrupedEnv", "Randomization", "State", "TaskParams", "VectorEnv", "make", "override", "register_task",
+    "TASKS",
+    "QuadrupedEnv",
+    "Randomization",
+    "State",
+    "TaskParams",
+    "VectorEnv",
+    "make",
+    "override",
+    "register_task",
     "tasks",
-]  # fmt: skip
+]

@@ -1,4 +1,4 @@
-"""Batches of worlds that start over by themselves."""
+"""Vectorised environments with automatic reset."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.errors import InputError
 
-# Fields that tell how a step went: an auto-reset keeps them.
-_KEPT = ("aid", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
+# Fields that describe the last step; an auto-reset keeps them.
+_KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
 
 
 def autoreset(env: QuadrupedEnv, state: State) -> State:
-    """Replaces one finished world by a freshly drawn one.
+    """Replaces the state of one environment by a fresh one if its episode has ended.
 
-    Whole state, no forward pass. `reward`, `terminated`, `truncated`, `metrics` and `final_obs` still tell of the
-    step that ended the episode; `obs` is the fresh world's. The aid stays.
+    Resets the whole state, without a forward pass. `reward`, `terminated`, `truncated`, `metrics` and `final_obs`
+    still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept.
     """
     done = state.terminated | state.truncated
     key, reset_key = jax.random.split(state.key)
-    fresh = env.reset(reset_key, state.aid)
+    fresh = env.reset(reset_key, state.assistance)
     merged = {
         field.name: jax.tree.map(
             lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
@@ -34,18 +35,18 @@ def autoreset(env: QuadrupedEnv, state: State) -> State:
 
 
 class VectorEnv:
-    """Worlds side by side that start over when they end; what trainers use.
+    """A batch of environments that are reset when their episodes end: the environment of trainers.
 
     Attributes:
         env: the task.
-        num_envs: N.
+        num_envs: number of environments N.
         max_episode_steps: environment steps until the time limit.
     """
 
     def __init__(self, env: QuadrupedEnv, num_envs: int) -> None:
         if num_envs < 1:
-            raise ValueError(f"num_envs: {num_envs} must be at least 1")
-        self.env = env.with_room_for(num_envs)
+            raise InputError(f"num_envs: {num_envs} must be at least 1")
+        self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.name = env.name
         self.max_episode_steps = env.max_steps
@@ -56,11 +57,11 @@ class VectorEnv:
         self.action_size = env.action_size
 
     def reset(self, key: jax.Array) -> State:
-        """Returns N fresh worlds; every leaf has a leading axis N."""
+        """Returns N initial states; every leaf has a leading axis N."""
         return jax.vmap(self.env.reset)(jax.random.split(key, self.num_envs))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances all worlds by one step with actions (N, A, action_size), and resets those that ended."""
+        """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
 
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action))

@@ -1,14 +1,15 @@
-"""The environment core: one world of robots as pure `reset` and `step` functions, batched by `jax.vmap`.
+"""The environment core: one environment of several robots as pure `reset` and `step` functions, batched by `jax.vmap`.
 
-A task is a subclass in a file of its own that says, in this order: its parameters, its scene, what it draws at
-reset, its observation, its reward terms and its ending. Everything that tasks share is here: spawning, control,
-physics, randomisation, falls, collisions, the time limit and the guard against diverged physics.
+A task is a subclass in a file of its own that defines, in this order: its parameters, its scene, its randomised
+initial state, its observation, its reward terms and its ending. Everything that tasks share is here: spawning,
+control, physics, randomisation, falls, collisions, the time limit and the guard against diverged physics.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -25,11 +26,11 @@ from mqe_jax.control import Controller, ControlState, check_mode, load_actuator_
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.privileged import PrivilegedObservation
-from mqe_jax.envs.randomization import Randomizer, World
+from mqe_jax.envs.randomization import RandomizedParams, Randomizer
 from mqe_jax.envs.reward import weigh
+from mqe_jax.errors import InputError
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, build_model, compile_scene
 
@@ -37,26 +38,27 @@ from mqe_jax.scene import Scene, build_model, compile_scene
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """State of one world with A agents, R robots and G gates; a batch has leading axes.
+    """State of one environment with A agents, R robots and G anchors; a batch has leading axes.
 
     Attributes:
         data: physics state.
-        obs: what the agents see now (A, O); after an auto-reset, of the fresh world.
-        privileged_obs: everything in the simulator, for critics and distillation (P,).
-        final_obs: what the agents saw at the end of the last step (A, O): differs from `obs` after an auto-reset.
+        obs: the agents' observations (A, O); after an auto-reset, those of the new episode.
+        privileged_obs: simulator state, for critics and distillation (P,); after an auto-reset likewise.
+        final_obs: observations at the end of the last step (A, O); differs from `obs` only after an auto-reset.
         final_privileged_obs: likewise (P,).
         reward: (A,).
-        terminated: () bool; an episode ended by its rules.
-        truncated: () bool; it ended by the time limit.
-        metrics: `reward/<name>`, `average_step_reward`, `success`, `diverged` and the task's own, () each.
+        terminated: () bool; the episode ended by its rules.
+        truncated: () bool; the episode ended by the time limit.
+        metrics: `reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the
+            physics engine dropped contacts or constraints in this step) and the task's own, () each.
         step: environment steps since the reset () int32.
-        gates: centres of the gates (G, 2), m, environment frame.
-        control: what control remembers.
-        world: randomised physics.
+        anchors: positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame.
+        control: controller state.
+        randomized: randomised physics parameters.
         task: the task's own fields.
-        aid: how much the world helps learning () in [0, 1]; 0 is the task itself, trainers may start higher.
-        hold: environment steps for which each agent's action counts as zero (A,); zeros without aid.
-        key: random key of the world.
+        assistance: curriculum level () in [0, 1]; 0 is the unmodified task.
+        frozen_steps: initial steps during which each agent's action is replaced by zero (A,) int32.
+        key: random key.
     """
 
     data: mjx.Data
@@ -69,33 +71,40 @@ class State:
     truncated: jax.Array
     metrics: dict[str, jax.Array]
     step: jax.Array
-    gates: jax.Array
+    anchors: jax.Array
     control: ControlState
-    world: World
+    randomized: RandomizedParams
     task: Any
-    aid: jax.Array
-    hold: jax.Array
+    assistance: jax.Array
+    frozen_steps: jax.Array
     key: jax.Array
 
 
 class QuadrupedEnv:
-    """Base of all tasks; functions of one world, to be batched by `jax.vmap` and compiled by `jax.jit`.
+    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`.
 
     Attributes:
+        name: id of the task.
+        title: name of the task in the paper.
+        Params: class of the task's parameters.
+        metrics_if_diverged: metrics that are not 0 in a step in which the physics diverged.
+        variable_num_agents: whether `num_agents` may differ from the task's default.
         params: the task's parameters.
         impl: physics engine: 'jax', 'warp' or 'c'.
-        control: 'command', 'position' or 'torque'.
-        num_agents: A.
-        teams: agents of each team.
-        dt: environment step, s.
+        control: action mode: 'command', 'position' or 'torque'.
+        num_agents: number of controlled robots A.
+        robot: all robots of the task.
+        dt: environment step, s: the physics step times the substeps.
+        compiled: the compiled scene.
+        index: index tables of the robots.
+        objects: index tables of the objects by name.
     """
 
     name: ClassVar[str] = ""
     title: ClassVar[str] = ""
     Params: ClassVar[type[TaskParams]] = TaskParams
-    if_diverged: ClassVar[Mapping[str, float]] = {}  # metrics of a diverged world that are not 0
-    any_number: ClassVar[bool] = False  # whether `num_agents` may be another than the task's own
-    dt = walk_policy.STEP
+    metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
+    variable_num_agents: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -106,113 +115,145 @@ class QuadrupedEnv:
         num_envs: int = 4096,
     ) -> None:
         self.params: Any = self.Params() if params is None else params
-        own = self.Params().num_agents
-        if self.params.num_agents != own and not self.any_number:
-            raise ValueError(f"num_agents: {self.params.num_agents}; {self.name} is for {own} robots")
+        expected = self.Params().num_agents
+        if self.params.num_agents != expected and not self.variable_num_agents:
+            raise InputError(f"num_agents: {self.params.num_agents}; {self.name} is for {expected} robots")
         self.control = check_mode(control)
         if num_envs < 1:
-            raise ValueError(f"num_envs: {num_envs} must be at least 1")
+            raise InputError(f"num_envs: {num_envs} must be at least 1")
         self.num_agents = self.params.num_agents
+        self.robot = robots.get(self.params.robot)
         scene = self.scene()
         network = self.params.actuator_network if control != "torque" else None
-        # Robots that are no agents follow joint targets, whatever the agents do.
+        # NPC robots follow joint targets in every mode.
         torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
         self._scene = dataclasses.replace(
-            scene, friction=self.params.friction, solver_iterations=self.params.solver_iterations,
-            torque_robots=torque_robots, max_contacts=self.params.contacts_per_robot * scene.num_robots,
-        )  # fmt: skip
+            scene,
+            robot=self.robot,
+            friction=self.params.friction,
+            solver_iterations=self.params.solver_iterations,
+            torque_robots=torque_robots,
+            max_contacts=self.params.contacts_per_robot * scene.num_robots,
+            foot_sensors=self.params.privileged_contact_forces,
+        )
         self.compiled = compile_scene(self._scene)
-        self.robot, self.objects = self.compiled.robot, self.compiled.objects
+        self.index, self.objects = self.compiled.index, self.compiled.objects
         self.physics = Physics(
-            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=self._scene.max_contacts,
-            rows_per_env=self.params.rows_per_robot * scene.num_robots,
-        )  # fmt: skip
+            self.compiled.model,
+            impl=impl,
+            num_envs=num_envs,
+            contacts_per_env=self._scene.max_contacts,
+            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots,
+        )
         self.impl = self.physics.impl
-        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.robot, self.params.friction)
-        self.privileged = PrivilegedObservation(self.compiled.model, self.robot, len(self.compiled.layout.anchors))
+        self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
         walks = control == "command" or self._scene.num_robots > self.num_agents
+        if walks and not math.isclose(self.dt, walk_policy.STEP):
+            raise InputError(
+                f"Scene.timestep: {scene.timestep} s x {self.physics.num_substeps} substeps is {self.dt:g} s; "
+                f"the walk policy's period is {walk_policy.STEP} s"
+            )
+        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
+        self.privileged = PrivilegedObservation(
+            self.robot,
+            self.compiled.model,
+            self.index,
+            num_anchors=len(self.compiled.layout.anchors),
+            gait=walks,
+            contact_forces=self.params.privileged_contact_forces,
+        )
         self.controller = Controller(
-            mode=control, physics=self.physics, index=self.robot, num_agents=self.num_agents,
-            walk_params=walk_policy.load_params(self.params.walk_policy) if walks else None,
-            actuator_params=load_actuator_network(network) if network else None, commands=self.params.commands,
-            default_commands=walk_policy.default_commands(self.params.gait), lag=self.params.randomization.action_lag,
-        )  # fmt: skip
+            mode=control,
+            robot=self.robot,
+            physics=self.physics,
+            index=self.index,
+            num_agents=self.num_agents,
+            walk_params=walk_policy.load_params(self.robot, self.params.walk_policy) if walks else None,
+            actuator_params=load_actuator_network(network) if network else None,
+            commands=self.params.commands,
+            default_commands=walk_policy.default_commands(self.robot, self.params.gait),
+            lag=self.params.randomization.action_lag,
+        )
 
-    # -- what a task says ---------------------------------------------------------------------------------------
+    # -- task interface (override) ------------------------------------------------------------------------------
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
-        raise TypeError(f"{type(self).__name__}: scene() is not defined")
+        """Returns the scene: track, robots and objects."""
+        raise NotImplementedError(f"{type(self).__name__}: scene() is not defined")
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
-        """Says where the robots start, x, y, yaw of each, m and rad; where the track's blocks say if not here."""
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
+        """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the track's blocks."""
         return self.compiled.layout.spawn
 
     def spawn(self, key: jax.Array) -> jax.Array:
-        """Draws poses x, y, z, yaw (R, 4), m and rad, of all robots."""
+        """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
         params = self.params
-        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_places()], np.float32)
+        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32)
         noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
         return jnp.asarray(pose).at[:, :2].add(noise)
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draws where movable objects start, into qpos (nq,) and qvel (nv,)."""
+        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,)."""
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> Any:
-        """Returns the task's own fields of a fresh world."""
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> Any:
+        """Returns the task's own state fields at the start of an episode."""
         return None
 
-    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array | None:
-        """Returns walk commands (R - A, 15) of the robots that are no agents."""
+    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array | None:
+        """Returns the walk commands (R - A, 15) of the NPC robots, or None if there are none."""
         return None
 
-    def to_world(self, action: jax.Array) -> jax.Array:
-        """Turns actions (A, action_size), each in its agent's own frame, into those that the robots carry out."""
+    def unmirror_action(self, action: jax.Array) -> jax.Array:
+        """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the robots' frame."""
         return action
 
-    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
-        """Moves what has a will of its own: returns the world with its velocities for the next step."""
+    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+        """Applies scripted NPC behaviour: sets NPC velocities for the next physics step."""
         return data
 
     @property
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
-        raise TypeError(f"{type(self).__name__}: observation_layout is not defined")
+        raise NotImplementedError(f"{type(self).__name__}: observation_layout is not defined")
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
-        raise TypeError(f"{type(self).__name__}: observe() is not defined")
+        raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms, () or (A,), and the task's fields after the step.
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the unweighted reward terms, () or (A,), and the task's own fields after the step.
 
         Args:
-            state: the state before the step, with the physics after it.
-            readings: of the robots after the step.
-            collision: whether any trunk touches anything () bool.
+            state: the state before the step, with the physics state after it.
+            robot_state: after the step.
+            collision: whether any agent's trunk touches anything () bool.
         """
-        raise TypeError(f"{type(self).__name__}: rewards() is not defined")
+        raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns whether the task's own rules end the episode () bool."""
         return jnp.zeros((), bool)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
-        """Returns `success` () and further `success/...` measures, which count when the episode ends.
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Returns `success` () and further `success/...` metrics, which are evaluated at the end of an episode.
 
         Args:
             state: after the step.
-            readings: of the robots.
-            failed: whether the step ended by a fall, a collision or a divergence () bool.
+            robot_state: after the step.
+            failed: whether a fall, a collision or diverged physics ended the episode () bool.
         """
         return {"success": jnp.zeros(())}
 
-    # -- what users call ----------------------------------------------------------------------------------------
+    def external_forces(self, state: State) -> jax.Array | None:
+        """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
+        return None
+
+    # -- public API ---------------------------------------------------------------------------------------------
 
     @property
     def teams(self) -> tuple[tuple[int, ...], ...]:
-        """Agents of each team; one team where all work together."""
+        """Agents of each team; a single team in cooperative tasks."""
         return (tuple(range(self.num_agents)),)
 
     @property
@@ -222,17 +263,17 @@ class QuadrupedEnv:
 
     @property
     def observation_size(self) -> int:
-        """Length of an agent's observation."""
+        """Length of an agent's observation O."""
         return self.observation_layout.size
 
     @property
     def privileged_layout(self) -> ObservationLayout:
-        """The blocks of the privileged observation, in order; raw units."""
+        """The blocks of the privileged observation, in order; physical units, not normalised."""
         return self.privileged.layout
 
     @property
     def privileged_observation_size(self) -> int:
-        """Length of the privileged observation."""
+        """Length of the privileged observation P."""
         return self.privileged_layout.size
 
     @property
@@ -247,7 +288,7 @@ class QuadrupedEnv:
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
-        """The model with everything to look at; its qpos and mocap bodies are those of the physics."""
+        """Rendering model: the physics model plus visual geoms; qpos and mocap layouts are identical."""
         return build_model(self._scene, visual=True)[0]
 
     @property
@@ -255,133 +296,146 @@ class QuadrupedEnv:
         """Environment steps until the time limit."""
         return round(self.params.episode_length / self.dt)
 
-    def with_room_for(self, num_envs: int) -> QuadrupedEnv:
-        """Returns the environment with buffers for `num_envs` worlds, which only Warp's contacts need."""
+    def with_num_envs(self, num_envs: int) -> QuadrupedEnv:
+        """Returns an environment whose Warp contact buffers are sized for `num_envs` environments.
+
+        A no-op on the other engines, and where the buffers are large enough.
+        """
         if self.impl != "warp" or self.physics.num_envs >= num_envs:
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
-    def reset(self, key: jax.Array, aid: jax.Array | float = 0.0) -> State:
-        """Returns a freshly drawn world; needs no forward pass of the physics.
+    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State:
+        """Returns a randomised initial state; runs no forward pass of the physics.
 
         Args:
             key: random key.
-            aid: how much the world helps learning, in [0, 1]; 0 is the task itself.
+            assistance: curriculum level in [0, 1]; 0 is the unmodified task.
         """
         keys = jax.random.split(key, 9)
-        next_key, gate_key, spawn_key, body_key, object_key, world_key, task_key, noise_key, aid_key = keys
-        aid = jnp.asarray(aid, jnp.float32)
-        gates = self._draw_gates(gate_key)
-        qpos, qvel = self._draw_robots(spawn_key, body_key)
+        next_key, anchor_key, spawn_key, body_key, object_key, physics_key, task_key, noise_key, freeze_key = keys
+        assistance = jnp.asarray(assistance, jnp.float32)
+        anchors = self._sample_anchors(anchor_key)
+        qpos, qvel = self._sample_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel)
-        ctrl = jnp.zeros(self.compiled.model.nu).at[self.robot.actuator].set(self.controller.neutral)
-        data = self.physics.init(qpos, qvel, self._mocap(gates), ctrl)
-        readings = self.read(data)
+        ctrl = jnp.zeros(self.compiled.model.nu).at[self.index.actuator].set(self.controller.neutral)
+        data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
+        robot_state = self.read(data)
         no = jnp.zeros((), bool)
         empty = jnp.zeros((0,))
         state = State(
-            data=data, obs=empty, privileged_obs=empty, final_obs=empty, final_privileged_obs=empty,
-            reward=jnp.zeros(self.num_agents), terminated=no, truncated=no, metrics={},
-            step=jnp.zeros((), jnp.int32), gates=gates, control=self.controller.reset(),
-            world=self.randomizer.draw(world_key), task=self.reset_task(task_key, readings, data, gates), aid=aid,
-            hold=self._draw_hold(aid_key, aid), key=next_key,
-        )  # fmt: skip
-        terms, _ = self.rewards(state, readings, no)
+            data=data,
+            obs=empty,
+            privileged_obs=empty,
+            final_obs=empty,
+            final_privileged_obs=empty,
+            reward=jnp.zeros(self.num_agents),
+            terminated=no,
+            truncated=no,
+            metrics={},
+            step=jnp.zeros((), jnp.int32),
+            anchors=anchors,
+            control=self.controller.reset(),
+            randomized=self.randomizer.sample(physics_key),
+            task=self.reset_task(task_key, robot_state, data, anchors),
+            assistance=assistance,
+            frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
+            key=next_key,
+        )
+        terms, _ = self.rewards(state, robot_state, no)
         _, logged = weigh(terms, self.params.rewards, self.num_agents)
-        metrics = {**logged, **self.outcome(state, readings, no), "collision": 0.0, "diverged": 0.0}
-        state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in metrics})
-        return self._observed(state, readings, noise_key)
+        names = (*logged, *self.outcome(state, robot_state, no), "collision", "diverged", "overflow")
+        state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
+        return self._observed(state, robot_state, noise_key)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one world by one environment step.
+        """Advances one environment by one environment step.
 
         Args:
-            state: of the world; one that has ended goes on unless it is reset (see `VectorEnv`).
+            state: of the environment; an episode that has ended continues unless it is reset (see `VectorEnv`).
             action: (A, action_size), floating point, in [-1, 1] (clipped to it).
 
         Raises:
-            ValueError: if the action has another shape or dtype, or is not finite (where that can be seen: in
-                compiled code a world with such an action ends as diverged).
+            InputError: if the action has another shape or dtype, or is not finite. Finiteness is checked only
+                outside of compiled code; inside, an action that is not finite ends the episode as diverged.
         """
         action = self._checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
-        action = self.to_world(jnp.where((state.step < state.hold)[:, None], 0.0, action))
-        key, push_key, noise_key, drive_key = jax.random.split(state.key, 4)
+        action = self.unmirror_action(jnp.where((state.step < state.frozen_steps)[:, None], 0.0, action))
+        key, push_key, noise_key, npc_key = jax.random.split(state.key, 4)
 
         before = self.read(state.data)
         target, control = self.controller.targets(
-            state.control, action, before.projected_gravity, before.joint_position, before.joint_velocity,
+            state.control,
+            action,
+            before.projected_gravity,
+            before.joint_position,
+            before.joint_velocity,
             self.npc_commands(state, before),
-        )  # fmt: skip
-        data = self.drive(self.randomizer.push(state.data, push_key, self.dt), before, drive_key)
+        )
+        data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before, npc_key)
         data, control = self.controller.apply(
             control,
             data,
             target,
-            state.world.action_lag,
-            self.randomizer.fields(state.world),
+            state.randomized.action_lag,
+            self.randomizer.fields(state.randomized),
             self.external_forces(state),
         )
-        readings = self.read(data)
+        robot_state = self.read(data)
         state = dataclasses.replace(state, data=data, control=control, step=state.step + 1, key=key)
 
         diverged = bad_action | self._diverged(data)
-        collision = jnp.any(readings.trunk_force[: self.num_agents] > self.params.collision_force)
-        terms, task = self.rewards(state, readings, collision)
+        collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
+        terms, task = self.rewards(state, robot_state, collision)
         reward, logged = weigh(terms, self.params.rewards, self.num_agents)
         state = dataclasses.replace(state, task=task)
-        failed = jnp.any(self.fallen(readings)) | diverged | (collision & self.params.end_on_collision)
-        terminated = failed | self.ending(state, readings)
-        metrics = {**logged, **self.outcome(state, readings, failed), "collision": collision}
+        failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
+        terminated = failed | self.ending(state, robot_state)
+        metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
-        metrics = {name: clean(value, self.if_diverged.get(name, 0.0)) for name, value in metrics.items()}
+        metrics = {name: clean(value, self.metrics_if_diverged.get(name, 0.0)) for name, value in metrics.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
+        metrics["overflow"] = self.physics.overflow(data).astype(jnp.float32)
         state = dataclasses.replace(
-            state, reward=clean(reward), terminated=terminated, metrics=metrics,
+            state,
+            reward=clean(reward),
+            terminated=terminated,
+            metrics=metrics,
             truncated=~terminated & (state.step >= self.max_steps),
-        )  # fmt: skip
-        return self._observed(state, readings, noise_key)
+        )
+        return self._observed(state, robot_state, noise_key)
 
-    def read(self, data: mjx.Data) -> RobotReadings:
-        """Reads all robots of one world."""
-        return robots.read_robots(self.robot, data.qpos, data.qvel, data.sensordata)
+    def read(self, data: mjx.Data) -> RobotState:
+        """Returns the state of all robots."""
+        return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
-        """Returns the coordinates of an object by name, as its class gives them."""
+        """Returns the generalised coordinates of an object, as its class documents them."""
         return data.qpos[self.objects[name].qpos]
 
-    def fallen(self, readings: RobotReadings) -> jax.Array:
-        """Returns which robots lie on their side or back, or are too low or too high (R,) bool."""
+    def fallen(self, robot_state: RobotState) -> jax.Array:
+        """Returns which robots exceed the roll, pitch or height limits (R,) bool."""
         params = self.params
-        roll, pitch = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1])
-        height = readings.position_w[:, 2]
+        roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
+        height = robot_state.position_w[:, 2]
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
         return out | (height < params.min_height) | (height > params.max_height)
 
-    def external_forces(self, state: State) -> jax.Array | None:
-        """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
-        return None
+    # -- internals of reset and step ----------------------------------------------------------------------------
 
-    # -- the common parts of reset and step ---------------------------------------------------------------------
-
-    def _draw_gates(self, key: jax.Array) -> jax.Array:
+    def _sample_anchors(self, key: jax.Array) -> jax.Array:
         mean, spread = self.compiled.anchor_mean, self.compiled.anchor_spread
         return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
 
-    def _mocap(self, gates: jax.Array) -> jax.Array:
-        model = self.compiled.model
-        if not model.nmocap:
-            return jnp.zeros((0, 3))
-        return self.compiled.wall_positions(gates)
-
-    def _draw_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        params, model, index = self.params, self.compiled.model, self.robot
+    def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        params, model, index = self.params, self.compiled.model, self.index
         pose = self.spawn(spawn_key)
         joint_key, velocity_key = jax.random.split(body_key)
         low, high = params.spawn_joint_scale
-        joints = go1.DEFAULT_JOINTS * jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
-        joints = jnp.clip(joints, go1.JOINT_LOWER, go1.JOINT_UPPER)
+        factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
+        joints = jnp.clip(self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper)
         speed = params.spawn_velocity
         velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
         level = jnp.zeros(len(pose))
@@ -390,34 +444,39 @@ class QuadrupedEnv:
         qpos = qpos.at[index.base_qpos].set(jnp.concatenate([pose[:, :3], turn], axis=-1))
         return qpos, jnp.zeros(model.nv).at[index.base_qvel].set(velocity)
 
-    def _draw_hold(self, key: jax.Array, aid: jax.Array) -> jax.Array:
-        who_key, time_key = jax.random.split(key)
-        steps = aid * self.params.hold_time / self.dt * jax.random.uniform(time_key, ())
-        who = jax.random.randint(who_key, (), 0, self.num_agents)
-        return jnp.where(jnp.arange(self.num_agents) == who, steps, 0.0).astype(jnp.int32)
+    def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array) -> jax.Array:
+        agent_key, time_key = jax.random.split(key)
+        steps = assistance * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
+        agent = jax.random.randint(agent_key, (), 0, self.num_agents)
+        return jnp.where(jnp.arange(self.num_agents) == agent, steps, 0.0).astype(jnp.int32)
 
     def _checked(self, action: jax.Array) -> jax.Array:
         action = jnp.asarray(action)
         shape = (self.num_agents, self.action_size)
         if action.shape != shape:
-            raise ValueError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
+            raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
         if not jnp.issubdtype(action.dtype, jnp.floating):
-            raise ValueError(f"action: dtype {action.dtype}; expected a floating-point type")
-        if not isinstance(action, Tracer) and not bool(jnp.all(jnp.isfinite(action))):
-            raise ValueError("action: holds NaN or infinite numbers; expected numbers in [-1, 1]")
+            raise InputError(f"action: dtype {action.dtype}; expected a floating-point type")
+        # Under jit the result is traced even where the action is a captured constant.
+        finite = jnp.all(jnp.isfinite(action))
+        if not isinstance(finite, Tracer) and not bool(finite):
+            raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
         return action
 
     def _diverged(self, data: mjx.Data) -> jax.Array:
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        position = data.qpos[self.robot.base_qpos[:, :3]]
+        position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
 
-    def _observed(self, state: State, readings: RobotReadings, key: jax.Array) -> State:
-        obs = self.observation_layout.pack(self.observe(state, readings))
+    def _observed(self, state: State, robot_state: RobotState, key: jax.Array) -> State:
+        layout = self.observation_layout
+        obs = layout.pack(self.observe(state, robot_state))
         noise = self.params.randomization.observation_noise
         if noise:
-            obs = obs + noise * jax.random.normal(key, obs.shape)
-        privileged = self.privileged.observe(readings, state.data, state.gates)
+            obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
+        privileged = self.privileged.observe(
+            robot_state, state.data, state.anchors, state.randomized, state.control.walk
+        )
         obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
         return dataclasses.replace(
             state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged

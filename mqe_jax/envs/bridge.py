@@ -1,8 +1,7 @@
-"""go1bridge, the paper's Traverse Bridge: two robots meet on a bridge for one."""
+"""go1bridge, the paper's Traverse Bridge: two robots meet on a bridge wide enough for one."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -15,14 +14,15 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Init, Plane, Track
+from mqe_jax.settings import Positive, Range, fail, record
+from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class BridgeRewards:
-    """Weights of the reward terms; every side's own less the opponent's.
+    """Weights of the reward terms; each is a robot's own term minus the opponent's.
 
     Attributes:
         win: when the opponent is off the bridge or has fallen.
@@ -33,46 +33,50 @@ class BridgeRewards:
     far_side: float = 1.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class BridgeParams(TaskParams):
     """Parameters of Traverse Bridge.
 
     Attributes:
-        platform: extents of both platforms along x and y, m; they lie across the bridge, as in the paper's figure.
-        platform_x: of their middles, m.
+        platform: extents of both platforms along x and y, m; their long sides are perpendicular to the bridge, as in
+            the paper's figure.
+        platform_x: of the platforms' centres, m.
         top: height of platforms and bridge, m.
         bridge_width: m.
         bridge_thickness: m.
-        spawn_x: of the robots, m. The released system starts the first at 2.0, with its hind feet on the platform's
-            edge; here both sides start alike.
-        off_height: a trunk below is off the bridge, m.
-        rewards: weights.
+        spawn_x: of the robots, m. The released system spawns the first robot at 2.0, with its hind feet on the
+            platform's edge; here the two poses are symmetric.
+        off_height: height of a trunk below which a robot counts as off the bridge, m.
+        rewards: weights of the reward terms.
     """
 
-    episode_length: float = 20.0
-    spawn_height: float = 1.4
-    platform: tuple[float, float] = (1.3, 2.5)
-    platform_x: tuple[float, float] = (2.35, 7.65)
-    top: float = 1.02
-    bridge_width: float = 0.7
-    bridge_thickness: float = 0.3
-    spawn_x: tuple[float, float] = (2.5, 7.5)
+    episode_length: Positive = 20.0
+    spawn_height: Positive = 1.4
+    platform: tuple[Positive, Positive] = (1.3, 2.5)
+    platform_x: Range = (2.35, 7.65)
+    top: Positive = 1.02
+    bridge_width: Positive = 0.7
+    bridge_thickness: Positive = 0.3
+    spawn_x: Range = (2.5, 7.5)
     off_height: float = 0.5
     rewards: BridgeRewards = BridgeRewards()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.top)
+        check_above(self.spawn_height, self.top, self.robot)
+        first, second = self.platform_x
+        if second - first <= self.platform[0]:
+            fail("platform_x", self.platform_x, f"more than a platform's length, {self.platform[0]}, apart")
 
 
 class Go1Bridge(Duel):
     """Traverse Bridge.
 
-    - Scene: two platforms, 1 m high, and between them a bridge 0.7 m wide; the robots start on one each.
+    - Scene: two platforms, 1 m high, joined by a bridge 0.7 m wide; one robot is spawned on each.
     - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
     - Reward: see `BridgeRewards`; zero-sum.
-    - End: one is off the bridge or has fallen, or 20 s. Win: the opponent is, or at the time limit one is on the
-      opponent's platform and the opponent is not on one's own.
+    - End: a robot is off the bridge or has fallen, or 20 s. Win: the opponent is off or has fallen, or at the time
+      limit only this robot is on the other's platform.
 
     Source: paper, section III.
     """
@@ -83,11 +87,10 @@ class Go1Bridge(Duel):
 
     @property
     def center(self) -> tuple[float, float]:
-        """Between the platforms, m."""
+        """The midpoint between the platforms, m."""
         return sum(self.params.platform_x) / 2, 0.0
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
         first, second = params.platform_x
         length, width = params.platform
@@ -98,38 +101,37 @@ class Go1Bridge(Duel):
         middle = (*self.center, params.top)
         span = second - first - length
         deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
-        track = Track(blocks=(Init(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
+        track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
         contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(*blocks, deck), colors=(0, 2))
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
-        """Says where the robots start, x, y, yaw of each, m and rad: one on each platform, facing the bridge."""
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
+        """One robot on each platform, facing the bridge."""
         first, second = self.params.spawn_x
         return (first, 0.0, 0.0), (second, 0.0, np.pi)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
-        out = self.lost(readings)
-        terms = {"win": self.versus(out[::-1] & ~out), "far_side": self.versus(self.across(readings))}
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        out = self.eliminated(robot_state)
+        terms = {"win": self.zero_sum(out[::-1] & ~out), "far_side": self.zero_sum(self.across(robot_state))}
         return terms, None
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
-        """Which robots are off the bridge or have fallen (2,) bool."""
-        return self.fallen(readings) | (readings.position_w[:, 2] < self.params.off_height)
+    def eliminated(self, robot_state: RobotState) -> jax.Array:
+        """Returns which robots are off the bridge or have fallen (2,) bool."""
+        return self.fallen(robot_state) | (robot_state.position_w[:, 2] < self.params.off_height)
 
-    def across(self, readings: RobotReadings) -> jax.Array:
-        """Which robots are on the opponent's platform (2,) bool."""
+    def across(self, robot_state: RobotState) -> jax.Array:
+        """Returns which robots are on the opponent's platform (2,) bool."""
         params = self.params
-        x, height = readings.position_w[:, 0], readings.position_w[:, 2]
+        x, height = robot_state.position_w[:, 0], robot_state.position_w[:, 2]
         first, second = params.platform_x
         half = params.platform[0] / 2
         reached = jnp.stack([x[0] > second - half, x[1] < first + half])
         return reached & (height > params.top)
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
-        """On the opponent's platform."""
-        return self.across(readings)
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
+        """A robot leads while it is on the opponent's platform."""
+        return self.across(robot_state)
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
-        """One is off the bridge or has fallen."""
-        return jnp.any(self.lost(readings))
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
+        """The episode ends when a robot is off the bridge or has fallen."""
+        return jnp.any(self.eliminated(robot_state))

@@ -1,6 +1,6 @@
-"""go1football-1vs1 and go1football-2vs2, and the field, the ball and the kick-off that all football tasks share.
+"""go1football-1vs1 and go1football-2vs2, and the field, ball and kick-off poses shared by all football tasks.
 
-The field lies between x 2 and 12; its goals are the gaps in the thick walls behind both goal lines.
+The field extends from x 2 to 12; the goals are gaps in the thick walls behind both goal lines.
 """
 
 from __future__ import annotations
@@ -16,49 +16,57 @@ from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.match import Match
-from mqe_jax.envs.observation import BASE_INFO, ONE_HOT, Block, ObservationLayout, others
-from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
+from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.objects import Ball
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
-# Middles of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
+# Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
 _GOAL_DEPTH = 1.0  # m
 
 BALL_BLOCKS = (Block("ball", 3, "centre, m"), Block("ball_velocity", 3, "m/s"))
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class FootballParams(TaskParams):
     """Parameters of all football tasks.
 
     Attributes:
         field_width: m.
-        goal_width: of the mouths, m.
+        goal_width: of the goal mouths, m.
         wall_height: of all walls, m.
         ball_radius: m.
         ball_mass: kg.
-        ball_drag: resistance to its motion, N s/m.
+        ball_drag: linear drag coefficient, N s/m.
         ball_noise: half-width of the uniform noise on the ball's position at reset, m.
     """
 
-    episode_length: float = 20.0
-    field_width: float = 9.0
-    goal_width: float = 2.0
-    wall_height: float = 1.0
-    ball_radius: float = 0.1
-    ball_mass: float = 0.318
-    ball_drag: float = 0.1
-    ball_noise: float = 0.0
+    episode_length: Positive = 20.0
+    field_width: Positive = 9.0
+    goal_width: Positive = 2.0
+    wall_height: Positive = 1.0
+    ball_radius: Positive = 0.1
+    ball_mass: Positive = 0.318
+    ball_drag: NonNegative = 0.1
+    ball_noise: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_gap("goal_width", self.goal_width, self.field_width)
 
 
 class Football(QuadrupedEnv):
-    """Base of the football tasks: the field, the ball and where everything starts.
+    """Base of the football tasks: the field, the ball and the kick-off.
 
-    A task says its robots' kick-off poses x, y, yaw (m, rad), its ball's place (m) and its robots' colours.
+    Attributes:
+        kick_off: spawn pose x, y, yaw of each robot, m and rad.
+        ball_spot: x, y of the ball at reset, m.
+        colors: of the robots, as in `Scene`.
     """
 
     kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()
@@ -66,25 +74,25 @@ class Football(QuadrupedEnv):
     colors: ClassVar[tuple[int, ...]] = ()
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
         goal = Gate(_GOAL_DEPTH, width=params.goal_width, depth=_GOAL_DEPTH)
         length = float(GOALS[0, 0] - GOALS[1, 0])
         track = Track(
-            blocks=(Init(1.0), goal, Plane(length), goal, Closing()), width=params.field_width,
+            blocks=(SpawnArea(1.0), goal, Plane(length), goal, EndWall()),
+            width=params.field_width,
             wall_height=params.wall_height,
-        )  # fmt: skip
+        )
         ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
         contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         robots = len(self.kick_off)
         return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
-        """Says where the robots start, x, y, yaw of each, m and rad."""
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
+        """The kick-off poses."""
         return self.kick_off
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Puts the ball on its spot."""
+        """Samples the ball's initial position about its spot."""
         params = self.params
         noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)
         position = jnp.array([*self.ball_spot, params.ball_radius]).at[:2].add(noise)
@@ -104,21 +112,21 @@ class Football(QuadrupedEnv):
         return jnp.stack([x > GOALS[0, 0], x < GOALS[1, 0]]) & (jnp.abs(y) < self.params.goal_width / 2)
 
     def goal_distance(self, data: mjx.Data) -> jax.Array:
-        """Returns the ball's horizontal distance to the middle of each goal line of `GOALS` (2,), m."""
+        """Returns the ball's horizontal distance to the midpoint of each goal line of `GOALS` (2,), m."""
         return jnp.linalg.norm(self.ball(data)[:2] - GOALS, axis=-1)
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class FootballMatchRewards:
-    """Weights of the reward terms; every side's own less the opponent's.
+    """Weights of the reward terms; each is a team's own term minus the opponents'.
 
-    The release has no rewards for these matches; all terms beside the goal are ours.
+    The released system defines no rewards for these matches; all terms except the goal are this package's.
 
     Attributes:
         goal: when the ball is in the goal that the team attacks, which ends the episode.
-        progress: per m by which the ball came closer to the middle of that goal.
-        approach: per m by which the team's robot nearest to the ball came closer to it.
-        fall: when a robot of the team has fallen, which ends the episode as a lost one.
+        progress: per m of decrease of the ball's distance to the midpoint of that goal.
+        approach: per m of decrease of the distance between the ball and the team's nearest robot.
+        fall: when a robot of the team has fallen, which ends and loses the match.
     """
 
     goal: float = 10.0
@@ -127,35 +135,37 @@ class FootballMatchRewards:
     fall: float = -10.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Football1vs1Params(FootballParams):
     """Parameters of Football (1 vs 1).
 
     Attributes:
-        rewards: weights.
+        rewards: weights of the reward terms.
     """
 
     rewards: FootballMatchRewards = FootballMatchRewards()
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Football2vs2Params(FootballParams):
     """Parameters of Football (2 vs 2).
 
     Attributes:
-        rewards: weights.
+        rewards: weights of the reward terms.
     """
 
-    num_agents: int = 4
+    num_agents: PositiveInt = 4
     rewards: FootballMatchRewards = FootballMatchRewards()
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FootballMatchState:
-    """After the last step: distances of the ball, m, for each team.
+    """The task's own state.
 
-    `goal`: to the middle of the goal that it attacks (2,); `robot`: to its nearest robot (2,).
+    Attributes:
+        goal: distance of the ball to the goal that each team attacks, after the last step (2,), m.
+        robot: distance of the ball to each team's nearest robot, after the last step (2,), m.
     """
 
     goal: jax.Array
@@ -165,39 +175,37 @@ class FootballMatchState:
 class FootballMatch(Football, Match):
     """Base of the football matches.
 
-    - Scene: the field with the ball in its middle. Team 0 attacks the goal at x 12, team 1 that at x 2.
-    - Observation, own side first: one-hot within the team, own base info 6, mate's, opponents', ball position 3,
-      ball velocity 3.
+    - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at x 2.
+    - Observation, in the team's own frame: one-hot within the team, own base info 6, mate's, opponents', ball
+      position 3, ball velocity 3.
     - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
     - End: a goal, a fall, or 20 s. Win: a goal, or the opponents' fall.
 
-    Source: paper, section III; rewards and observations as the released system leaves them open.
+    Source: paper, section III; the released system leaves rewards and observations undefined.
     """
 
     @property
     def center(self) -> tuple[float, float]:
-        """The middle of the field, m."""
+        """The centre of the field, m."""
         return float(GOALS[:, 0].mean()), 0.0
 
     def reset_task(
-        self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array
+        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array
     ) -> FootballMatchState:
-        """Returns the task's own fields of a fresh world."""
-        return self.distances(readings, data)
+        return self.distances(robot_state, data)
 
-    def distances(self, readings: RobotReadings, data: mjx.Data) -> FootballMatchState:
-        """Returns the ball's distances to what matters to each team, m."""
-        apart = jnp.linalg.norm(readings.position_w[:, :2] - self.ball(data)[:2], axis=-1)
+    def distances(self, robot_state: RobotState, data: mjx.Data) -> FootballMatchState:
+        """Returns the ball's distances to goals and robots."""
+        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - self.ball(data)[:2], axis=-1)
         return FootballMatchState(self.goal_distance(data), jnp.min(apart.reshape(2, -1), axis=1))
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         team = self.num_agents // 2
         mate = (Block("mate", 6 * (team - 1), BASE_INFO),) if team > 1 else ()
         return ObservationLayout(
             (
-                Block("one_hot", team, ONE_HOT + " within its team"),
+                one_hot(team, "agent's id within its team"),
                 Block("base", 6, BASE_INFO),
                 *mate,
                 Block("opponents", 6 * team, BASE_INFO),
@@ -205,37 +213,38 @@ class FootballMatch(Football, Match):
             )
         )
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (A, width), each in its agent's frame."""
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+        """Blocks (A, width), each in its agent's own frame."""
         team, side = self.num_agents // 2, self.team_of
-        both = self.views(readings.base_info).reshape(2, 2, team, 6)  # as seen by a team, of a team
+        both = self.views(robot_state.base_info).reshape(2, 2, team, 6)  # (observing team, observed team, robot, info)
         own, opponents = both[[0, 1], [0, 1]], both[[0, 1], [1, 0]].reshape(2, -1)
         blocks = {
-            "one_hot": jnp.tile(jnp.eye(team), (2, 1)), "base": own.reshape(-1, 6), "opponents": opponents[side],
+            "one_hot": jnp.tile(jnp.eye(team), (2, 1)),
+            "base": own.reshape(-1, 6),
+            "opponents": opponents[side],
             "ball": self.view_points(self.ball(state.data))[side],
             "ball_velocity": self.view_vectors(self.ball_velocity(state.data))[side],
-        }  # fmt: skip
+        }
         if team > 1:
             blocks["mate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
         return blocks
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
-        after = self.distances(readings, state.data)
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        after = self.distances(robot_state, state.data)
         terms = {
-            "goal": self.versus(self.in_goal(state.data)),
-            "progress": self.versus(state.task.goal - after.goal),
-            "approach": self.versus(state.task.robot - after.robot),
-            "fall": self.versus(self.lost(readings)),
+            "goal": self.zero_sum(self.in_goal(state.data)),
+            "progress": self.zero_sum(state.task.goal - after.goal),
+            "approach": self.zero_sum(state.task.robot - after.robot),
+            "fall": self.zero_sum(self.eliminated(robot_state)),
         }
         return terms, after
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
-        """A goal ends the episode."""
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
+        """The episode ends with a goal."""
         return jnp.any(self.in_goal(state.data))
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
-        """The ball is in the goal that the team attacks."""
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
+        """A team leads while the ball is in the goal that it attacks."""
         return self.in_goal(state.data)
 
 
@@ -255,6 +264,6 @@ class Go1Football2vs2(FootballMatch):
     name = "go1football-2vs2"
     title = "Football (2 vs 2)"
     Params: ClassVar[type[TaskParams]] = Football2vs2Params
-    # The second half is the first turned about the middle: both sides see the same kick-off.
+    # The second team's poses are the first's after a half turn about the centre.
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 2.0, np.pi), (10.0, -2.0, np.pi))
     colors = (0, 1, 2, 3)

@@ -1,4 +1,4 @@
-"""go1football-defender, the paper's Football (2 vs 1): two robots against one that defends its goal by a rule."""
+"""go1football-defender, the paper's Football (2 vs 1): two robots against a scripted defender."""
 
 from __future__ import annotations
 
@@ -15,30 +15,31 @@ from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.npc import defend
-from mqe_jax.robots.index import RobotReadings
-from mqe_jax.walk_policy import command_index, default_commands
+from mqe_jax.robots.index import RobotState
+from mqe_jax.settings import record
+from mqe_jax.walk_policy import command_index
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class DefenderRewards:
     """Weights of the reward terms.
 
     Attributes:
         goal: while the ball is in the goal.
-        nearness: times exp(-distance of the ball to the goal's middle / 3 m).
+        nearness: of exp(-distance of the ball to the goal's midpoint / 3 m).
     """
 
     goal: float = 10.0
     nearness: float = 3.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class DefenderParams(FootballParams):
     """Parameters of Football (2 vs 1).
 
     Attributes:
-        defender_idle: the defender stands still.
-        rewards: weights.
+        defender_idle: whether the defender stands still.
+        rewards: weights of the reward terms.
     """
 
     defender_idle: bool = False
@@ -48,7 +49,11 @@ class DefenderParams(FootballParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DefenderState:
-    """`scored`: whether the ball has been in the goal in this episode () bool."""
+    """The task's own state.
+
+    Attributes:
+        scored: whether the ball has been in the goal in this episode () bool.
+    """
 
     scored: jax.Array
 
@@ -71,38 +76,35 @@ class Go1FootballDefender(Football):
     ball_spot = (5.0, -2.1)
     colors = (0, 1, 2)
 
-    def npc_commands(self, state: State, readings: RobotReadings) -> jax.Array:
-        """Returns the defender's walk commands (1, 15)."""
-        commands = jnp.asarray(default_commands(self.params.gait))
+    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array:
+        """Walk commands of the defender (1, 15)."""
+        commands = jnp.asarray(self.controller.default_commands)
         if not self.params.defender_idle:
             move = defend(
-                readings.position_w[2, :2], readings.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
+                robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
             )
             commands = commands.at[np.array([command_index(name) for name in ("vx", "vy", "yaw_rate")])].set(move)
         return commands[None]
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> DefenderState:
-        """Returns the task's own fields of a fresh world."""
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
         return DefenderState(jnp.zeros((), bool))
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, *BALL_BLOCKS))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width)."""
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         return {
-            **pair(readings.base_info[:2]), "ball": for_all(self.ball(state.data), 2),
+            **pair(robot_state.base_info[:2]),
+            "ball": for_all(self.ball(state.data), 2),
             "ball_velocity": for_all(self.ball_velocity(state.data), 2),
-        }  # fmt: skip
+        }
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         goal = self.in_goal(state.data)[0]
         terms = {"goal": goal, "nearness": jnp.exp(-self.goal_distance(state.data)[0] / 3.0)}
         return terms, DefenderState(state.task.scored | goal)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: a goal in this episode."""
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: a goal at any time in this episode."""
         return {"success": state.task.scored}

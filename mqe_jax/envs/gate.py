@@ -1,4 +1,4 @@
-"""go1gate, the paper's Narrow Gate: two robots must pass, one after the other, a gap for one."""
+"""go1gate, the paper's Narrow Gate: two robots pass, one after the other, through a gap wide enough for one."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from mujoco import mjx
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
-from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.settings import NonNegative, Positive, record
+from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class GateRewards:
     """Weights of the reward terms.
 
     Attributes:
         success: per robot past the gate.
-        approach: per m by which a robot came closer to its target.
-        crowding: per robot and 1 / d^2 while the robots are closer than 0.5 m.
-        collision: when any trunk touches anything.
+        approach: per m of decrease of a robot's distance to its target.
+        crowding: per robot and 1 / d^2 while the distance d between the robots is below 0.5 m.
+        collision: in steps in which any trunk touches anything.
     """
 
     success: float = 5.0
@@ -37,40 +38,48 @@ class GateRewards:
     collision: float = -2.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class GateParams(TaskParams):
     """Parameters of Narrow Gate.
 
     Attributes:
         track_width: m.
         gate_width: of the gap, m.
-        gate_depth: of the wall along x, m.
+        gate_depth: thickness of the wall along x, m.
         gate_random: half-widths of the range of the gap's centre in x and y, m.
-        past_gate: a robot is through when it is so far behind the gate's centre, m.
+        past_gate: distance behind the gate's centre at which a robot counts as through, m.
         target_x: x of the robots' targets, m.
-        target_y: y of the targets, m; the robots cross: the first goes to the left.
-        rewards: weights.
+        target_y: |y| of the targets, m; the robots' paths cross: the first robot's target is on the left.
+        rewards: weights of the reward terms.
     """
 
-    episode_length: float = 10.0
-    spawn_noise: float = 0.0
+    episode_length: Positive = 10.0
+    spawn_noise: NonNegative = 0.0
     min_height: float = 0.08
     max_height: float = 1.5
     end_on_collision: bool = True
-    track_width: float = 3.0
-    gate_width: float = 0.6
-    gate_depth: float = 0.1
-    gate_random: tuple[float, float] = (0.5, 0.5)
+    track_width: Positive = 3.0
+    gate_width: Positive = 0.6
+    gate_depth: Positive = 0.1
+    gate_random: tuple[NonNegative, NonNegative] = (0.5, 0.5)
     past_gate: float = 0.25
     target_x: float = 5.5
     target_y: float = 0.75
     rewards: GateRewards = GateRewards()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_gap("gate_width", self.gate_width, self.track_width)
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GateState:
-    """`distance`: of each robot to its target after the last step (2,), m."""
+    """The task's own state.
+
+    Attributes:
+        distance: of each robot to its target after the last step (2,), m.
+    """
 
     distance: jax.Array
 
@@ -91,44 +100,39 @@ class Go1Gate(QuadrupedEnv):
     Params: ClassVar[type[TaskParams]] = GateParams
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
         gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
-        track = Track(blocks=(Init(2.0), gate, Plane(1.0), Closing()), width=params.track_width)
+        track = Track(blocks=(SpawnArea(2.0), gate, Plane(1.0), EndWall()), width=params.track_width)
         contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk", "foot"), object=())
         return Scene(track, num_robots=2, contacts=contacts)
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> GateState:
-        """Returns the task's own fields of a fresh world."""
-        return GateState(self.target_distance(readings))
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> GateState:
+        return GateState(self.target_distance(robot_state))
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, GATE))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width)."""
-        return {**pair(readings.base_info), "gate": for_all(state.gates, 2)}
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+        return {**pair(robot_state.base_info), "gate": for_all(state.anchors, 2)}
 
-    def target_distance(self, readings: RobotReadings) -> jax.Array:
+    def target_distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to its target (2,), m."""
         params = self.params
         target = np.array([[params.target_x, params.target_y], [params.target_x, -params.target_y]], np.float32)
-        return jnp.linalg.norm(readings.position_w[:, :2] - target, axis=-1)
+        return jnp.linalg.norm(robot_state.position_w[:, :2] - target, axis=-1)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
-        distance = self.target_distance(readings)
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        distance = self.target_distance(robot_state)
         terms = {
-            "success": reward.past(readings.position_w[:, 0], state.gates[0, 0], self.params.past_gate),
+            "success": reward.past(robot_state.position_w[:, 0], state.anchors[0, 0], self.params.past_gate),
             "approach": reward.decrease(state.task.distance, distance),
-            "crowding": reward.crowding(readings.position_w[:, :2]),
+            "crowding": reward.crowding(robot_state.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
         }
         return terms, GateState(distance)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: both robots are through; `success/one`: at least one is, however the episode ended."""
-        through = readings.position_w[:, 0] > state.gates[0, 0] + self.params.past_gate
+        through = robot_state.position_w[:, 0] > state.anchors[0, 0] + self.params.past_gate
         return {"success": jnp.all(through) & ~failed, "success/one": jnp.any(through)}

@@ -1,7 +1,7 @@
 """Matches: two teams of the same size against each other, with zero-sum rewards and mirrored observations.
 
-A match looks the same from both sides after a half turn about its centre ("turn") or after a reflection across the
-track ("reflect"). Every agent observes the world so that its own side is the first: one policy plays both.
+A match is symmetric under a half turn about its centre ("turn") or a reflection in the x-z plane ("reflect"). Agents of
+team 1 observe in the frame so transformed, so that one policy plays both sides.
 
 Team 0 has the first half of the agents, team 1 the second half.
 """
@@ -17,12 +17,12 @@ import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.robots.go1 import NUM_JOINTS
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import NUM_JOINTS
 
-# How a command changes where left and right are swapped.
+# Sign of a command under reflection.
 _MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}
-# Joints of the other side's legs (FL <-> FR, RL <-> RR), and how they turn there: the hips the other way.
+# Joints of the opposite legs (FL <-> FR, RL <-> RR), and their signs under reflection: hip abduction flips.
 _OTHER_SIDE = np.arange(NUM_JOINTS).reshape(4, 3)[[1, 0, 3, 2]].ravel()
 _OTHER_SIGN = np.tile([-1.0, 1.0, 1.0], 4).astype(np.float32)
 
@@ -30,24 +30,26 @@ _OTHER_SIGN = np.tile([-1.0, 1.0, 1.0], 4).astype(np.float32)
 class Match(QuadrupedEnv):
     """Base of the competitive tasks.
 
-    Reward: every side has terms of its own, and gets them less the opponent's: what one gains the other loses.
-    Result: a team that has lost outright (`lost`: a robot of it has fallen, in all matches) loses unless both have;
-    otherwise the team that is `ahead` wins, and it is a draw if both or none are.
-    Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended now; they count when it
-    ends. `success` is a win of team 0. A diverged world is a draw.
+    Reward: zero-sum; each term is the team's own minus the opponents'.
+    Result: an `eliminated` team (by default one with a fallen robot) loses unless both are; otherwise the `leading`
+    team wins, and it is a draw if both or neither lead.
+    Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended in this step; they are
+    evaluated at its end. `success` is a win of team 0. Diverged physics is a draw.
+
+    Attributes:
+        symmetry: 'turn' or 'reflect'.
     """
 
     symmetry: ClassVar[str] = "turn"
-    if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
+    metrics_if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
 
     @property
     def center(self) -> tuple[float, float]:
-        """The point about which the match is symmetric, m."""
+        """The centre of symmetry (x, y), m."""
         return 0.0, 0.0
 
     @property
     def teams(self) -> tuple[tuple[int, ...], ...]:
-        """Agents of each team."""
         half = self.num_agents // 2
         return tuple(range(half)), tuple(range(half, self.num_agents))
 
@@ -56,25 +58,25 @@ class Match(QuadrupedEnv):
         """Team of each agent (A,)."""
         return np.repeat([0, 1], self.num_agents // 2)
 
-    # -- what a match says ----------------------------------------------------------------------------------------
+    # -- task interface (override) ------------------------------------------------------------------------------
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
-        """Returns which team has lost outright (2,) bool: one of its robots has fallen."""
-        return jnp.any(self.fallen(readings).reshape(2, -1), axis=1)
+    def eliminated(self, robot_state: RobotState) -> jax.Array:
+        """Returns which team is eliminated (2,) bool: by default one with a fallen robot."""
+        return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
 
-    def ahead(self, state: State, readings: RobotReadings) -> jax.Array:
-        """Returns which team is ahead where none has lost outright (2,) bool."""
+    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
+        """Returns which team leads if neither is eliminated (2,) bool."""
         return jnp.zeros(2, bool)
 
-    def wins(self, state: State, readings: RobotReadings) -> jax.Array:
-        """Returns which team wins if the episode ends now (2,) bool, one at most."""
-        lost, ahead = self.lost(readings), self.ahead(state, readings)
-        return jnp.where(jnp.any(lost), lost[::-1] & ~lost, ahead & ~ahead[::-1])
+    def wins(self, state: State, robot_state: RobotState) -> jax.Array:
+        """Returns which team wins if the episode ends in this step (2,) bool, at most one."""
+        out, leading = self.eliminated(robot_state), self.leading(state, robot_state)
+        return jnp.where(jnp.any(out), out[::-1] & ~out, leading & ~leading[::-1])
 
-    # -- both sides' views ----------------------------------------------------------------------------------------
+    # -- both teams' frames -------------------------------------------------------------------------------------
 
     def views(self, info: jax.Array) -> jax.Array:
-        """Shows base information (R, 6), position and roll, pitch, yaw, to both teams: (2, R, 6)."""
+        """Transforms base information (R, 6), position and roll, pitch, yaw, to both teams' frames: (2, R, 6)."""
         position, (roll, pitch, yaw) = self.view_points(info[:, :3])[1], jnp.moveaxis(info[:, 3:], -1, 0)
         if self.symmetry == "turn":
             euler = jnp.stack([roll, pitch, jnp.arctan2(-jnp.sin(yaw), -jnp.cos(yaw))], axis=-1)
@@ -83,17 +85,17 @@ class Match(QuadrupedEnv):
         return jnp.stack([info, jnp.concatenate([position, euler], axis=-1)])
 
     def view_points(self, points: jax.Array) -> jax.Array:
-        """Shows points (..., 3), m, to both teams: (2, ..., 3)."""
+        """Transforms points (..., 3), m, to both teams' frames: (2, ..., 3)."""
         middle = jnp.array([*self.center, 0.0])
         return self.view_vectors(points - middle) + middle
 
     def view_vectors(self, vectors: jax.Array) -> jax.Array:
-        """Shows vectors (..., 3), such as velocities, to both teams: (2, ..., 3)."""
+        """Transforms vectors (..., 3), such as velocities, to both teams' frames: (2, ..., 3)."""
         other = jnp.array([-1.0, -1.0, 1.0] if self.symmetry == "turn" else [1.0, -1.0, 1.0])
         return jnp.stack([vectors, vectors * other])
 
-    def to_world(self, action: jax.Array) -> jax.Array:
-        """Mirrors the actions (A, action_size) of team 1 where it sees left and right swapped."""
+    def unmirror_action(self, action: jax.Array) -> jax.Array:
+        """Reflects the actions (A, action_size) of team 1 where its frame is reflected."""
         if self.symmetry == "turn":
             return action
         if self.control == "command":
@@ -103,16 +105,16 @@ class Match(QuadrupedEnv):
             mirrored = action[:, _OTHER_SIDE] * _OTHER_SIGN
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)
 
-    # -- rewards and result ---------------------------------------------------------------------------------------
+    # -- rewards and result -------------------------------------------------------------------------------------
 
-    def versus(self, own: jax.Array) -> jax.Array:
-        """Turns both teams' own terms (2,) into zero-sum ones of every agent (A,)."""
+    def zero_sum(self, own: jax.Array) -> jax.Array:
+        """Returns each agent's zero-sum term (A,) from both teams' own terms (2,)."""
         own = jnp.asarray(own, jnp.float32)
         return (own - own[::-1])[self.team_of]
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
-        """Win, draw and loss of each team; `success` is a win of team 0."""
-        wins = self.wins(state, readings)
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Win, draw and loss of each team; success: team 0 wins."""
+        wins = self.wins(state, robot_state)
         result = {}
         for team in (0, 1):
             result[f"team{team}/win"] = wins[team]
@@ -122,14 +124,13 @@ class Match(QuadrupedEnv):
 
 
 class Duel(Match):
-    """Base of the matches of one robot against one: each observes itself and the other, in its own frame."""
+    """Base of the matches of one robot against one: each observes both robots in its own frame."""
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width), each in its agent's frame."""
-        views = self.views(readings.base_info)
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+        """Blocks (2, width), each in its agent's own frame."""
+        views = self.views(robot_state.base_info)
         return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}

@@ -1,21 +1,31 @@
-"""Observation layouts: the order and width of an observation's blocks, written once per task."""
+"""Observation layouts: the order and width of an observation's blocks, defined once per task."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """One block of an observation: its name, width and meaning (with unit and frame)."""
+    """One block of an observation.
+
+    Attributes:
+        name: unique in the layout.
+        width: number of entries.
+        meaning: with unit and frame.
+        categorical: whether the entries encode a category, such as a one-hot, and get no observation noise.
+    """
 
     name: str
     width: int
     meaning: str = ""
+    categorical: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,17 +48,32 @@ class ObservationLayout:
         """Names of the blocks in order."""
         return tuple(block.name for block in self.blocks)
 
+    @functools.cached_property
+    def continuous(self) -> np.ndarray:
+        """1 where an entry is a continuous quantity, 0 where it is categorical (size,)."""
+        return np.repeat(
+            [0.0 if block.categorical else 1.0 for block in self.blocks], [block.width for block in self.blocks]
+        ).astype(np.float32)
+
     def slice(self, name: str) -> slice:
-        """Returns where a block lies in the vector."""
+        """Returns the position of a block in the vector.
+
+        Raises:
+            KeyError: if there is no such block.
+        """
         start = 0
         for block in self.blocks:
             if block.name == name:
                 return slice(start, start + block.width)
             start += block.width
-        raise ValueError(f"observation block: unknown name {name!r}; allowed: {', '.join(self.names)}")
+        raise KeyError(f"observation block: unknown name {name!r}; allowed: {', '.join(self.names)}")
 
     def pack(self, values: Mapping[str, jax.Array]) -> jax.Array:
-        """Concatenates named blocks (A, width) into observations (A, size), checking names and widths."""
+        """Concatenates named blocks (..., width) into observations (..., size).
+
+        Raises:
+            ValueError: if names or widths do not match the layout.
+        """
         if set(values) != set(self.names):
             raise ValueError(f"observation: blocks {sorted(values)} do not match the layout {sorted(self.names)}")
         parts = []
@@ -61,14 +86,24 @@ class ObservationLayout:
             parts.append(part)
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
+    def split(self, observation: jax.Array) -> dict[str, jax.Array]:
+        """Returns the blocks (..., width) of observations (..., size) by name: the inverse of `pack`."""
+        return {name: observation[..., self.slice(name)] for name in self.names}
+
     def __str__(self) -> str:
         return " | ".join(f"{block.name} {block.width}" for block in self.blocks) + f" = {self.size}"
 
 
-ONE_HOT = "agent's id"
 BASE_INFO = "position, m, and roll, pitch, yaw, rad; environment frame"
-# The first blocks of two robots that work together; `pair` fills them.
-PAIR = (Block("one_hot", 2, ONE_HOT), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO))
+
+
+def one_hot(agents: int, meaning: str = "agent's id") -> Block:
+    """Returns the block of a one-hot encoding of `agents` agents."""
+    return Block("one_hot", agents, meaning, categorical=True)
+
+
+# The first blocks of two cooperating robots; `pair` fills them.
+PAIR = (one_hot(2), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO))
 GATE = Block("gate", 2, "centre of the gap, m")
 
 
@@ -78,12 +113,12 @@ def pair(info: jax.Array) -> dict[str, jax.Array]:
 
 
 def others(values: jax.Array) -> jax.Array:
-    """Gives every agent the other agents' rows, in order: (A, D) -> (A, (A - 1) D)."""
+    """Returns, for every agent, the other agents' rows in order: (A, D) -> (A, (A - 1) D)."""
     count = values.shape[0]
     rows = [jnp.delete(values, agent, axis=0, assume_unique_indices=True).reshape(-1) for agent in range(count)]
     return jnp.stack(rows)
 
 
 def for_all(value: jax.Array, agents: int) -> jax.Array:
-    """Gives every agent the same vector: (D,) -> (A, D)."""
+    """Repeats a vector for every agent: (D,) -> (A, D)."""
     return jnp.broadcast_to(value.reshape(-1), (agents, value.size))

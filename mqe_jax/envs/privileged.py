@@ -1,4 +1,4 @@
-"""The privileged observation: everything that is in the simulator, for critics and distillation."""
+"""The privileged observation: the simulator's state and randomised physics, for critics and distillation."""
 
 from __future__ import annotations
 
@@ -9,42 +9,112 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs.observation import Block, ObservationLayout
-from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotIndex, RobotReadings
+from mqe_jax.envs.randomization import RandomizedParams
+from mqe_jax.robots.index import RobotIndex, RobotState
+from mqe_jax.robots.robot import Robot
+from mqe_jax.walk_policy import WalkMemory
 
 _ROBOT = (
-    Block("position", 3, "m"), Block("quaternion", 4, "wxyz"), Block("linear_velocity", 3, "m/s, world"),
-    Block("angular_velocity", 3, "rad/s, body"), Block("joint_position", 12, "rad, minus default"),
+    Block("position", 3, "m"),
+    Block("quaternion", 4, "wxyz"),
+    Block("linear_velocity", 3, "m/s, world"),
+    Block("angular_velocity", 3, "rad/s, body"),
+    Block("joint_position", 12, "rad, minus default"),
     Block("joint_velocity", 12, "rad/s"),
-)  # fmt: skip
+)
 
 
 class PrivilegedObservation:
-    """Full state of the R robots, of everything else that moves, and of the gates.
+    """State of the R robots and all other moving bodies, anchors, randomised physics, gait phases, contact forces.
+
+    The randomised physics is included whether it is randomised or not, so that the layout does not depend on the
+    ranges.
+
+    Args:
+        robot: all robots of the task.
+        model: the compiled model.
+        index: its robots.
+        num_anchors: G.
+        gait: whether the robots walk by the walk policy, whose gait phases are then included.
+        contact_forces: whether the scene measures the feet's contact forces, which are then included with the trunks'.
 
     Attributes:
-        layout: its blocks, in order; raw units.
+        layout: its blocks, in order; physical units, not normalised.
     """
 
-    def __init__(self, model: mujoco.MjModel, index: RobotIndex, num_gates: int) -> None:
-        robots = range(index.num_robots)
+    def __init__(
+        self,
+        robot: Robot,
+        model: mujoco.MjModel,
+        index: RobotIndex,
+        *,
+        num_anchors: int,
+        gait: bool,
+        contact_forces: bool,
+    ) -> None:
+        count = index.num_robots
+        self._default_joints = robot.default_joints
+        self._foot_force = index.foot_force if contact_forces else None
         self._qpos = np.setdiff1d(np.arange(model.nq), np.concatenate([index.base_qpos, index.joint_qpos], axis=1))
         self._qvel = np.setdiff1d(np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1))
-        blocks = (
-            *(Block(f"robot{i}/{block.name}", block.width, block.meaning) for i in robots for block in _ROBOT),
-            Block("objects/qpos", len(self._qpos), "positions of everything that is no robot"),
-            Block("objects/qvel", len(self._qvel), "velocities of everything that is no robot"),
-            Block("gates", 2 * num_gates, "centres, m"),
+        robot_blocks = [
+            Block(f"robot{i}/{part.name}", part.width, part.meaning) for i in range(count) for part in _ROBOT
+        ]
+        self.layout = ObservationLayout(
+            tuple(
+                block
+                for block in (
+                    *robot_blocks,
+                    Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
+                    Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
+                    Block("anchors", 2 * num_anchors, "x, y of each, m"),
+                    Block("friction", count, "sliding friction of each robot"),
+                    Block("payload", count, "of each robot, kg"),
+                    Block("center_of_mass", 3 * count, "shift of each robot's, m"),
+                    Block("motor_strength", count, "factor on each robot's torques"),
+                    Block("action_lag", 1, "environment steps"),
+                    Block("gait_phase", 2 * count if gait else 0, "sine and cosine of each robot's"),
+                    Block("contact_force", 5 * count if contact_forces else 0, "on each robot's trunk and feet, N"),
+                )
+                if block.width
+            )
         )
-        self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 
-    def observe(self, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> jax.Array:
-        """Returns the observation of one world (P,)."""
+    def observe(
+        self,
+        robot_state: RobotState,
+        data: mjx.Data,
+        anchors: jax.Array,
+        randomized: RandomizedParams,
+        walk: WalkMemory | None,
+    ) -> jax.Array:
+        """Returns the observation of one environment (P,); `walk` is the memory of the walk policy, leading axis R."""
         robots = jnp.concatenate(
             [
-                readings.position_w, readings.quaternion, readings.linear_velocity_w, readings.angular_velocity_b,
-                readings.joint_position - go1.DEFAULT_JOINTS, readings.joint_velocity,
+                robot_state.position_w,
+                robot_state.quaternion,
+                robot_state.linear_velocity_w,
+                robot_state.angular_velocity_b,
+                robot_state.joint_position - self._default_joints,
+                robot_state.joint_velocity,
             ],
             axis=-1,
-        )  # fmt: skip
-        return jnp.concatenate([robots.ravel(), data.qpos[self._qpos], data.qvel[self._qvel], gates.ravel()])
+        )
+        parts = [
+            robots,
+            data.qpos[self._qpos],
+            data.qvel[self._qvel],
+            anchors,
+            randomized.friction,
+            randomized.payload,
+            randomized.center_of_mass,
+            randomized.motor_strength,
+            randomized.action_lag.astype(jnp.float32),
+        ]
+        if walk is not None:
+            angle = 2 * jnp.pi * walk.gait
+            parts.append(jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1))
+        if self._foot_force is not None:
+            feet = jnp.linalg.norm(data.sensordata[self._foot_force], axis=-1)
+            parts.append(jnp.concatenate([robot_state.trunk_force[:, None], feet], axis=-1))
+        return jnp.concatenate([part.ravel() for part in parts])

@@ -1,4 +1,4 @@
-"""go1pushbox, the paper's Push Box: two robots push a box, hard to push for one, through a gate."""
+"""go1pushbox, the paper's Push Box: two robots push a box, which is hard to push for one, through a gate."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
-from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.objects import Box
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Track
+from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class PushBoxRewards:
     """Weights of the reward terms.
 
     Attributes:
-        progress: per m that the box moved along x.
+        progress: per m of the box's displacement along x.
         success: while the box is past the gate.
     """
 
@@ -32,7 +33,7 @@ class PushBoxRewards:
     success: float = 1.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class PushBoxParams(TaskParams):
     """Parameters of Push Box.
 
@@ -40,33 +41,42 @@ class PushBoxParams(TaskParams):
         track_width: m.
         gate_width: of the gap, m.
         gate_random: half-widths of the range of the gap's centre in x and y, m.
-        past_gate: the box is through when its centre is so far behind the gate's, m.
+        past_gate: distance of the box's centre behind the gate's at which it counts as through, m.
         box_size: full extents, m.
         box_mass: kg.
-        box_friction: sliding friction with the ground.
+        box_friction: sliding friction between box and ground.
         box_x: of the box's centre at reset, m.
         box_noise: half-width of the uniform noise on the box's position, m.
-        rewards: weights.
+        rewards: weights of the reward terms.
     """
 
-    episode_length: float = 15.0
-    track_width: float = 5.0
-    gate_width: float = 1.5
-    gate_random: tuple[float, float] = (0.0, 0.5)
+    episode_length: Positive = 15.0
+    track_width: Positive = 5.0
+    gate_width: Positive = 1.5
+    gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
     past_gate: float = 0.0
-    box_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_mass: float = 6.0
-    box_friction: float = 1.0
+    box_size: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    box_mass: Positive = 6.0
+    box_friction: NonNegative = 1.0
     box_x: float = 2.5
-    box_noise: float = 0.5
-    contacts_per_robot: int = 16
+    box_noise: NonNegative = 0.5
+    contacts_per_robot: PositiveInt = 16
     rewards: PushBoxRewards = PushBoxRewards()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_gap("gate_width", self.gate_width, self.track_width)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PushBoxState:
-    """`x`: of the box after the last step (), m; `start`: at the reset (), m."""
+    """The task's own state.
+
+    Attributes:
+        x: of the box after the last step (), m.
+        start: x of the box at the reset (), m.
+    """
 
     x: jax.Array
     start: jax.Array
@@ -75,7 +85,7 @@ class PushBoxState:
 class Go1PushBox(QuadrupedEnv):
     """Push Box.
 
-    - Scene: a track 5 m wide with a box of 1 m and 6 kg before a gate of 1.5 m.
+    - Scene: a track 5 m wide with a box of 1 m and 6 kg in front of a gate of 1.5 m.
     - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2, box x, y, box quaternion 4.
     - Reward: see `PushBoxRewards`; shared.
     - End: a fall, or 15 s. Success: the box is past the gate.
@@ -88,49 +98,46 @@ class Go1PushBox(QuadrupedEnv):
     Params: ClassVar[type[TaskParams]] = PushBoxParams
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
         gate = Gate(5.0, width=params.gate_width, random=params.gate_random)
-        track = Track(blocks=(Init(2.0), gate, Closing()), width=params.track_width)
+        track = Track(blocks=(SpawnArea(2.0), gate, EndWall()), width=params.track_width)
         box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
         contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         return Scene(track, num_robots=2, contacts=contacts, objects=(box,))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draws where the box starts."""
+        """Samples the box's initial position."""
         params = self.params
         noise = jax.random.uniform(key, (2,), minval=-params.box_noise, maxval=params.box_noise)
         pose = jnp.array([params.box_x, 0.0, params.box_size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
         return qpos.at[self.objects["box"].qpos].set(pose), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> PushBoxState:
-        """Returns the task's own fields of a fresh world."""
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PushBoxState:
         x = self.object_pose(data, "box")[0]
         return PushBoxState(x, x)
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, GATE, Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width)."""
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         pose = self.object_pose(state.data, "box")
         return {
-            **pair(readings.base_info), "gate": for_all(state.gates, 2), "box": for_all(pose[:2], 2),
+            **pair(robot_state.base_info),
+            "gate": for_all(state.anchors, 2),
+            "box": for_all(pose[:2], 2),
             "box_quaternion": for_all(pose[3:], 2),
-        }  # fmt: skip
+        }
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         x = self.object_pose(state.data, "box")[0]
         terms = {"progress": x - state.task.x, "success": self.through(state).astype(jnp.float32)}
         return terms, PushBoxState(x, state.task.start)
 
     def through(self, state: State) -> jax.Array:
-        """Whether the box is past the gate () bool."""
-        return self.object_pose(state.data, "box")[0] > state.gates[0, 0] + self.params.past_gate
+        """Returns whether the box is past the gate () bool."""
+        return self.object_pose(state.data, "box")[0] > state.anchors[0, 0] + self.params.past_gate
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: the box is past the gate; `success/way`: how far it came, m."""
-        return {"success": self.through(state), "success/way": state.task.x - state.task.start}
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: the box is past the gate; `success/distance`: its displacement along x, m."""
+        return {"success": self.through(state), "success/distance": state.task.x - state.task.start}

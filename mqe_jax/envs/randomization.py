@@ -1,4 +1,4 @@
-"""Domain randomisation: how the physics of one world differs from the model."""
+"""Domain randomisation: physics parameters that differ between environments."""
 
 from __future__ import annotations
 
@@ -9,53 +9,51 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from mqe_jax.envs.overrides import Range
 from mqe_jax.robots.index import RobotIndex
+from mqe_jax.settings import NonNegative, NonNegativeInt, Positive, Range, fail, record
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Randomization:
-    """Domain randomisation; every range is drawn uniformly at reset, for each robot by itself. None or 0 is off.
+    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables.
 
     Attributes:
-        friction: sliding friction of the robots' shapes (lowest, highest).
-        payload: extra mass of the trunk, kg.
+        friction: sliding friction of the robots' collision shapes (lowest, highest).
+        payload: additional mass of the trunk, kg; its inertia is scaled by the same factor as its mass.
         center_of_mass: shift of the trunk's centre of mass along each axis, m.
         motor_strength: factor on all torques.
-        action_lag: greatest delay of the actuator targets, environment steps; drawn once a world.
-        push: greatest sudden change of a trunk's horizontal velocity, m/s.
+        action_lag: maximum delay of the actuator targets, environment steps; one sample per environment.
+        push: maximum sudden change of a trunk's horizontal velocity, m/s.
         push_period: mean time between pushes, s.
-        observation_noise: standard deviation of the noise on every observed number.
+        observation_noise: standard deviation of the noise on observations, except on one-hot blocks.
     """
 
     friction: Range | None = None
     payload: Range | None = None
     center_of_mass: Range | None = None
     motor_strength: Range | None = None
-    action_lag: int = 0
-    push: float = 0.0
-    push_period: float = 5.0
-    observation_noise: float = 0.0
+    action_lag: NonNegativeInt = 0
+    push: NonNegative = 0.0
+    push_period: Positive = 5.0
+    observation_noise: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("friction", "payload", "center_of_mass", "motor_strength"):
-            value = getattr(self, name)
-            if value is not None and (len(value) != 2 or value[0] > value[1]):
-                raise ValueError(f"randomization.{name}: {value} must be (lowest, highest) or none")
-        if self.action_lag < 0 or self.push < 0 or self.observation_noise < 0 or self.push_period <= 0:
-            raise ValueError("randomization: action_lag, push, observation_noise must be >= 0 and push_period > 0")
+        for name in ("friction", "motor_strength"):
+            span = getattr(self, name)
+            if span is not None and span[0] <= 0:
+                fail(name, span, "two numbers greater than 0 (lowest, highest), or none")
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class World:
-    """How one world differs from the model: its randomised physics (R robots).
+class RandomizedParams:
+    """Randomised physics parameters of one environment (R robots); the model's values where not randomised.
 
     Attributes:
-        friction: (R,).
-        payload: (R,), kg.
-        center_of_mass: (R, 3), m.
-        motor_strength: (R,).
+        friction: sliding friction (R,).
+        payload: additional mass of the trunk (R,), kg.
+        center_of_mass: shift of the trunk's centre of mass (R, 3), m.
+        motor_strength: factor on all torques (R,).
         action_lag: () int32, environment steps.
     """
 
@@ -67,48 +65,59 @@ class World:
 
 
 class Randomizer:
-    """Draws worlds and puts them into the physics."""
+    """Samples randomised physics parameters and applies them to the model.
+
+    Raises:
+        InputError: if the lowest payload leaves a trunk without mass.
+    """
 
     def __init__(self, random: Randomization, model: mujoco.MjModel, index: RobotIndex, friction: float) -> None:
         self.random, self.model, self.index, self.friction = random, model, index, friction
+        mass = float(model.body_mass[index.trunk_body].min())
+        if random.payload is not None and random.payload[0] <= -mass:
+            fail("randomization.payload", random.payload, f"greater than -{mass:.3g} kg, the mass of the trunk")
 
-    def draw(self, key: jax.Array) -> World:
-        """Draws one world."""
+    def sample(self, key: jax.Array) -> RandomizedParams:
+        """Returns the parameters of one environment."""
         random, robots = self.random, self.index.num_robots
         keys = jax.random.split(key, 5)
 
-        def draw(key: jax.Array, span: Range | None, shape: tuple[int, ...], usual: float) -> jax.Array:
+        def uniform(key: jax.Array, span: Range | None, shape: tuple[int, ...], usual: float) -> jax.Array:
             if span is None:
                 return jnp.full(shape, usual)
             return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
 
-        return World(
-            friction=draw(keys[0], random.friction, (robots,), self.friction),
-            payload=draw(keys[1], random.payload, (robots,), 0.0),
-            center_of_mass=draw(keys[2], random.center_of_mass, (robots, 3), 0.0),
-            motor_strength=draw(keys[3], random.motor_strength, (robots,), 1.0),
+        return RandomizedParams(
+            friction=uniform(keys[0], random.friction, (robots,), self.friction),
+            payload=uniform(keys[1], random.payload, (robots,), 0.0),
+            center_of_mass=uniform(keys[2], random.center_of_mass, (robots, 3), 0.0),
+            motor_strength=uniform(keys[3], random.motor_strength, (robots,), 1.0),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
         )
 
-    def fields(self, world: World) -> dict[str, jax.Array]:
-        """Returns the model's fields that this world has otherwise than the model."""
+    def fields(self, params: RandomizedParams) -> dict[str, jax.Array]:
+        """Returns the model fields that domain randomisation overrides for this environment."""
         random, model, index = self.random, self.model, self.index
         fields = {}
         as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
         if random.friction is not None:
-            fields["geom_friction"] = as_float(model.geom_friction).at[index.geoms, 0].set(world.friction[:, None])
+            fields["geom_friction"] = as_float(model.geom_friction).at[index.geoms, 0].set(params.friction[:, None])
         if random.payload is not None:
-            fields["body_mass"] = as_float(model.body_mass).at[index.trunk_body].add(world.payload)
+            # The payload is distributed like the trunk's own mass: mass and inertia grow by the same factor.
+            trunk = index.trunk_body
+            factor = 1.0 + params.payload / as_float(model.body_mass[trunk])
+            fields["body_mass"] = as_float(model.body_mass).at[trunk].add(params.payload)
+            fields["body_inertia"] = as_float(model.body_inertia).at[trunk].multiply(factor[:, None])
         if random.center_of_mass is not None:
-            fields["body_ipos"] = as_float(model.body_ipos).at[index.trunk_body].add(world.center_of_mass)
+            fields["body_ipos"] = as_float(model.body_ipos).at[index.trunk_body].add(params.center_of_mass)
         if random.motor_strength is not None:
-            strength = jnp.ones(model.nu).at[index.actuator].set(world.motor_strength[:, None])[:, None]
+            strength = jnp.ones(model.nu).at[index.actuator].set(params.motor_strength[:, None])[:, None]
             fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
             fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
         return fields
 
     def push(self, data: mjx.Data, key: jax.Array, dt: float) -> mjx.Data:
-        """Pushes some robots: each by a sudden velocity, on average once in `push_period`, in a step of `dt` s."""
+        """Changes each trunk's horizontal velocity at random, on average once per `push_period`; `dt` in s."""
         random, index = self.random, self.index
         if not random.push:
             return data

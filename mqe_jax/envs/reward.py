@@ -11,17 +11,20 @@ import jax.numpy as jnp
 
 
 def weigh(terms: Mapping[str, jax.Array], weights: Any, num_agents: int) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Sums weighted terms into the agents' rewards (A,), and names them for logging.
+    """Returns the weighted sum of the terms per agent, and the weighted terms for logging.
 
-    A term is () if all agents share it, or (A,) if each has its own; of the latter the first agent's is logged.
+    A term is () if it is shared by all agents, or (A,); of the latter the first agent's value is logged.
 
     Args:
         terms: unweighted terms by name.
-        weights: a dataclass whose fields have the same names.
+        weights: a record whose fields have the same names.
         num_agents: A.
 
     Returns:
         reward (A,), and `reward/<name>` () of every term with their sum `average_step_reward`.
+
+    Raises:
+        ValueError: if the names differ.
     """
     names = [field.name for field in dataclasses.fields(weights)]
     if set(terms) != set(names):
@@ -34,17 +37,17 @@ def weigh(terms: Mapping[str, jax.Array], weights: Any, num_agents: int) -> tupl
 
 
 def past(position_x: jax.Array, line_x: jax.Array | float, margin: float = 0.0) -> jax.Array:
-    """Counts who is past a line across the track by a margin, m: (N,) -> ()."""
+    """Number of entities more than `margin` metres past the line x = `line_x`: (N,) -> ()."""
     return jnp.sum(position_x > line_x + margin).astype(jnp.float32)
 
 
 def decrease(before: jax.Array, after: jax.Array) -> jax.Array:
-    """Sums the decrease of distances over a step: (N,), (N,) -> (), m."""
+    """Summed decrease of distances over a step: (N,), (N,) -> (), m."""
     return jnp.sum(before - after)
 
 
 def crowding(position: jax.Array, within: float = 0.5) -> jax.Array:
-    """Sums 1 / d^2 over robots, for each other robot at a distance d below `within` m: (A, D) -> ()."""
+    """Sum of 1 / d^2 over all ordered pairs of robots at a distance d below `within` m: (A, D) -> ()."""
     count = position.shape[0]
     apart = position[:, None] - position[None]
     square = jnp.sum(jnp.square(apart), axis=-1) + jnp.eye(count)

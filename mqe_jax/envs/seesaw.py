@@ -15,23 +15,24 @@ from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Init, Plane, Track
+from mqe_jax.settings import NonNegative, Positive, fail, record
+from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class SeesawRewards:
     """Weights of the reward terms.
 
     Attributes:
         success: per robot on the platform.
-        height: per m of the robots' heights, added, above `height_base`.
-        progress: per m that the robots moved along x, added.
-        aside: per m^2 of the robots' squared distances from the centre line, added, above `aside_base`.
-        collision: when any trunk touches anything.
-        fall: when any robot rolls or pitches over.
-        crowding: per 1 / d^2 while the robots are closer than 0.5 m, once for both.
+        height: per m of the robots' summed heights above `height_base`.
+        progress: per m of the robots' summed displacement along x.
+        aside: per m^2 of the robots' summed squared distances from the centre line above `aside_base`.
+        collision: in steps in which any trunk touches anything.
+        fall: in steps in which any robot exceeds the roll or pitch limit.
+        crowding: per 1 / d^2 while the distance d between the robots is below 0.5 m, once for the pair.
     """
 
     success: float = 10.0
@@ -43,7 +44,7 @@ class SeesawRewards:
     crowding: float = -0.25
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class SeesawParams(TaskParams):
     """Parameters of Climb on Seesaw.
 
@@ -51,47 +52,56 @@ class SeesawParams(TaskParams):
         track_width: m.
         hinge: position of the plank's hinge (x, y, z), m.
         plank_size: length, width and thickness, m.
-        plank_behind: how far the plank's middle is before the hinge, m.
+        plank_behind: distance of the plank's centre from the hinge towards the near end, m.
         plank_mass: kg.
         plank_inertia: about the hinge, kg m^2.
-        plank_limit: greatest angle either way, rad.
+        plank_limit: maximum |angle|, rad.
         plank_damping: of the hinge, N m s/rad.
-        plank_start: angle at reset, rad; negative where the near end is down.
-        platform: centre of its top face (x, y, z), m.
+        plank_start: angle at reset, rad; negative with the near end down.
+        platform: centre of the platform's top face (x, y, z), m.
         platform_size: full extents, m.
-        platform_column: radius of the column under it, m.
-        on_platform: a robot is on the platform beyond this x and above this z, m.
-        height_base: sum of the robots' heights that is worth nothing, m.
-        aside_base: sum of the squared distances from the centre line that is worth nothing, m^2.
-        rewards: weights.
+        platform_column: radius of the column under the platform, m.
+        on_platform: x and z beyond which a robot counts as on the platform, m.
+        height_base: summed height of the robots at which the height term is zero, m.
+        aside_base: summed squared distance from the centre line at which the aside term is zero, m^2.
+        rewards: weights of the reward terms.
     """
 
-    episode_length: float = 10.0
+    episode_length: Positive = 10.0
     min_height: float = 0.08
     end_on_collision: bool = True
     gait: str = "pace"
-    track_width: float = 3.0
+    track_width: Positive = 3.0
     hinge: tuple[float, float, float] = (5.6, 0.0, 0.545)
-    plank_size: tuple[float, float, float] = (4.123, 1.0, 0.03)
+    plank_size: tuple[Positive, Positive, Positive] = (4.123, 1.0, 0.03)
     plank_behind: float = 0.103
-    plank_mass: float = 100.0
-    plank_inertia: float = 100.0
-    plank_limit: float = 0.254
-    plank_damping: float = 1000.0
+    plank_mass: Positive = 100.0
+    plank_inertia: Positive = 100.0
+    plank_limit: Positive = 0.254
+    plank_damping: NonNegative = 1000.0
     plank_start: float = -0.25
     platform: tuple[float, float, float] = (8.0, 0.0, 1.0)
-    platform_size: tuple[float, float, float] = (1.0, 1.0, 0.03)
-    platform_column: float = 0.2
+    platform_size: tuple[Positive, Positive, Positive] = (1.0, 1.0, 0.03)
+    platform_column: NonNegative = 0.2
     on_platform: tuple[float, float] = (7.7, 1.2)
     height_base: float = 0.56
     aside_base: float = 0.5
     rewards: SeesawRewards = SeesawRewards()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if abs(self.plank_start) > self.plank_limit:
+            fail("plank_start", self.plank_start, f"within +-plank_limit, {self.plank_limit}")
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SeesawState:
-    """`x`: of each robot after the last step (2,), m."""
+    """The task's own state.
+
+    Attributes:
+        x: of each robot after the last step (2,), m.
+    """
 
     x: jax.Array
 
@@ -99,8 +109,8 @@ class SeesawState:
 class Go1Seesaw(QuadrupedEnv):
     """Climb on Seesaw.
 
-    - Scene: a track 3 m wide with a balanced plank, its near end on the ground, whose far end reaches a platform
-      1 m high. A robot beyond the hinge tips the plank unless another stands on the near end.
+    - Scene: a track 3 m wide with a balanced plank whose near end is on the ground and whose far end reaches a
+      platform 1 m high. A robot beyond the hinge tips the plank unless another stands on the near end.
     - Observation: one-hot 2, own base info 6, mate's base info 6.
     - Reward: see `SeesawRewards`; shared.
     - End: a fall, a trunk below 0.08 m, a collision, or 10 s. Success: a robot stands on the platform at the end.
@@ -113,59 +123,60 @@ class Go1Seesaw(QuadrupedEnv):
     Params: ClassVar[type[TaskParams]] = SeesawParams
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
-        track = Track(blocks=(Init(2.0), Plane(8.0), Closing()), width=params.track_width)
+        track = Track(blocks=(SpawnArea(2.0), Plane(8.0), EndWall()), width=params.track_width)
         plank = Seesaw(
-            "seesaw", hinge=params.hinge, size=params.plank_size, behind=params.plank_behind, mass=params.plank_mass,
-            inertia=params.plank_inertia, limit=params.plank_limit, damping=params.plank_damping,
-        )  # fmt: skip
+            "seesaw",
+            hinge=params.hinge,
+            size=params.plank_size,
+            behind=params.plank_behind,
+            mass=params.plank_mass,
+            inertia=params.plank_inertia,
+            limit=params.plank_limit,
+            damping=params.plank_damping,
+        )
         platform = Platform(
             "platform", center=params.platform, size=params.platform_size, column=params.platform_column
         )
-        # Plank and platform are ground.
+        # Plank and platform collide as ground.
         contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk",), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(plank, platform))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Lays the plank's near end on the ground."""
+        """Places the plank at its initial angle, with the near end on the ground."""
         return qpos.at[self.objects["seesaw"].qpos].set(self.params.plank_start), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> SeesawState:
-        """Returns the task's own fields of a fresh world."""
-        return SeesawState(readings.position_w[:, 0])
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> SeesawState:
+        return SeesawState(robot_state.position_w[:, 0])
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         return ObservationLayout(PAIR)
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width)."""
-        return pair(readings.base_info)
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+        return pair(robot_state.base_info)
 
-    def on_platform(self, readings: RobotReadings) -> jax.Array:
-        """Which robots are on the platform (2,) bool."""
+    def on_platform(self, robot_state: RobotState) -> jax.Array:
+        """Returns which robots are on the platform (2,) bool."""
         x, z = self.params.on_platform
-        return (readings.position_w[:, 0] > x) & (readings.position_w[:, 2] > z)
+        return (robot_state.position_w[:, 0] > x) & (robot_state.position_w[:, 2] > z)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         params = self.params
-        x, y, z = readings.position_w.T
-        roll, pitch = jnp.abs(readings.euler[:, 0]), jnp.abs(readings.euler[:, 1])
+        x, y, z = robot_state.position_w.T
+        roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
         terms = {
-            "success": jnp.sum(self.on_platform(readings)).astype(jnp.float32),
+            "success": jnp.sum(self.on_platform(robot_state)).astype(jnp.float32),
             "height": jnp.sum(z) - params.height_base,
             "progress": jnp.sum(x - state.task.x),
             "aside": jnp.sum(jnp.square(y)) - params.aside_base,
             "collision": collision.astype(jnp.float32),
             "fall": jnp.any((roll > params.max_roll) | (pitch > params.max_pitch)).astype(jnp.float32),
-            "crowding": reward.crowding(readings.position_w[:, :2]) / 2,
+            "crowding": reward.crowding(robot_state.position_w[:, :2]) / 2,
         }
         return terms, SeesawState(x)
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: a robot stands on the platform; `success/height`: of the highest robot, m."""
-        success = jnp.any(self.on_platform(readings)) & ~failed
-        return {"success": success, "success/height": jnp.max(readings.position_w[:, 2])}
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: a robot stands on the platform; `success/height`: height of the highest robot, m."""
+        success = jnp.any(self.on_platform(robot_state)) & ~failed
+        return {"success": success, "success/height": jnp.max(robot_state.position_w[:, 2])}

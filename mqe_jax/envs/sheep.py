@@ -1,4 +1,4 @@
-"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: two robots drive sheep through a gate."""
+"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: two robots herd sheep through a gate."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
-from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Closing, Gate, Init, Plane, Track
+from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class SheepRewards:
     """Weights of the reward terms.
 
     Attributes:
         success: per sheep past the gate.
-        progress: per m that the sheep moved along x, all together.
-        nearness: for each sheep that is not past the gate, exp(-distance to the gate's centre / 2 m).
+        progress: per m of the sheep's summed displacement along x.
+        nearness: sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the gate.
     """
 
     success: float = 1.0
@@ -36,79 +37,87 @@ class SheepRewards:
     nearness: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class SheepEasyParams(TaskParams):
-    """Parameters of both tasks, with the values of the easy one.
+    """Parameters of both tasks, with the defaults of the easy one.
 
     Attributes:
         track_width: m.
-        lengths: of the init block and of the free ground before and behind the gate, m.
+        lengths: of the spawn area and of the free ground in front of and behind the gate, m.
         spawn_x: of the robots, m.
-        spawn_apart: distance of the robots from each other, m.
+        spawn_apart: distance between the robots, m.
         gate_width: of the gap, m.
         gate_random: half-widths of the range of the gap's centre in x and y, m.
-        past_gate: a sheep is through when it is so far behind the gate's centre, m.
-        flock: rows of sheep along x and along y.
-        flock_center: middle of the flock at reset, m.
-        flock_spacing: of the rows, m.
+        past_gate: distance behind the gate's centre at which a sheep counts as through, m.
+        flock: number of sheep along x and along y.
+        flock_center: centre of the flock at reset, m.
+        flock_spacing: distance between neighbouring sheep at reset, m.
         flock_noise: half-width of the uniform noise on each sheep's position, m.
-        restlessness: how much the sheep move of their own will (s in `mqe_jax.npc.flock`). The released system has 0
-            for the single sheep; the paper's sheep always move.
-        sheep_friction: sliding friction of the sheep with the ground.
-        rewards: weights.
+        restlessness: scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep of
+            the released system; in the paper sheep always move.
+        sheep_friction: sliding friction between sheep and ground.
+        rewards: weights of the reward terms.
     """
 
-    episode_length: float = 15.0
+    episode_length: Positive = 15.0
     end_on_collision: bool = True
-    track_width: float = 4.0
-    lengths: tuple[float, float, float] = (1.5, 3.0, 3.0)
+    track_width: Positive = 4.0
+    lengths: tuple[Positive, Positive, Positive] = (1.5, 3.0, 3.0)
     spawn_x: float = 1.25
-    spawn_apart: float = 1.95
-    gate_width: float = 0.8
-    gate_random: tuple[float, float] = (0.0, 0.5)
+    spawn_apart: NonNegative = 1.95
+    gate_width: Positive = 0.8
+    gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
     past_gate: float = 0.0
-    flock: tuple[int, int] = (1, 1)
+    flock: tuple[PositiveInt, PositiveInt] = (1, 1)
     flock_center: tuple[float, float] = (3.0, 0.0)
-    flock_spacing: float = 1.5
-    flock_noise: float = 0.3
-    restlessness: float = 0.08
-    sheep_friction: float = 1.0
+    flock_spacing: NonNegative = 1.5
+    flock_noise: NonNegative = 0.3
+    restlessness: NonNegative = 0.08
+    sheep_friction: NonNegative = 1.0
     rewards: SheepRewards = SheepRewards()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_gap("gate_width", self.gate_width, self.track_width)
 
-@dataclasses.dataclass(frozen=True)
+
+@record
 class SheepHardParams(SheepEasyParams):
-    """The same parameters with the values of the hard task."""
+    """Parameters of `SheepEasyParams` with the defaults of the hard task."""
 
-    track_width: float = 6.0
-    lengths: tuple[float, float, float] = (2.0, 6.0, 6.0)
+    track_width: Positive = 6.0
+    lengths: tuple[Positive, Positive, Positive] = (2.0, 6.0, 6.0)
     spawn_x: float = 1.5
-    spawn_apart: float = 3.0
-    gate_width: float = 1.5
-    gate_random: tuple[float, float] = (0.0, 1.0)
-    flock: tuple[int, int] = (3, 3)
+    spawn_apart: NonNegative = 3.0
+    gate_width: Positive = 1.5
+    gate_random: tuple[NonNegative, NonNegative] = (0.0, 1.0)
+    flock: tuple[PositiveInt, PositiveInt] = (3, 3)
     flock_center: tuple[float, float] = (5.0, 0.0)
-    restlessness: float = 0.1
-    contacts_per_robot: int = 20  # sheep touch each other
-    rows_per_robot: int = 96
+    restlessness: NonNegative = 0.1
+    contacts_per_robot: PositiveInt = 20  # sheep touch each other
+    constraints_per_robot: PositiveInt = 96
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SheepState:
-    """`x`: of the sheep after the last step (S,), m."""
+    """The task's own state.
+
+    Attributes:
+        x: of the sheep after the last step (S,), m.
+    """
 
     x: jax.Array
 
 
 class Go1SheepEasy(QuadrupedEnv):
-    """Sheep Dog: sheep flee from robots that come near, and must be driven through a gate.
+    """Sheep Dog: sheep flee from nearby robots and must be herded through a gate.
 
-    - Scene: a track with a gate whose centre is drawn at reset; one sheep (hard: nine) before it.
+    - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front of it.
     - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2, each sheep's x, y.
     - Reward: see `SheepRewards`; shared.
-    - End: a fall, a collision, or 15 s. Success: the share of the sheep that are past the gate.
+    - End: a fall, a collision, or 15 s. Success: the fraction of the sheep that are past the gate.
 
     Source: paper, section III and table of rewards.
     """
@@ -119,24 +128,23 @@ class Go1SheepEasy(QuadrupedEnv):
 
     @property
     def num_sheep(self) -> int:
-        """How many sheep there are."""
+        """Number of sheep S."""
         rows, columns = self.params.flock
         return rows * columns
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
         before, middle, behind = params.lengths
-        init = Init(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
+        spawn = SpawnArea(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
-        track = Track(blocks=(init, Plane(middle), gate, Plane(behind), Closing()), width=params.track_width)
+        track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
         touching = ("trunk", "foot")
         contacts = Contacts(ground=touching, wall=touching, robot=touching, object=touching)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
         return Scene(track, num_robots=2, contacts=contacts, objects=flock)
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Draws where the sheep start."""
+        """Samples the sheep's initial positions."""
         params = self.params
         rows, columns = params.flock
         x, y = np.meshgrid(np.arange(rows) - (rows - 1) / 2, np.arange(columns) - (columns - 1) / 2, indexing="ij")
@@ -144,17 +152,21 @@ class Go1SheepEasy(QuadrupedEnv):
         noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
-    def reset_task(self, key: jax.Array, readings: RobotReadings, data: mjx.Data, gates: jax.Array) -> SheepState:
-        """Returns the task's own fields of a fresh world."""
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> SheepState:
         return SheepState(self.sheep(data)[:, 0])
 
-    def drive(self, data: mjx.Data, readings: RobotReadings, key: jax.Array) -> mjx.Data:
-        """Lets the sheep flee, wander and flock together."""
+    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+        """Sets the sheep's velocities by `flock`."""
         index = self._sheep("qvel")
         velocity = flock(
-            key, self.sheep(data), data.qvel[index], readings.position_w[:, :2], step=self.dt,
-            restlessness=self.params.restlessness, friction=self.params.sheep_friction,
-        )  # fmt: skip
+            key,
+            self.sheep(data),
+            data.qvel[index],
+            robot_state.position_w[:, :2],
+            step=self.dt,
+            restlessness=self.params.restlessness,
+            friction=self.params.sheep_friction,
+        )
         return data.replace(qvel=data.qvel.at[index].set(velocity))
 
     def sheep(self, data: mjx.Data) -> jax.Array:
@@ -162,27 +174,24 @@ class Go1SheepEasy(QuadrupedEnv):
         return data.qpos[self._sheep("qpos")]
 
     def _sheep(self, vector: str) -> np.ndarray:
-        """Where the sheep are in qpos or qvel (S, 2)."""
+        """Addresses of the sheep in qpos or qvel (S, 2)."""
         return np.stack([getattr(self.objects[f"sheep{number}"], vector) for number in range(self.num_sheep)])
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
         return ObservationLayout((*PAIR, GATE, Block("sheep", 2 * self.num_sheep, "x, y of each, m")))
 
-    def observe(self, state: State, readings: RobotReadings) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (2, width)."""
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         sheep = for_all(self.sheep(state.data), 2)
-        return {**pair(readings.base_info), "gate": for_all(state.gates, 2), "sheep": sheep}
+        return {**pair(robot_state.base_info), "gate": for_all(state.anchors, 2), "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
-        """Which sheep are past the gate (S,) bool."""
-        return self.sheep(state.data)[:, 0] > state.gates[0, 0] + self.params.past_gate
+        """Returns which sheep are past the gate (S,) bool."""
+        return self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         sheep, through = self.sheep(state.data), self.through(state)
-        distance = jnp.linalg.norm(sheep - state.gates[0], axis=-1)
+        distance = jnp.linalg.norm(sheep - state.anchors[0], axis=-1)
         terms = {
             "success": jnp.sum(through).astype(jnp.float32),
             "progress": jnp.sum(sheep[:, 0] - state.task.x),
@@ -190,8 +199,8 @@ class Go1SheepEasy(QuadrupedEnv):
         }
         return terms, SheepState(sheep[:, 0])
 
-    def outcome(self, state: State, readings: RobotReadings, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: the share of the sheep that are past the gate, however the episode ended."""
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Success: the fraction of the sheep that are past the gate, however the episode ended."""
         return {"success": jnp.mean(self.through(state))}
 
 

@@ -1,8 +1,7 @@
-"""go1wrestling, the paper's Sumo Wrestling: two robots try to push or tip each other out of a ring."""
+"""go1wrestling, the paper's Sumo Wrestling: two robots try to push each other out of a ring or tip each other over."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -15,57 +14,62 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.terrain import Init, Plane, Track
+from mqe_jax.settings import NonNegative, Positive, record
+from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class WrestlingRewards:
-    """Weights: `win`, of the side whose opponent falls or leaves the ring, less the opponent's."""
+    """Weights of the reward terms; each is a robot's own term minus the opponent's.
+
+    Attributes:
+        win: when the opponent falls or leaves the ring.
+    """
 
     win: float = 10.0
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class WrestlingParams(TaskParams):
     """Parameters of Sumo Wrestling.
 
-    A robot has lost when its |roll| or |pitch| is over the limit, or its trunk is outside the ring or too low.
+    A robot is eliminated when its |roll| or |pitch| exceeds the limit, or its trunk is outside the ring or too low.
 
     Attributes:
-        center: of platform and ring, m.
-        platform: extents of the platform, m; a part of it is in the ground.
-        platform_top: height of its top, m: where robots that are dropped from the listed height land on their feet.
+        center: of platform and ring (x, y), m.
+        platform: extents of the platform, m; its lower part is below the ground.
+        platform_top: height of its top face, m; robots dropped from the spawn height land on their feet.
         ring_radius: m.
-        ring_depth: a trunk this far below the platform's top has left it, m.
-        spawn_y: distance of the robots from the ring's middle, m; the first starts on the side of -y.
-        rewards: weights.
+        ring_depth: distance of a trunk below the platform's top at which the robot counts as out, m.
+        spawn_y: distance of the robots from the ring's centre, m; the first robot is on the side of negative y.
+        rewards: weights of the reward terms.
     """
 
-    episode_length: float = 15.0
-    spawn_height: float = 0.74
-    max_roll: float = 0.4 * np.pi
+    episode_length: Positive = 15.0
+    spawn_height: Positive = 0.74
+    max_roll: Positive = 0.4 * np.pi
     center: tuple[float, float] = (3.1, 0.0)
-    platform: tuple[float, float, float] = (4.37, 4.37, 0.5)
-    platform_top: float = 0.4
-    ring_radius: float = 1.7
-    ring_depth: float = 0.2
-    spawn_y: float = 1.0
+    platform: tuple[Positive, Positive, Positive] = (4.37, 4.37, 0.5)
+    platform_top: Positive = 0.4
+    ring_radius: Positive = 1.7
+    ring_depth: NonNegative = 0.2
+    spawn_y: NonNegative = 1.0
     rewards: WrestlingRewards = WrestlingRewards()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.platform_top)
+        check_above(self.spawn_height, self.platform_top, self.robot)
 
 
 class Go1Wrestling(Duel):
     """Sumo Wrestling.
 
-    - Scene: a platform with a ring of 3.4 m marked on it; the robots face each other, 2 m apart.
+    - Scene: a platform with a ring of 3.4 m diameter marked on it; the robots face each other, 2 m apart.
     - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
     - Reward: see `WrestlingRewards`; zero-sum.
-    - End: one has fallen or left the ring, or 15 s. Win: the opponent has, and oneself has not.
+    - End: a robot has fallen or left the ring, or 15 s. Win: only the opponent has.
 
     Source: paper, section III.
     """
@@ -76,36 +80,34 @@ class Go1Wrestling(Duel):
 
     @property
     def center(self) -> tuple[float, float]:
-        """The ring's middle, m."""
+        """The centre of the ring, m."""
         return self.params.center
 
     def scene(self) -> Scene:
-        """Says what is in the world."""
         params = self.params
         x, y = self.center
         top = params.platform_top
         platform = Platform("platform", center=(x, y, top), size=params.platform)
         ring = Ring("ring", center=(x, y, top), radius=params.ring_radius)
-        track = Track(blocks=(Init(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
+        track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
         contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
         return Scene(track, num_robots=2, contacts=contacts, objects=(platform, ring), colors=(0, 2))
 
-    def spawn_places(self) -> Sequence[tuple[float, float, float]]:
-        """Says where the robots start, x, y, yaw of each, m and rad: facing each other across the ring."""
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
+        """Facing each other across the ring."""
         (x, y), apart = self.center, self.params.spawn_y
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
-    def rewards(self, state: State, readings: RobotReadings, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the reward terms and the task's fields after the step."""
-        return {"win": self.versus(self.wins(state, readings))}, None
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        return {"win": self.zero_sum(self.wins(state, robot_state))}, None
 
-    def lost(self, readings: RobotReadings) -> jax.Array:
-        """Which robots have fallen or left the ring (2,) bool."""
+    def eliminated(self, robot_state: RobotState) -> jax.Array:
+        """Returns which robots have fallen or left the ring (2,) bool."""
         params = self.params
-        apart = jnp.linalg.norm(readings.position_w[:, :2] - jnp.array(self.center), axis=-1)
-        below = readings.position_w[:, 2] < params.platform_top - params.ring_depth
-        return self.fallen(readings) | (apart > params.ring_radius) | below
+        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
+        below = robot_state.position_w[:, 2] < params.platform_top - params.ring_depth
+        return self.fallen(robot_state) | (apart > params.ring_radius) | below
 
-    def ending(self, state: State, readings: RobotReadings) -> jax.Array:
-        """One has fallen or left the ring."""
-        return jnp.any(self.lost(readings))
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
+        """The episode ends when a robot has fallen or left the ring."""
+        return jnp.any(self.eliminated(robot_state))

@@ -1,4 +1,4 @@
-"""Planners written by hand, one per task, over the same observations and actions that a policy has."""
+"""Scripted policies, one per task, with the observations and actions of a learned policy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import jax
 
+from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.errors import InputError
 from mqe_jax.planners.bridge import plan_bridge
 from mqe_jax.planners.door import plan_revolving_door
 from mqe_jax.planners.football import plan_1vs1, plan_2vs2, plan_defender
@@ -13,11 +15,12 @@ from mqe_jax.planners.gate import plan_gate
 from mqe_jax.planners.pushbox import plan_pushbox
 from mqe_jax.planners.seesaw import plan_seesaw
 from mqe_jax.planners.sheep import plan_sheep_easy, plan_sheep_hard
+from mqe_jax.planners.steering import Observation
 from mqe_jax.planners.tug import plan_tug
 from mqe_jax.planners.wrestling import plan_wrestling
 
-# Task id -> function from one world's observations (A, O) to its actions (A, action_size).
-PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
+# Task id -> function from one environment's observation blocks to its actions (A, 3) in the `command` mode.
+PLANNERS: dict[str, Callable[[Observation], jax.Array]] = {
     "go1gate": plan_gate,
     "go1seesaw": plan_seesaw,
     "go1sheep-easy": plan_sheep_easy,
@@ -31,3 +34,15 @@ PLANNERS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "go1football-1vs1": plan_1vs1,
     "go1football-2vs2": plan_2vs2,
 }
+
+
+def scripted_policy(env: QuadrupedEnv) -> Callable[[jax.Array], jax.Array]:
+    """Returns the scripted policy of a task, from one environment's observations (A, O) to its actions (A, 3).
+
+    Raises:
+        InputError: if the task has none.
+    """
+    if env.name not in PLANNERS:
+        raise InputError(f"planner: {env.name} has no scripted policy; allowed for: {', '.join(PLANNERS)}")
+    plan, layout = PLANNERS[env.name], env.observation_layout
+    return lambda obs: plan(layout.split(obs))

@@ -1,18 +1,18 @@
-"""Revolving Door by hand: push one's own half of the door open, far from the hinge, and walk on through."""
+"""Scripted policy of Revolving Door: push the own half of the door open, far from the hinge, and walk through."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.planners.steering import go_to
+from mqe_jax.planners.steering import Observation, go_to, pose
 
-_LANE = -0.62  # m, beside the hinge: a long lever, and room to the wall
+_LANE = -0.62  # m, y: a long lever about the hinge, clear of the wall
 
 
-def plan_revolving_door(obs: jax.Array) -> jax.Array:
-    """Returns both robots' actions (2, 3) from their observations (2, 12), each in its own frame."""
-    position, yaw = obs[:, :2], obs[:, 5]
+def plan_revolving_door(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3), each in its own frame."""
+    position, yaw = pose(obs["base"])
     in_lane = jnp.abs(position[:, 1] - _LANE) < 0.15
     through = position[:, 0] > 2.4
     ahead = jnp.where(in_lane | through | (position[:, 0] < 1.6), position[:, 0] + 1.5, 1.7)

@@ -1,41 +1,42 @@
-"""Football by hand: get behind the ball on the line to a free part of the goal, then walk through it."""
+"""Scripted policies of football: move behind the ball on the line to an open part of the goal, then walk through it."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.planners.steering import go_to
+from mqe_jax.planners.steering import Observation, go_to
 
-_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, places in the goal
+_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, points in the goal
 _GOAL = jnp.array([12.0, 0.0])  # m
 
 
-def plan_defender(obs: jax.Array) -> jax.Array:
-    """Returns both robots' actions (2, 3) from their observations (2, 20); where the defender is, they must guess."""
-    ball = obs[:, 14:16]
+def plan_defender(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3); the unobserved defender is assumed where its control law steers to."""
+    ball = obs["ball"][:, :2]
     opponents = (0.6 * ball + 0.4 * _GOAL)[:, None]
-    return jax.vmap(_play)(obs[:, 2:8], obs[:, 8:14], opponents, ball, obs[:, 17:19])
+    return jax.vmap(_play)(obs["base"], obs["mate"], opponents, ball, obs["ball_velocity"][:, :2])
 
 
-def plan_1vs1(obs: jax.Array) -> jax.Array:
-    """Returns both robots' actions (2, 3) from their observations (2, 19), each in its own frame."""
-    nobody = jnp.full((2, 6), 1e3)
-    return jax.vmap(_play)(obs[:, 1:7], nobody, obs[:, None, 7:9], obs[:, 13:15], obs[:, 16:18])
+def plan_1vs1(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3), each in its own frame."""
+    far_mate = jnp.full((2, 6), 1e3)
+    opponents = obs["opponents"][:, None, :2]
+    return jax.vmap(_play)(obs["base"], far_mate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
-def plan_2vs2(obs: jax.Array) -> jax.Array:
-    """Returns all robots' actions (4, 3) from their observations (4, 32), each in its own frame."""
-    opponents = obs[:, 14:26].reshape(-1, 2, 6)[..., :2]
-    return jax.vmap(_play)(obs[:, 2:8], obs[:, 8:14], opponents, obs[:, 26:28], obs[:, 29:31])
+def plan_2vs2(obs: Observation) -> jax.Array:
+    """Returns all robots' actions (4, 3), each in its own frame."""
+    opponents = obs["opponents"].reshape(-1, 2, 6)[..., :2]
+    return jax.vmap(_play)(obs["base"], obs["mate"], opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
 def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Returns one robot's action (3,): the nearer of two goes for the ball, the other stays behind it.
+    """Returns one robot's action (3,): the nearer of two attacks the ball, the other supports from behind it.
 
     Args:
         own: base information (6,).
-        mate: likewise (6,).
+        mate: base information (6,).
         opponents: positions (K, 2), m.
         ball: position (2,), m.
         velocity: of the ball (2,), m/s.
@@ -46,7 +47,7 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
     facing = jnp.array([jnp.cos(yaw), jnp.sin(yaw)])
     offset = position - ball
     distance = jnp.linalg.norm(offset)
-    # The aim that is freest and needs the least turning.
+    # The aim with the most clearance and the least turning.
     ways = _AIMS - ball
     ways = ways / jnp.linalg.norm(ways, axis=-1, keepdims=True)
     lefts = ways[:, ::-1] * jnp.array([-1.0, 1.0])
@@ -60,7 +61,7 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
     between_legs = near & (jnp.abs(aside) < 0.25) & (facing @ way > 0.5)
     push = position + 0.8 * way - 1.5 * aside * left
     behind = ball - 0.5 * way
-    # From before the ball: first to the side, then back.
+    # From in front of the ball: first to the side, then back.
     side = jnp.sign(aside) * left
     around = jnp.where(jnp.abs(aside) < 0.3, position + 0.6 * side, behind + 0.45 * side)
     attack = jnp.where(lined_up | between_legs, push, jnp.where(along > -0.3, around, behind))

@@ -3,36 +3,39 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.robots.build import PARTS, Contacts
-from mqe_jax.robots.go1 import JOINT_NAMES, JOINTS, LEGS
+from mqe_jax.errors import InputError
+from mqe_jax.robots.build import Contacts
+from mqe_jax.robots.robot import JOINT_NAMES, NUM_LEGS, Robot
 from mqe_jax.rotation import quaternion_to_euler, rotate_inverse
 
 
 @dataclasses.dataclass(frozen=True)
 class RobotIndex:
-    """Where the robots of a compiled model are; all tables are host integers, A robots.
+    """Where the R robots of a compiled model are; all tables are host integers.
 
     Attributes:
-        base_qpos: addresses of (position 3, quaternion wxyz 4) in qpos (A, 7).
-        base_qvel: addresses of (linear 3 world, angular 3 body) in qvel (A, 6).
-        joint_qpos: joint angles in qpos (A, 12).
-        joint_qvel: joint velocities in qvel (A, 12).
-        actuator: rows of ctrl (A, 12).
-        trunk_body: trunk body ids (A,).
-        bodies: all body ids of each robot (A, 13).
-        foot_geom: foot shape ids (A, 4).
-        trunk_geom: trunk shape ids (A,).
-        geoms: collision shape ids of each robot (A, G).
-        trunk_force: addresses in sensordata of the trunk's strongest contact force (A, 3), contact frame, N.
-        foot_force: addresses of each foot's strongest contact force (A, 4, 3), contact frame, N; (0, 4, 3) unless
+        base_qpos: addresses of (position 3, quaternion wxyz 4) in qpos (R, 7).
+        base_qvel: addresses of (linear 3 world, angular 3 body) in qvel (R, 6).
+        joint_qpos: joint angles in qpos (R, 12).
+        joint_qvel: joint velocities in qvel (R, 12).
+        actuator: rows of ctrl (R, 12).
+        trunk_body: trunk body ids (R,).
+        bodies: all body ids of each robot (R, 13).
+        foot_geom: foot shape ids (R, 4); (R, 0) where feet touch nothing.
+        geoms: collision shape ids of each robot (R, G).
+        trunk_force: addresses in sensordata of the strongest contact force on each of the trunk's T shapes
+            (R, T, 3), contact frame, N.
+        foot_force: addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless
             the scene has foot sensors.
-        touch: (robot, robot, address in sensordata) of each robot-robot contact counter (T, 3).
+        touch: (robot, robot, address in sensordata) of each robot-robot contact counter (S, 3).
     """
 
     base_qpos: np.ndarray
@@ -43,7 +46,6 @@ class RobotIndex:
     trunk_body: np.ndarray
     bodies: np.ndarray
     foot_geom: np.ndarray
-    trunk_geom: np.ndarray
     geoms: np.ndarray
     trunk_force: np.ndarray
     foot_force: np.ndarray
@@ -51,98 +53,117 @@ class RobotIndex:
 
     @property
     def num_robots(self) -> int:
-        """Number of robots A."""
+        """Number of robots R."""
         return len(self.trunk_body)
 
 
-def prefix(robot: int) -> str:
-    """Returns the name prefix of robot number `robot` in a scene."""
-    return f"robot{robot}/"
+def prefix(number: int) -> str:
+    """Returns the name prefix of robot `number` in a scene."""
+    return f"robot{number}/"
 
 
-def add_sensors(spec: mujoco.MjSpec, num_robots: int, contacts: Contacts, *, feet: bool = False) -> None:
-    """Adds the trunk (and foot) contact force and robot-robot contact sensors, which all engines compute alike."""
+def _geom_names(robot: Robot, parts: tuple[str, ...]) -> list[str]:
+    return [name for shape in robot.shapes(parts) for name in shape.geom_names]
+
+
+def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, contacts: Contacts, *, feet: bool = False) -> None:
+    """Adds the trunk (and foot) contact force and robot-robot contact sensors, which all engines compute alike.
+
+    Raises:
+        InputError: if the trunk touches nothing.
+    """
     geom = mujoco.mjtObj.mjOBJ_GEOM
     force_bits, found_bits, strongest = 1 << 1, 1 << 0, 2
     if "trunk" not in contacts.parts():
-        raise ValueError(
-            "Contacts: the trunk must collide with something; add 'trunk' to ground, wall, robot or object"
-        )
-    shapes = ["trunk"] + [f"{leg}_foot" for leg in LEGS if feet]
-    for robot in range(num_robots):
-        for shape in shapes:
+        raise InputError("Contacts: the trunk must touch something; add 'trunk' to ground, wall, robot or object")
+    for number in range(num_robots):
+        for shape in _geom_names(robot, ("trunk", "foot") if feet else ("trunk",)):
             spec.add_sensor(
-                name=f"{prefix(robot)}{shape}_force", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom,
-                objname=prefix(robot) + shape, intprm=(force_bits, strongest, 1),
-            )  # fmt: skip
-    for name, first, second in _touch_pairs(num_robots, contacts):
+                name=f"{prefix(number)}{shape}_force",
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=geom,
+                objname=prefix(number) + shape,
+                intprm=(force_bits, strongest, 1),
+            )
+    for name, first, second in _touch_pairs(robot, num_robots, contacts):
         spec.add_sensor(
-            name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname=first, reftype=geom,
-            refname=second, intprm=(found_bits, 0, 1),
-        )  # fmt: skip
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=geom,
+            objname=first,
+            reftype=geom,
+            refname=second,
+            intprm=(found_bits, 0, 1),
+        )
 
 
-def _touch_pairs(num_robots: int, contacts: Contacts) -> list[tuple[str, str, str]]:
-    """Returns (sensor, shape, shape) of every pair of shapes by which two robots can touch."""
-    limbs = [f"{leg}_{part}" for part in ("foot", "calf", "thigh") if part in contacts.robot for leg in LEGS]
-    pairs = []
-    for i in range(num_robots):
-        for j in range(i + 1, num_robots):
-            if "trunk" not in contacts.robot:
-                continue
-            shapes = [("trunk", "trunk")] + [("trunk", limb) for limb in limbs] + [(limb, "trunk") for limb in limbs]
-            pairs += [(f"touch/{i}/{j}/{a}/{b}", prefix(i) + a, prefix(j) + b) for a, b in shapes]
-    return pairs
+def _touch_pairs(robot: Robot, num_robots: int, contacts: Contacts) -> list[tuple[str, str, str]]:
+    """Returns (sensor, shape, shape) of every pair of shapes, one of them a trunk's, by which robots can touch."""
+    if not {"trunk"} <= {*contacts.robot} & {*contacts.robot_target}:
+        return []
+    trunk = _geom_names(robot, ("trunk",))
+    limbs = _geom_names(robot, tuple(part for part in contacts.robot if part != "trunk"))
+    shapes = [(a, b) for a in trunk for b in trunk]
+    shapes += [(a, b) for a in trunk for b in limbs] + [(a, b) for a in limbs for b in trunk]
+    return [
+        (f"touch/{i}/{j}/{a}/{b}", prefix(i) + a, prefix(j) + b)
+        for i in range(num_robots)
+        for j in range(i + 1, num_robots)
+        for a, b in shapes
+    ]
 
 
-def index_robots(model: mujoco.MjModel, num_robots: int, contacts: Contacts, *, feet: bool = False) -> RobotIndex:
+def index_robots(
+    model: mujoco.MjModel, robot: Robot, num_robots: int, contacts: Contacts, *, feet: bool = False
+) -> RobotIndex:
     """Looks up by name, once, where every robot of a compiled model is."""
-    base_qpos, base_qvel, joint_qpos, joint_qvel, actuator, trunk, bodies = ([] for _ in range(7))
-    foot_geom, trunk_geom, geoms, force, foot_force = [], [], [], [], []
-    body_names = ["trunk"] + [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
-    for robot in range(num_robots):
-        name = prefix(robot)
-        base = model.joint(name + "base")
-        base_qpos.append(base.qposadr[0] + np.arange(7))
-        base_qvel.append(base.dofadr[0] + np.arange(6))
-        joint_qpos.append([model.joint(name + joint).qposadr[0] for joint in JOINT_NAMES])
-        joint_qvel.append([model.joint(name + joint).dofadr[0] for joint in JOINT_NAMES])
-        actuator.append([model.actuator(name + joint).id for joint in JOINT_NAMES])
-        trunk.append(model.body(name + "trunk").id)
-        bodies.append([model.body(name + body).id for body in body_names])
-        shapes = ["trunk"] + [f"{leg}_{part}" for part in PARTS[1:] if part in contacts.parts() for leg in LEGS]
-        geoms.append([model.geom(name + shape).id for shape in shapes])
-        trunk_geom.append(model.geom(name + "trunk").id)
-        foot_geom.append([model.geom(f"{name}{leg}_foot").id for leg in LEGS])
-        force.append(model.sensor(name + "trunk_force").adr[0] + np.arange(3))
-        if feet:
-            foot_force.append([model.sensor(f"{name}{leg}_foot_force").adr[0] + np.arange(3) for leg in LEGS])
+    numbers = range(num_robots)
+    body_names = ["trunk", *JOINT_NAMES]
+    shapes = robot.shapes(contacts.parts())
+    geom_names = [name for shape in shapes for name in shape.geom_names]
+    foot_names = [name for shape in shapes if shape.part == "foot" for name in shape.geom_names]
+    bases = [model.joint(prefix(i) + "base") for i in numbers]
+
+    def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
+        return np.array([[lookup(prefix(i) + name) for name in names] for i in numbers], np.int32)
+
+    def force(names: Sequence[str]) -> np.ndarray:
+        return table(lambda name: model.sensor(name + "_force").adr[0] + np.arange(3), names)
+
     touch = [
         (*map(int, sensor.split("/")[1:3]), model.sensor(sensor).adr[0])
-        for sensor, _, _ in _touch_pairs(num_robots, contacts)
+        for sensor, _, _ in _touch_pairs(robot, num_robots, contacts)
     ]
-    as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
     return RobotIndex(
-        as_int(base_qpos), as_int(base_qvel), as_int(joint_qpos), as_int(joint_qvel), as_int(actuator),
-        as_int(trunk), as_int(bodies), as_int(foot_geom), as_int(trunk_geom), as_int(geoms), as_int(force),
-        as_int(foot_force).reshape(-1, 4, 3), as_int(touch).reshape(-1, 3),
-    )  # fmt: skip
+        base_qpos=np.array([base.qposadr[0] + np.arange(7) for base in bases], np.int32),
+        base_qvel=np.array([base.dofadr[0] + np.arange(6) for base in bases], np.int32),
+        joint_qpos=table(lambda name: model.joint(name).qposadr[0], JOINT_NAMES),
+        joint_qvel=table(lambda name: model.joint(name).dofadr[0], JOINT_NAMES),
+        actuator=table(lambda name: model.actuator(name).id, JOINT_NAMES),
+        trunk_body=table(lambda name: model.body(name).id, ["trunk"])[:, 0],
+        bodies=table(lambda name: model.body(name).id, body_names),
+        foot_geom=table(lambda name: model.geom(name).id, foot_names),
+        geoms=table(lambda name: model.geom(name).id, geom_names),
+        trunk_force=force(_geom_names(robot, ("trunk",))),
+        foot_force=force(foot_names) if feet else np.zeros((0, NUM_LEGS, 3), np.int32),
+        touch=np.array(touch, np.int32).reshape(-1, 3),
+    )
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class RobotReadings:
-    """What every engine tells about the A robots of a scene after a step.
+class RobotState:
+    """Backend-independent robot state after a step (R robots, NPC robots included).
 
     Attributes:
-        position_w: trunk origin in the environment frame (A, 3), m.
-        quaternion: trunk orientation, wxyz (A, 4).
-        linear_velocity_w: of the trunk origin (A, 3), m/s.
-        angular_velocity_b: body frame (A, 3), rad/s.
-        joint_position: (A, 12), rad.
-        joint_velocity: (A, 12), rad/s.
-        trunk_force: strongest contact force on the trunk (A,), N.
-        touching: whether robots i and j touch (A, A) bool, symmetric.
+        position_w: trunk origin in the environment frame (R, 3), m.
+        quaternion: trunk orientation, wxyz (R, 4).
+        linear_velocity_w: of the trunk origin (R, 3), m/s.
+        angular_velocity_b: body frame (R, 3), rad/s.
+        joint_position: (R, 12), rad.
+        joint_velocity: (R, 12), rad/s.
+        trunk_force: strongest contact force on the trunk (R,), N.
+        touching: whether robots i and j touch, by the trunk of one of them (R, R) bool, symmetric.
     """
 
     position_w: jax.Array
@@ -156,22 +177,22 @@ class RobotReadings:
 
     @property
     def euler(self) -> jax.Array:
-        """Roll, pitch, yaw of the trunk (A, 3), rad."""
+        """Roll, pitch, yaw of the trunk (R, 3), rad."""
         return quaternion_to_euler(self.quaternion)
 
     @property
     def base_info(self) -> jax.Array:
-        """Position and roll, pitch, yaw (A, 6): the base information of the paper's observations."""
+        """Position and roll, pitch, yaw (R, 6): the base information of the paper's observations."""
         return jnp.concatenate([self.position_w, self.euler], axis=-1)
 
     @property
     def projected_gravity(self) -> jax.Array:
-        """Unit gravity vector in the trunk frame (A, 3)."""
+        """Unit gravity vector in the trunk frame (R, 3)."""
         return rotate_inverse(self.quaternion, jnp.array([0.0, 0.0, -1.0]))
 
 
-def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotReadings:
-    """Reads all robots off the state vectors of one world (nq,), (nv,), (nsensordata,)."""
+def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotState:
+    """Reads all robots from the state vectors of one environment (nq,), (nv,), (nsensordata,)."""
     base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
     count = index.num_robots
     touching = jnp.zeros((count, count), bool)
@@ -179,13 +200,13 @@ def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata:
         first, second, address = index.touch.T
         found = sensordata[address] > 0
         touching = touching.at[first, second].max(found).at[second, first].max(found)
-    return RobotReadings(
+    return RobotState(
         position_w=base[:, :3],
         quaternion=base[:, 3:],
         linear_velocity_w=base_velocity[:, :3],
         angular_velocity_b=base_velocity[:, 3:],
         joint_position=qpos[index.joint_qpos],
         joint_velocity=qvel[index.joint_qvel],
-        trunk_force=jnp.linalg.norm(sensordata[index.trunk_force], axis=-1),
+        trunk_force=jnp.max(jnp.linalg.norm(sensordata[index.trunk_force], axis=-1), axis=-1),
         touching=touching,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.files import check_folder, write_atomically
 
 FORMAT = "mqe_jax.train"
 VERSION = 2
@@ -128,6 +128,37 @@ def list_checkpoints(run_dir: str | Path) -> list[Path]:
 def latest(run_dir: str | Path) -> Path | None:
     """Returns a run's newest checkpoint, or None."""
     return next(reversed(list_checkpoints(run_dir)), None)
+
+
+def prepare_folder(run_dir: Path, resume: bool, files: Sequence[str]) -> Path | None:
+    """Creates the folder of a run and returns the checkpoint to resume from, or None for a new run.
+
+    Args:
+        run_dir: the folder.
+        resume: whether a run in it is to be continued.
+        files: names of the files that a run leaves in it, besides its checkpoints.
+
+    Raises:
+        InputError: where the folder cannot be written, holds a run that is not to be resumed, or one without a
+            checkpoint. Nothing in it is changed.
+    """
+    check_folder(run_dir)
+    checkpoint = latest(run_dir)
+    found = [name for name in files if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
+    if found and not resume:
+        raise InputError(
+            f"run_dir: {run_dir} already holds a run ({', '.join(found)}); resume it (--resume) or name another folder"
+        )
+    if found and checkpoint is None:
+        raise InputError(
+            f"run_dir: {run_dir} holds {', '.join(found)} but no checkpoint to resume from; name another folder"
+        )
+    return checkpoint
+
+
+def nonfinite(tree: Any) -> list[str]:
+    """Returns the path names of the leaves that hold NaN or infinite numbers."""
+    return [name for name, leaf in _flatten(jax.device_get(tree))[0].items() if not np.all(np.isfinite(leaf))]
 
 
 def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:

@@ -86,7 +86,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     if env.num_envs != config.num_envs:
         fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
     assistance = config.curriculum.assistance
-    if assistance and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "aid"):
+    if assistance and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of the environment {env.name} has no such field")
     if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
         fail("stagger_episodes", True, f"false: the environment {env.name} has no max_episode_steps")
@@ -177,7 +177,7 @@ def _check_divisible(config: TrainConfig, network: Network) -> None:
 
 def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
     """Sets the assistance of every environment, which takes effect with its next episode."""
-    env_state = dataclasses.replace(state.env_state, aid=jnp.full_like(state.env_state.aid, assistance))
+    env_state = dataclasses.replace(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
     return state._replace(env_state=env_state)
 
 

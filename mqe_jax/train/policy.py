@@ -11,9 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import build, to_mapping
-from mqe_jax.train.checkpoint import load_tree, read_metadata, save_tree
+from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims, NetworkSettings
@@ -82,8 +82,14 @@ def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata:
 
 
 def save_policy(run_dir: str | Path, policy: Policy) -> Path:
-    """Writes `policy.safetensors` into a run's folder atomically."""
+    """Writes `policy.safetensors` into a run's folder atomically.
+
+    Raises:
+        NonFiniteError: for weights or statistics that are NaN or infinite.
+    """
     path = Path(run_dir) / POLICY_FILE
+    if wrong := nonfinite({"params": policy.params, "normalizer": policy.normalizer}):
+        raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     metadata = {**policy.metadata, "dims": policy.dims._asdict(), "config": to_mapping(policy.config)}
     save_tree(path, {"params": policy.params, "normalizer": policy.normalizer}, metadata, kind="policy")
     return path
@@ -93,7 +99,7 @@ def load_policy(run: str | Path) -> Policy:
     """Reads the policy of a run's folder, or a policy file.
 
     Raises:
-        InputError: in one line naming the file, where it is missing, damaged or foreign.
+        InputError: in one line naming the file, where it is missing, damaged, foreign or not finite.
     """
     path = Path(run)
     if path.is_dir():
@@ -112,4 +118,6 @@ def load_policy(run: str | Path) -> Policy:
         return {"params": params, "normalizer": running_init(dims.observation)}
 
     tree = load_tree(path, jax.eval_shape(template), kind="policy").tree
+    if wrong := nonfinite(tree):
+        raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; a training that diverged wrote it")
     return Policy(tree["params"], tree["normalizer"], dims, config, metadata)

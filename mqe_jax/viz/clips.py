@@ -12,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from mqe_jax.errors import InputError
+
 SUFFIXES = (".mp4", ".gif", ".png")
 
 
 def check_output(path: Path) -> Path:
-    """Refuse what cannot be written, before any work; ValueError names the path and what is allowed."""
+    """Refuse what cannot be written, before any work; the InputError names the path and what is allowed."""
     if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
+        raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
     if path.is_dir():
-        raise ValueError(f"output {str(path)!r} is a folder, it must be a file")
+        raise InputError(f"output {str(path)!r} is a folder, it must be a file")
     parent = path.resolve().parent
     while not parent.exists():
         parent = parent.parent
@@ -29,12 +31,12 @@ def check_output(path: Path) -> Path:
             pass
     except OSError as error:
         reason = error.strerror or error
-        raise ValueError(f"output {str(path)!r}: {str(parent)!r} cannot be written ({reason})") from None
+        raise InputError(f"output {str(path)!r}: {str(parent)!r} cannot be written ({reason})") from None
     if path.suffix.lower() == ".mp4":
         try:
             import_module("imageio_ffmpeg")
         except ImportError:
-            raise ValueError(
+            raise InputError(
                 f"output {str(path)!r}: .mp4 needs imageio-ffmpeg "
                 "(pip install 'mqe-jax[render]'); allowed without them: .gif, .png"
             ) from None
@@ -84,7 +86,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
         process.stdin.close()
         said = process.stderr.read().decode(errors="replace")
     if process.returncode:
-        raise ValueError(f"output: ffmpeg could not write the clip ({' '.join(said.split())})")
+        raise InputError(f"output: ffmpeg could not write the clip ({' '.join(said.split())})")
 
 
 def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:

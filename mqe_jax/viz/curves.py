@@ -8,13 +8,14 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from mqe_jax.errors import InputError
 from mqe_jax.study import paper
 
 _INK, _OURS, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:
-    """Columns of a metrics.csv; ValueError in one line where it is missing or no such table."""
+    """Columns of a metrics.csv; InputError in one line where it is missing or no such table."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
@@ -23,11 +24,11 @@ def read_metrics(path: Path) -> dict[str, list[float]]:
                 for name in columns:
                     columns[name].append(float(row[name]))
     except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; a run folder has one after its first update") from None
+        raise InputError(f"{path}: no such file; a run folder has one after its first update") from None
     except (TypeError, ValueError, UnicodeDecodeError):
-        raise ValueError(f"{path}: is no table of numbers as a training writes it") from None
+        raise InputError(f"{path}: is no table of numbers as a training writes it") from None
     if "env_steps" not in columns:
-        raise ValueError(f"{path}: has no column env_steps")
+        raise InputError(f"{path}: has no column env_steps")
     return columns
 
 

@@ -7,6 +7,7 @@ import zipfile
 
 import numpy as np
 
+from mqe_jax.errors import InputError
 from mqe_jax.walk_policy import Params, _nested
 
 
@@ -24,7 +25,7 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     try:
         return read_state(path)
     except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"walk policy {path}: not a TorchScript Sequential of float32 layers ({error})") from None
+        raise InputError(f"walk policy {path}: not a TorchScript Sequential of float32 layers ({error})") from None
 
 
 def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:

@@ -1,10 +1,10 @@
-"""The environment in which the walk policy is trained and measured: one Go1 that follows commands.
+"""Training and evaluation environment of the walk policy: one robot that follows commands.
 
-The ground is flat and the slope is in the gravity: a robot on an endless slope of angle t is the same, in the
-frame of the slope, as one on flat ground under gravity turned by t. So every world has a slope of its own
-without geometry of its own. All positions and velocities here are in the slope's frame.
+Slopes are rotations of gravity: a robot on an infinite slope of angle t behaves, in the frame of the slope, as one on
+flat ground under gravity rotated by t. Each environment thus has its own slope without its own geometry. All positions
+and velocities here are in the slope's frame.
 
-Randomisation follows walk-these-ways (Margolis and Agrawal, arXiv 2212.03238), as the rewards do (`walk_rewards`).
+Randomisation and rewards (`mqe_jax.walk.rewards`) follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238).
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
-from mqe_jax.robots import go1
 from mqe_jax.robots.build import Contacts
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -29,22 +30,28 @@ from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_term
 from mqe_jax.walk_policy import WalkMemory
 
 GRAVITY = 9.81  # m/s^2
+# Maximum contacts of a shape with a plane.
+_GROUND_CONTACTS = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): 4,
+    int(mujoco.mjtGeom.mjGEOM_BOX): 4,
+}
 DT = walk_policy.STEP
 
 
 @dataclasses.dataclass(frozen=True)
 class WalkTask:
-    """Numbers of the walking task.
+    """Parameters of the walking task.
 
     Attributes:
         rewards: weights.
         episode_length: time limit, s.
-        command_period: a new command, slope and force are drawn this often, s; 0 keeps the first.
-        body_height: of the trunk's origin at zero height command, m.
+        command_period: interval at which commands, slope and force are resampled, s; 0 never resamples.
         max_vx, max_vy, max_yaw: ranges of the velocity commands, m/s, m/s, rad/s.
-        slope: greatest slope, rad.
-        force: greatest sustained horizontal force on the trunk, N.
-        kick: greatest sudden change of the trunk's velocity, m/s.
+        slope: maximum slope, rad.
+        force: maximum sustained horizontal force on the trunk, N.
+        kick: maximum instantaneous change of the trunk's velocity, m/s.
         kick_period: mean time between kicks, s.
         randomize: whether friction, payload, centre of mass, motors and observations are randomised.
         solver_iterations: of the physics.
@@ -53,7 +60,6 @@ class WalkTask:
     rewards: WalkRewards = WalkRewards()
     episode_length: float = 20.0
     command_period: float = 8.0
-    body_height: float = 0.30
     max_vx: float = 1.2
     max_vy: float = 0.7
     max_yaw: float = 1.2
@@ -67,14 +73,14 @@ class WalkTask:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Condition:
-    """What one world asks of the robot.
+class EpisodeSpec:
+    """Commands and disturbances sampled for one episode.
 
     Attributes:
         commands: of the walk policy (15,).
-        slope: rise of the ground along x and y (2,), rad: it climbs towards +x for a positive first number.
+        slope: inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x.
         force: sustained force on the trunk (2,), N, along its heading and to its left, horizontal.
-        kick: sudden change of the trunk's velocity at each kick (), m/s.
+        kick: instantaneous change of the trunk's velocity at each kick (), m/s.
     """
 
     commands: jax.Array
@@ -85,15 +91,15 @@ class Condition:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Body:
-    """How one world's robot differs from the model.
+class RandomizedBody:
+    """Randomised physical parameters of one environment's robot.
 
     Attributes:
         friction: sliding friction of its shapes ().
         payload: extra mass of the trunk (), kg.
         com: shift of the trunk's centre of mass (3,), m.
         strength: factor on the motors' torques ().
-        motor_offset: error of the joint targets (12,), rad.
+        motor_offset: offset added to the joint targets (12,), rad.
     """
 
     friction: jax.Array
@@ -106,26 +112,26 @@ class Body:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkState:
-    """State of one world.
+    """State of one environment.
 
     Attributes:
         data: physics state.
         obs: the walk policy's observation (70,), noisy if randomised.
         privileged_obs: for the critic (P,).
-        latent_target: what the adaptation network should estimate (2,): friction and payload, scaled.
+        latent_target: regression target of the adaptation network (2,): friction and payload, scaled.
         reward: ().
         terminated: () bool, fallen.
         truncated: () bool, time limit.
         metrics: reward terms and tracking errors, () each.
-        condition: what is asked.
-        slope: the slope now, which follows the condition's slowly (2,), rad.
-        force: the force now, likewise (2,), N.
-        body: how the robot differs from the model.
-        memory: gait cycle and last actions; its history is empty.
+        spec: commands and disturbances.
+        slope: current slope, rate-limited towards the spec's (2,), rad.
+        force: current force, likewise (2,), N.
+        body: randomised parameters of the robot.
+        memory: gait phase and last actions; its history is empty.
         mean_error: exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s.
-        step: steps since the reset () int32; may start anywhere.
+        step: steps counted towards the time limit () int32; starts at any offset.
         age: steps since the reset () int32.
-        level: how much of the task's difficulty is on (), in [0, 1].
+        difficulty: curriculum level () in [0, 1], which scales slopes, forces and kicks.
         key: random key.
     """
 
@@ -137,31 +143,45 @@ class WalkState:
     terminated: jax.Array
     truncated: jax.Array
     metrics: dict[str, jax.Array]
-    condition: Condition
+    spec: EpisodeSpec
     slope: jax.Array
     force: jax.Array
-    body: Body
+    body: RandomizedBody
     memory: WalkMemory
     mean_error: jax.Array
     step: jax.Array
     age: jax.Array
-    level: jax.Array
+    difficulty: jax.Array
     key: jax.Array
 
 
 class WalkEnv:
-    """One Go1 that follows commands on a slope under forces; batch with `jax.vmap`."""
+    """One robot that follows commands on a slope under forces; batch with `jax.vmap`."""
 
-    def __init__(self, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
+    def __init__(self, robot: Robot, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
+        self.robot = robot
         self.task = task or WalkTask()
         scene = Scene(
-            Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1,
-            contacts=Contacts(ground=("trunk", "foot"), wall=(), robot=(), object=()), foot_sensors=True,
+            Track(blocks=(Plane(4.0),), walled=False, num_robots=1),
+            num_robots=1,
+            robot=robot,
+            contacts=dataclasses.replace(Contacts(), wall=(), robot=(), object=()),
+            foot_sensors=True,
             solver_iterations=self.task.solver_iterations,
-        )  # fmt: skip
+        )
         self.compiled = compile_scene(scene)
-        self.physics = Physics(self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=8, rows_per_env=44)
-        self.index = self.compiled.robot
+        # Every shape flat on the ground; four constraints per contact (pyramidal cones), one per joint limit.
+        contacts = sum(
+            _GROUND_CONTACTS[int(kind)] for kind in self.compiled.model.geom_type[self.compiled.index.geoms[0]]
+        )
+        self.physics = Physics(
+            self.compiled.model,
+            impl=impl,
+            num_envs=num_envs,
+            contacts_per_env=contacts + 2,
+            max_constraints_per_env=NUM_JOINTS + 4 * (contacts + 2),
+        )
+        self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)
 
     @property
@@ -169,10 +189,10 @@ class WalkEnv:
         """Length of the critic's observation."""
         return jax.eval_shape(self.reset, jax.random.PRNGKey(0)).privileged_obs.shape[0]
 
-    # -- drawing ------------------------------------------------------------------------------------------------
+    # -- sampling ------------------------------------------------------------------------------------------------
 
-    def draw_condition(self, key: jax.Array, level: jax.Array) -> Condition:
-        """Draws what a training world asks; `level` in [0, 1] scales slopes, forces and kicks."""
+    def sample_spec(self, key: jax.Array, difficulty: jax.Array) -> EpisodeSpec:
+        """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and kicks."""
         task = self.task
         keys = iter(jax.random.split(key, 24))
         uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
@@ -190,35 +210,43 @@ class WalkEnv:
         gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.64, 0.28, 0.04, 0.04])))]
         varied = chance(0.35)
         vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
-        default = walk_policy.COMMAND_DEFAULT
+        default = walk_policy.default_commands(self.robot)
+        width, length = self.robot.walk.stance_width, self.robot.walk.stance_length
         rest = [
-            vary(-0.12, 0.06, default[3]), vary(2.0, 4.0, default[4]), *gait, default[8], vary(0.03, 0.16, default[9]),
-            vary(-0.25, 0.25, default[10]), vary(-0.1, 0.1, default[11]), vary(0.2, 0.35, default[12]),
-            vary(0.36, 0.44, default[13]), default[14],
-        ]  # fmt: skip
+            vary(-0.12, 0.06, default[3]),
+            vary(2.0, 4.0, default[4]),
+            *gait,
+            default[8],
+            vary(0.03, 0.16, default[9]),
+            vary(-0.25, 0.25, default[10]),
+            vary(-0.1, 0.1, default[11]),
+            vary(width - 0.05, width + 0.1, default[12]),
+            vary(length - 0.068, length + 0.012, default[13]),
+            default[14],
+        ]
         angle = uniform(-jnp.pi, jnp.pi)
-        slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * level
+        slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * difficulty
         direction = uniform(-jnp.pi, jnp.pi)
-        force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * level
-        return Condition(
+        force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * difficulty
+        return EpisodeSpec(
             commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
             slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
             force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
-            kick=task.kick * level,
+            kick=task.kick * difficulty,
         )
 
-    def draw_body(self, key: jax.Array) -> Body:
-        """Draws one world's robot: the model's own, or a randomised one."""
+    def sample_body(self, key: jax.Array) -> RandomizedBody:
+        """Samples the robot's parameters; the nominal ones without randomisation."""
         if not self.task.randomize:
             one, zero = jnp.ones(()), jnp.zeros(())
-            return Body(one, zero, jnp.zeros(3), one, jnp.zeros(go1.NUM_JOINTS))
+            return RandomizedBody(one, zero, jnp.zeros(3), one, jnp.zeros(NUM_JOINTS))
         f, p, c, s, o = jax.random.split(key, 5)
-        return Body(
+        return RandomizedBody(
             friction=jax.random.uniform(f, (), minval=0.35, maxval=1.8),
             payload=jax.random.uniform(p, (), minval=-1.0, maxval=2.5),
             com=jax.random.uniform(c, (3,), minval=-1.0, maxval=1.0) * jnp.array([0.03, 0.02, 0.02]),
             strength=jax.random.uniform(s, (), minval=0.9, maxval=1.1),
-            motor_offset=jax.random.uniform(o, (go1.NUM_JOINTS,), minval=-0.02, maxval=0.02),
+            motor_offset=jax.random.uniform(o, (NUM_JOINTS,), minval=-0.02, maxval=0.02),
         )
 
     # -- reset and step -----------------------------------------------------------------------------------------
@@ -226,60 +254,73 @@ class WalkEnv:
     def reset(
         self,
         key: jax.Array,
-        condition: Condition | None = None,
-        level: jax.Array | float = 1.0,
+        spec: EpisodeSpec | None = None,
+        difficulty: jax.Array | float = 1.0,
         step: jax.Array | int = 0,
     ) -> WalkState:
-        """Returns a fresh state; without a condition one is drawn."""
-        next_key, condition_key, body_key, pose_key, noise_key = jax.random.split(key, 5)
-        level = jnp.asarray(level, jnp.float32)
-        if condition is None:
-            condition = self.draw_condition(condition_key, level)
-        body = self.draw_body(body_key)
+        """Returns the initial state of an episode; samples a spec if none is given."""
+        next_key, spec_key, body_key, pose_key, noise_key = jax.random.split(key, 5)
+        difficulty = jnp.asarray(difficulty, jnp.float32)
+        if spec is None:
+            spec = self.sample_spec(spec_key, difficulty)
+        body = self.sample_body(body_key)
         a, b, c, d = jax.random.split(pose_key, 4)
         model, index = self.compiled.model, self.index
         yaw = jax.random.uniform(a, (), minval=-jnp.pi, maxval=jnp.pi)
-        # A given condition is a measurement: start along +x so that slopes and headings mean what they say.
+        # Fixed specs (evaluation) start along +x, so that slope and heading have a known relation.
         yaw = jnp.where(self.task.command_period > 0, yaw, 0.0)
-        joints = go1.DEFAULT_JOINTS * jax.random.uniform(b, (go1.NUM_JOINTS,), minval=0.7, maxval=1.3)
-        height = jax.random.uniform(c, (), minval=0.33, maxval=0.42)
+        joints = self.robot.default_joints * jax.random.uniform(b, (NUM_JOINTS,), minval=0.7, maxval=1.3)
+        stand = self.robot.stand_height
+        height = jax.random.uniform(c, (), minval=stand + 0.03, maxval=stand + 0.12)
         quaternion = euler_to_quaternion(jnp.stack([jnp.zeros(()), jnp.zeros(()), yaw]))
         qpos = jnp.zeros(model.nq).at[index.joint_qpos[0]].set(joints)
         qpos = qpos.at[index.base_qpos[0]].set(jnp.concatenate([jnp.stack([0.0, 0.0, height]), quaternion]))
         speed = jax.random.uniform(d, (6,), minval=-0.5, maxval=0.5)
         qvel = jnp.zeros(model.nv).at[index.base_qvel[0]].set(speed)
-        ctrl = jnp.zeros(model.nu).at[index.actuator[0]].set(go1.DEFAULT_JOINTS)
+        ctrl = jnp.zeros(model.nu).at[index.actuator[0]].set(self.robot.default_joints)
         data = self.physics.init(qpos, qvel, jnp.zeros((0, 3)), ctrl)
-        zero, zeros = jnp.zeros(()), jnp.zeros(go1.NUM_JOINTS)
+        zero, zeros = jnp.zeros(()), jnp.zeros(NUM_JOINTS)
         memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), zeros, zeros, zero)
         state = WalkState(
-            data=data, obs=jnp.zeros(walk_policy.OBSERVATION_SIZE), privileged_obs=zero, reward=zero,
+            data=data,
+            obs=jnp.zeros(walk_policy.OBSERVATION_SIZE),
+            privileged_obs=zero,
+            reward=zero,
             latent_target=jnp.stack([body.friction - 1.0, body.payload / 2.0]),
-            terminated=jnp.zeros((), bool), truncated=jnp.zeros((), bool), metrics=_zero_metrics(self.task.rewards),
-            condition=condition, slope=condition.slope, force=condition.force, body=body, memory=memory,
-            mean_error=jnp.zeros(3), step=jnp.asarray(step, jnp.int32), age=jnp.zeros((), jnp.int32), level=level,
+            terminated=jnp.zeros((), bool),
+            truncated=jnp.zeros((), bool),
+            metrics=_zero_metrics(self.task.rewards),
+            spec=spec,
+            slope=spec.slope,
+            force=spec.force,
+            body=body,
+            memory=memory,
+            mean_error=jnp.zeros(3),
+            step=jnp.asarray(step, jnp.int32),
+            age=jnp.zeros((), jnp.int32),
+            difficulty=difficulty,
             key=next_key,
-        )  # fmt: skip
+        )
         return self._observed(state, noise_key)
 
     def step(self, state: WalkState, action: jax.Array) -> WalkState:
         """Advances by one policy step with an action (12,)."""
         task, index = self.task, self.index
-        key, kick_key, kick_time, kick_size, condition_key, noise_key = jax.random.split(state.key, 6)
+        key, kick_key, kick_time, kick_size, spec_key, noise_key = jax.random.split(state.key, 6)
         action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
-        target = walk_policy.joint_targets(action)
-        previous_target = walk_policy.joint_targets(state.memory.action)
-        before_target = walk_policy.joint_targets(state.memory.previous_action)
+        target = walk_policy.joint_targets(self.robot, action)
+        previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
+        before_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
 
-        # Forces follow their condition within about half a second.
-        slope = state.slope + jnp.clip(state.condition.slope - state.slope, -0.02, 0.02)
-        force = state.force + jnp.clip(state.condition.force - state.force, -2.0, 2.0)
+        # Slope and force reach the spec's values within about half a second.
+        slope = state.slope + jnp.clip(state.spec.slope - state.slope, -0.02, 0.02)
+        force = state.force + jnp.clip(state.spec.force - state.force, -2.0, 2.0)
         if task.command_period > 0:
             kicked = jax.random.bernoulli(kick_time, DT / task.kick_period)
-            size = state.condition.kick * jax.random.uniform(kick_size, ())
+            size = state.spec.kick * jax.random.uniform(kick_size, ())
         else:
             kicked = (state.age + 1) % round(task.kick_period / DT) == 0
-            size = state.condition.kick
+            size = state.spec.kick
         angle = jax.random.uniform(kick_key, (), maxval=2 * jnp.pi)
         push = jnp.where(kicked, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
@@ -291,53 +332,75 @@ class WalkEnv:
             fields=self._fields(state.body),
             xfrc_applied=self._forces(data, state.body, slope, force),
         )
-        readings = self.read(data)
-        commands = state.condition.commands
-        velocity, yaw_rate = heading_velocity(readings)
+        robot_state = self.read(data)
+        commands = state.spec.commands
+        velocity, yaw_rate = heading_velocity(robot_state)
         error = jnp.stack([velocity[0] - commands[0], velocity[1] - commands[1], yaw_rate - commands[2]])
         mean_error = state.mean_error + 0.04 * (error - state.mean_error)
         gait = walk_policy.advance_gait(state.memory.gait, commands)
         memory = WalkMemory(state.memory.history, action, state.memory.action, gait)
 
         inputs = RewardInputs(
-            readings=readings, commands=commands, error=error, mean_error=mean_error, gait=gait, target=target,
-            previous_target=previous_target, before_target=before_target, body_height=task.body_height,
-            foot_force=self.foot_force(data), strength=state.body.strength,
-        )  # fmt: skip
+            robot=self.robot,
+            robot_state=robot_state,
+            commands=commands,
+            error=error,
+            mean_error=mean_error,
+            gait=gait,
+            target=target,
+            previous_target=previous_target,
+            before_target=before_target,
+            foot_force=self.foot_force(data),
+            strength=state.body.strength,
+        )
         terms = reward_terms(inputs)
         reward, weighted = combine(terms, task.rewards)
 
-        up = rotate_inverse(readings.quaternion, jnp.array([0.0, 0.0, 1.0]))[0]
+        up = rotate_inverse(robot_state.quaternion, jnp.array([0.0, 0.0, 1.0]))[0]
+        low = robot_state.position_w[0, 2] < self.robot.walk.min_trunk_height
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        fallen = (readings.trunk_force[0] > 1.0) | (up[2] < 0.5) | (readings.position_w[0, 2] < 0.1) | ~finite
+        fallen = (robot_state.trunk_force[0] > 1.0) | (up[2] < 0.5) | low | ~finite
         step, age = state.step + 1, state.age + 1
         metrics = {f"reward/{name}": value for name, value in weighted.items()} | {
-            "error_vx": jnp.square(error[0]), "error_vy": jnp.square(error[1]), "error_yaw": jnp.square(error[2]),
-        }  # fmt: skip
-        condition = state.condition
+            "error_vx": jnp.square(error[0]),
+            "error_vy": jnp.square(error[1]),
+            "error_yaw": jnp.square(error[2]),
+        }
+        spec = state.spec
         if task.command_period > 0:
             renewed = step % round(task.command_period / DT) == 0
-            fresh = self.draw_condition(condition_key, state.level)
-            condition = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, condition)
+            fresh = self.sample_spec(spec_key, state.difficulty)
+            spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, spec)
             mean_error = jnp.where(renewed, 0.0, mean_error)
         state = dataclasses.replace(
-            state, data=data, reward=jnp.where(finite, reward, 0.0), terminated=fallen,
-            truncated=~fallen & (step >= round(task.episode_length / DT)), metrics=metrics, condition=condition,
-            slope=slope, force=force, memory=memory, mean_error=mean_error, step=step, age=age, key=key,
-        )  # fmt: skip
+            state,
+            data=data,
+            reward=jnp.where(finite, reward, 0.0),
+            terminated=fallen,
+            truncated=~fallen & (step >= round(task.episode_length / DT)),
+            metrics=metrics,
+            spec=spec,
+            slope=slope,
+            force=force,
+            memory=memory,
+            mean_error=mean_error,
+            step=step,
+            age=age,
+            key=key,
+        )
         return self._observed(state, noise_key)
 
-    # -- readings -----------------------------------------------------------------------------------------------
+    # -- robot state --------------------------------------------------------------------------------------------
 
-    def read(self, data: mjx.Data) -> RobotReadings:
-        """Reads the robot."""
+    def read(self, data: mjx.Data) -> RobotState:
+        """Returns the robot's state."""
         return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def foot_force(self, data: mjx.Data) -> jax.Array:
-        """Strongest contact force on each foot (4,), N."""
+        """Returns the strongest contact force on each foot (4,), N."""
         return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
 
-    def _fields(self, body: Body) -> dict[str, jax.Array]:
+    def _fields(self, body: RandomizedBody) -> dict[str, jax.Array]:
         if not self.task.randomize:
             return {}
         model, index = self.compiled.model, self.index
@@ -348,12 +411,15 @@ class WalkEnv:
         gain = jnp.asarray(model.actuator_gainprm, jnp.float32) * body.strength
         bias = jnp.asarray(model.actuator_biasprm, jnp.float32) * body.strength
         return {
-            "geom_friction": friction, "body_mass": mass, "body_ipos": com, "actuator_gainprm": gain,
+            "geom_friction": friction,
+            "body_mass": mass,
+            "body_ipos": com,
+            "actuator_gainprm": gain,
             "actuator_biasprm": bias,
-        }  # fmt: skip
+        }
 
-    def _forces(self, data: mjx.Data, body: Body, slope: jax.Array, force: jax.Array) -> jax.Array:
-        """External forces on all bodies (nbody, 6): gravity's turn by the slope, and the force on the trunk."""
+    def _forces(self, data: mjx.Data, body: RandomizedBody, slope: jax.Array, force: jax.Array) -> jax.Array:
+        """Returns external forces on all bodies (nbody, 6), N: gravity's change by the slope, force on the trunk."""
         trunk = int(self.index.trunk_body[0])
         turn = gravity_w(slope) - jnp.array([0.0, 0.0, -GRAVITY])
         mass = jnp.asarray(self._mass, jnp.float32).at[trunk].add(body.payload)
@@ -365,45 +431,58 @@ class WalkEnv:
         return forces.at[trunk, :2].add(force[0] * along + force[1] * left)
 
     def _observed(self, state: WalkState, key: jax.Array) -> WalkState:
-        readings = self.read(state.data)
-        quaternion = readings.quaternion[0]
+        robot_state = self.read(state.data)
+        quaternion = robot_state.quaternion[0]
         gravity = rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
-        joint_position, joint_velocity = readings.joint_position[0], readings.joint_velocity[0]
-        clean = walk_policy.observe(state.memory, state.condition.commands, gravity, joint_position, joint_velocity)
+        joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
+        clean = walk_policy.observe(
+            self.robot, state.memory, state.spec.commands, gravity, joint_position, joint_velocity
+        )
         obs = clean
         if self.task.randomize:
             a, b, c = jax.random.split(key, 3)
             obs = walk_policy.observe(
-                state.memory, state.condition.commands,
+                self.robot,
+                state.memory,
+                state.spec.commands,
                 gravity + 0.02 * jax.random.normal(a, (3,)),
-                joint_position + 0.005 * jax.random.normal(b, (go1.NUM_JOINTS,)),
-                joint_velocity + 0.5 * jax.random.normal(c, (go1.NUM_JOINTS,)),
-            )  # fmt: skip
-        velocity = rotate_inverse(quaternion, readings.linear_velocity_w[0])
+                joint_position + 0.005 * jax.random.normal(b, (NUM_JOINTS,)),
+                joint_velocity + 0.5 * jax.random.normal(c, (NUM_JOINTS,)),
+            )
+        velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
-        feet = robots.foot_positions(joint_position)
-        foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
-        phases = walk_policy.foot_phases(state.memory.gait, state.condition.commands)
+        feet = robots.foot_positions(self.robot, joint_position)
+        foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
+        phases = walk_policy.foot_phases(state.memory.gait, state.spec.commands)
         body = state.body
-        privileged = jnp.concatenate([
-            clean, 2.0 * velocity, 0.25 * readings.angular_velocity_b[0], up, 5.0 * readings.position_w[0, 2:] - 1.5,
-            10.0 * foot_height, jnp.cos(2 * jnp.pi * phases), jnp.tanh(self.foot_force(state.data) / 50.0),
-            2.0 * state.mean_error, state.force / 20.0, state.slope * 4.0, body.com * 20.0,
-            jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
-        ])  # fmt: skip
+        privileged = jnp.concatenate(
+            [
+                clean,
+                2.0 * velocity,
+                0.25 * robot_state.angular_velocity_b[0],
+                up,
+                5.0 * robot_state.position_w[0, 2:] - 5.0 * self.robot.stand_height,
+                10.0 * foot_height,
+                jnp.cos(2 * jnp.pi * phases),
+                jnp.tanh(self.foot_force(state.data) / 50.0),
+                2.0 * state.mean_error,
+                state.force / 20.0,
+                state.slope * 4.0,
+                body.com * 20.0,
+                jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
+            ]
+        )
         obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))
         privileged = jnp.nan_to_num(jnp.clip(privileged, -100.0, 100.0))
         return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
 
     def autoreset(self, state: WalkState) -> WalkState:
-        """Replaces a finished state by a fresh one, keeping what tells how it finished."""
+        """Resets a finished environment; reward, end flags and metrics of the last step are kept."""
         done = state.terminated | state.truncated
         key, reset_key = jax.random.split(state.key)
-        fresh = self.reset(reset_key, None, state.level)
+        fresh = self.reset(reset_key, None, state.difficulty)
         data = self.physics.merge(done, fresh.data, state.data)
-        keep = {
-            name: getattr(state, name) for name in ("reward", "terminated", "truncated", "metrics", "level")
-        }  # fmt: skip
+        keep = {name: getattr(state, name) for name in ("reward", "terminated", "truncated", "metrics", "difficulty")}
         others = [field.name for field in dataclasses.fields(state) if field.name not in ("data", "key", *keep)]
         pick = lambda new, old: jnp.where(done, new, old)  # noqa: E731
         merged = {name: jax.tree.map(pick, getattr(fresh, name), getattr(state, name)) for name in others}
@@ -411,16 +490,16 @@ class WalkEnv:
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:
-    """Gravity (3,), m/s^2, in the frame of a ground that rises by `slope` (2,), rad, along x and y."""
+    """Returns gravity (3,), m/s^2, in the frame of a ground inclined by `slope` (2,), rad, along x and y."""
     angle = jnp.linalg.norm(slope + 1e-12)
     along = slope / jnp.maximum(angle, 1e-9)
     return GRAVITY * jnp.concatenate([-jnp.sin(angle) * along, -jnp.cos(angle)[None]])
 
 
-def heading_velocity(readings: RobotReadings) -> tuple[jax.Array, jax.Array]:
+def heading_velocity(robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
     """Returns the first robot's velocity along its heading and to its left (2,), m/s, and yaw rate (), rad/s."""
-    velocity = rotate_inverse(readings.quaternion[0], readings.linear_velocity_w[0])
-    return velocity[:2], readings.angular_velocity_b[0, 2]
+    velocity = rotate_inverse(robot_state.quaternion[0], robot_state.linear_velocity_w[0])
+    return velocity[:2], robot_state.angular_velocity_b[0, 2]
 
 
 def _zero_metrics(weights: WalkRewards) -> dict[str, Any]:

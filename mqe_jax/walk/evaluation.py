@@ -1,4 +1,4 @@
-"""Measures a walk policy: tracking, falls, kicks, slopes, forces, standing still and gait frequency."""
+"""Evaluation of a walk policy: tracking, falls, kicks, slopes, forces, standing still and gait frequency."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import robots, walk_policy
-from mqe_jax.errors import nearest
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
-from mqe_jax.walk.env import Condition, WalkEnv, WalkTask
+from mqe_jax.walk.env import EpisodeSpec, WalkEnv, WalkTask
 
-WARM_UP = 1.0  # s at the start of an episode that no error counts
+WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """What one measurement asks.
+    """Settings of one measurement.
 
     Attributes:
         duration: of an episode, s.
-        velocity: commanded vx, vy, yaw rate, m/s and rad/s; None draws them uniformly from +-1, +-0.6, +-1.
+        velocity: commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from +-1, +-0.6, +-1.
         gait: name of the gait.
         frequency: commanded gait frequency, Hz.
-        slope: rise of the ground along x, rad.
+        slope: inclination of the ground along x, rad.
         force: sustained force along and to the left of the heading, N.
-        kick: sudden change of velocity every 5 s, m/s.
-        meaning: a line of explanation.
+        kick: instantaneous change of velocity every 5 s, m/s.
+        meaning: one-line description.
     """
 
     duration: float = 20.0
@@ -58,24 +59,26 @@ SCENARIOS = {
 }
 
 
-def make_env(impl: str, episodes: int) -> WalkEnv:
-    """Makes the walking environment as it is for measuring: nothing randomised, commands kept."""
+def make_env(robot: Robot, impl: str, episodes: int) -> WalkEnv:
+    """Makes the evaluation environment: no randomisation, commands kept for the whole episode."""
     task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
-    return WalkEnv(task, impl=impl, num_envs=episodes)
+    return WalkEnv(robot, task, impl=impl, num_envs=episodes)
 
 
-def conditions(scenario: Scenario, key: jax.Array, episodes: int) -> Condition:
-    """Draws what every episode asks; leading axis `episodes`."""
+def sample_specs(robot: Robot, scenario: Scenario, key: jax.Array, episodes: int) -> EpisodeSpec:
+    """Samples the specs of all episodes; leading axis `episodes`."""
     span = jnp.array([1.0, 0.6, 1.0])
     velocity = jax.random.uniform(key, (episodes, 3), minval=-span, maxval=span)
     if scenario.velocity is not None:
         velocity = jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
-    rest = walk_policy.default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
+    rest = walk_policy.default_commands(robot, scenario.gait, gait_frequency=scenario.frequency)[3:]
     full = lambda values: jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))  # noqa: E731
-    return Condition(
+    return EpisodeSpec(
         commands=jnp.concatenate([velocity, full(rest)], axis=1),
-        slope=full((scenario.slope, 0.0)), force=full(scenario.force), kick=full(scenario.kick),
-    )  # fmt: skip
+        slope=full((scenario.slope, 0.0)),
+        force=full(scenario.force),
+        kick=full(scenario.kick),
+    )
 
 
 def measure(
@@ -85,42 +88,48 @@ def measure(
 
     Returns:
         rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors after the first second, until a fall;
-        fall_rate: share of episodes with a fall; speed: mean velocity along the heading, m/s; drift and drift_p95:
+        fall_rate: fraction of episodes with a fall; speed: mean velocity along the heading, m/s; drift and drift_p95:
         mean and 95th percentile of the distance covered in the 10 s after the first, m; step_frequency: median
         over episodes and feet of the strongest frequency of the foot's height, Hz.
     """
     steps, warm = round(scenario.duration / walk_policy.STEP), round(WARM_UP / walk_policy.STEP)
-    reset_key, condition_key = jax.random.split(jax.random.PRNGKey(seed))
+    reset_key, spec_key = jax.random.split(jax.random.PRNGKey(seed))
 
     def advance(carry: Any, _: None) -> Any:
         state, memory = carry
 
         def one(state: Any, memory: Any) -> Any:
-            readings = env.read(state.data)
+            robot_state = env.read(state.data)
             gravity = state.obs[:3]
-            commands = state.condition.commands
+            commands = state.spec.commands
             _, memory = walk_policy.walk(
-                params, memory, commands, gravity, readings.joint_position[0], readings.joint_velocity[0]
+                env.robot,
+                params,
+                memory,
+                commands,
+                gravity,
+                robot_state.joint_position[0],
+                robot_state.joint_velocity[0],
             )
             state = env.step(state, memory.action)
-            readings = env.read(state.data)
-            quaternion = readings.quaternion[0]
-            feet = robots.foot_positions(readings.joint_position[0])
-            height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + readings.position_w[0, 2]
+            robot_state = env.read(state.data)
+            quaternion = robot_state.quaternion[0]
+            feet = robots.foot_positions(env.robot, robot_state.joint_position[0])
+            height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
             squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
-            speed = rotate_inverse(quaternion, readings.linear_velocity_w[0])[0]
-            return state, memory, (squares, speed, readings.position_w[0, :2], height, state.terminated)
+            speed = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])[0]
+            return state, memory, (squares, speed, robot_state.position_w[0, :2], height, state.terminated)
 
         state, memory, record = jax.vmap(one)(state, memory)
         return (state, memory), record
 
     @jax.jit
-    def run(keys: jax.Array, condition: Condition) -> Any:
-        state = jax.vmap(env.reset)(keys, condition)
+    def run(keys: jax.Array, spec: EpisodeSpec) -> Any:
+        state = jax.vmap(env.reset)(keys, spec)
         memory = jax.vmap(lambda _: walk_policy.initial_memory())(keys)
         return jax.lax.scan(advance, (state, memory), None, steps)[1]
 
-    asked = conditions(scenario, condition_key, episodes)
+    asked = sample_specs(env.robot, scenario, spec_key, episodes)
     squares, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), asked))
     alive = ~np.logical_or.accumulate(fallen, axis=0)
     counted = alive.copy()
@@ -128,10 +137,12 @@ def measure(
     rms = np.sqrt((squares * counted[..., None]).sum((0, 1)) / max(counted.sum(), 1))
     upright = alive[-1]
     figures = {
-        "rms_vx": float(rms[0]), "rms_vy": float(rms[1]), "rms_yaw": float(rms[2]),
+        "rms_vx": float(rms[0]),
+        "rms_vy": float(rms[1]),
+        "rms_yaw": float(rms[2]),
         "fall_rate": float(1.0 - upright.mean()),
         "speed": float((speed * counted).sum() / max(counted.sum(), 1)),
-    }  # fmt: skip
+    }
     if upright.any():
         travelled = np.linalg.norm(position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1)[upright]
         figures |= {"drift": float(travelled.mean()), "drift_p95": float(np.percentile(travelled, 95))}
@@ -150,26 +161,32 @@ def _frequency(height: np.ndarray) -> float:
 
 
 def evaluate_walk(
-    params: walk_policy.Params, *, impl: str = "auto", episodes: int = 1000, seed: int = 0,
-    scenarios: Sequence[str] | None = None, report: Callable[[str, dict[str, float]], None] | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Measures a walk policy in the named scenarios (all of `SCENARIOS` if None).
+    robot: Robot,
+    params: walk_policy.Params,
+    *,
+    impl: str = "auto",
+    episodes: int = 1000,
+    seed: int = 0,
+    scenarios: Sequence[str] | None = None,
+    report: Callable[[str, dict[str, float]], None] | None = None,
+) -> dict[str, Any]:
+    """Measures a robot's walk policy in the named scenarios (all of `SCENARIOS` if None).
 
     Returns:
-        the figures of `flat` at the top level (rms_vx, rms_vy, rms_yaw, fall_rate) and all under `scenarios`.
+        the figures of `flat` at the top difficulty (rms_vx, rms_vy, rms_yaw, fall_rate) and all under `scenarios`.
 
     Raises:
-        ValueError: for an unknown scenario, or episodes below 1.
+        InputError: for an unknown scenario, or episodes below 1.
     """
     if episodes < 1:
-        raise ValueError(f"episodes: {episodes} must be at least 1")
+        raise InputError(f"episodes: {episodes} must be at least 1")
     names = list(SCENARIOS) if scenarios is None else list(scenarios)
     for name in names:
         if name not in SCENARIOS:
-            raise ValueError(
+            raise InputError(
                 f"scenario: unknown name {name!r}{nearest(name, SCENARIOS)}; allowed: {', '.join(SCENARIOS)}"
             )
-    env = make_env(impl, episodes)
+    env = make_env(robot, impl, episodes)
     results = {}
     for name in names:
         results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
@@ -178,6 +195,9 @@ def evaluate_walk(
     top = results.get("flat", {})
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
-        "impl": env.physics.impl, "episodes": episodes, **{key: top[key] for key in keys if key in top},
+        "robot": robot.name,
+        "impl": env.physics.impl,
+        "episodes": episodes,
+        **{key: top[key] for key in keys if key in top},
         "scenarios": results,
-    }  # fmt: skip
+    }

@@ -1,4 +1,4 @@
-"""The rewards by which the walk policy is trained.
+"""Rewards of the walk policy's training.
 
 They follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238): positive terms times the exponential of the sum
 of the negative ones.
@@ -7,19 +7,24 @@ of the negative ones.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 
 from mqe_jax import robots, walk_policy
-from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 
 
 @dataclasses.dataclass(frozen=True)
 class WalkRewards:
-    """Weights of the reward terms; the first four are positive terms, the others go into the exponent."""
+    """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
+
+    `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground that happens at the knee, so it is
+    read from the knee's height (`WalkSettings.min_knee_height`), at no cost for contact sensors.
+    """
 
     track_velocity: float = 0.6
     track_mean_velocity: float = 0.7
@@ -37,16 +42,17 @@ class WalkRewards:
     torque: float = -1e-4
     joint_velocity: float = -1e-4
     joint_limit: float = -10.0
-    low_knee: float = -5.0
+    limb_contact: float = -5.0
     vertical_speed: float = -0.02
     roll_pitch_rate: float = -0.001
 
 
 @dataclasses.dataclass(frozen=True)
 class RewardInputs:
-    """What the reward terms are functions of; see `WalkState` for shapes and units."""
+    """Inputs of the reward terms; shapes and units as in `WalkState`."""
 
-    readings: RobotReadings
+    robot: Robot
+    robot_state: RobotState
     commands: jax.Array
     error: jax.Array
     mean_error: jax.Array
@@ -54,28 +60,28 @@ class RewardInputs:
     target: jax.Array
     previous_target: jax.Array
     before_target: jax.Array
-    body_height: float
     foot_force: jax.Array
     strength: jax.Array
 
 
 def desired_contact(phases: jax.Array, width: float = 0.07) -> jax.Array:
-    """Returns how much each foot should be on the ground, in [0, 1], from its phase (4,): smooth at the switches."""
+    """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off and touch-down."""
     cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=width)  # noqa: E731
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
 
 
 def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
-    """Computes every term (), named as its weight in `WalkRewards`."""
-    readings, commands = inputs.readings, inputs.commands
-    quaternion, height = readings.quaternion[0], readings.position_w[0, 2]
-    joint_position, joint_velocity = readings.joint_position[0], readings.joint_velocity[0]
+    """Computes all terms (), named as their weights in `WalkRewards`."""
+    robot, robot_state, commands = inputs.robot, inputs.robot_state, inputs.commands
+    quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
+    joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
     phases = walk_policy.foot_phases(inputs.gait, commands)
     contact = desired_contact(phases)
-    velocity_b = rotate_inverse(quaternion, readings.linear_velocity_w[0])
-    rate = readings.angular_velocity_b[0]
+    velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
+    rate = robot_state.angular_velocity_b[0]
 
-    feet, feet_velocity = jax.jvp(robots.foot_positions, (joint_position,), (joint_velocity,))
+    locate_feet = functools.partial(robots.foot_positions, robot)
+    feet, feet_velocity = jax.jvp(locate_feet, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
     turn = jnp.broadcast_to(quaternion, (4, 4))
     feet_w, feet_velocity = rotate(turn, feet), rotate(turn, feet_velocity)
@@ -84,7 +90,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     feet_heading = jnp.stack([cos * feet_w[:, 0] + sin * feet_w[:, 1], -sin * feet_w[:, 0] + cos * feet_w[:, 1]], -1)
 
-    # Where the gait wants the feet: the stance corners, shifted by half a stance's travel over the cycle.
+    # Raibert heuristic: stance corners, shifted by half of the distance travelled during stance.
     stance = jnp.stack(
         [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]],
         -1,
@@ -93,17 +99,17 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)
     place = stance + shift[:, None] * speed * 0.5 / commands[4]
     swing = 1.0 - jnp.abs(1.0 - 2.0 * jnp.clip(2.0 * phases - 1.0, 0.0, 1.0))
-    wanted_height = commands[9] * swing + go1.FOOT_RADIUS
+    wanted_height = commands[9] * swing + robot.foot_radius
 
     up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
     tilt = euler_to_quaternion(jnp.stack([commands[11], commands[10], jnp.zeros(())]))
     wanted_up = rotate_inverse(tilt, jnp.array([0.0, 0.0, 1.0]))
-    torque = inputs.strength * (go1.KP * (inputs.target - joint_position) - go1.KD * joint_velocity)
-    torque = jnp.clip(torque, -go1.TORQUE_LIMIT, go1.TORQUE_LIMIT)
-    margin = 0.05 * (go1.JOINT_UPPER - go1.JOINT_LOWER)
-    beyond = jnp.maximum(joint_position - go1.JOINT_UPPER + margin, 0)
-    beyond += jnp.maximum(go1.JOINT_LOWER + margin - joint_position, 0)
-    knees = rotate(turn, robots.knee_positions(joint_position))[:, 2] + height
+    torque = inputs.strength * (robot.kp * (inputs.target - joint_position) - robot.kd * joint_velocity)
+    torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
+    margin = 0.05 * (robot.joint_upper - robot.joint_lower)
+    beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
+    beyond += jnp.maximum(robot.joint_lower + margin - joint_position, 0)
+    knees = rotate(turn, robots.knee_positions(robot, joint_position))[:, 2] + height
     on_ground = inputs.foot_force > 1.0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {
@@ -113,7 +119,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "track_mean_yaw": jnp.exp(-jnp.square(inputs.mean_error[2]) / 0.04),
         "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
         "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
-        "body_height": jnp.square(height - inputs.body_height - commands[3]),
+        "body_height": jnp.square(height - robot.stand_height - commands[3]),
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
         "raibert": jnp.sum(jnp.square(feet_heading - place)),
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
@@ -123,8 +129,8 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
-        "low_knee": jnp.sum(jnp.maximum(0.06 - knees, 0.0) > 0).astype(jnp.float32),
-        "vertical_speed": jnp.square(readings.linear_velocity_w[0, 2]),
+        "limb_contact": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(jnp.float32),
+        "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }
 

@@ -1,8 +1,8 @@
 """Training of the walk policy: PPO with a 30-step history, as walk-these-ways does it (arXiv 2212.03238).
 
-The rollout keeps single observations of 70 numbers; the 30-step windows are gathered from them when they are
-needed, so memory grows with 70 and not with 2100 numbers a step. The adaptation network learns by regression
-of the latent target and its output is an input without gradient of the policy.
+The rollout stores single observations (70 numbers); the 30-step windows (2100 numbers) are gathered for each minibatch,
+which saves a factor of 30 in memory. The adaptation network is trained by regression on the latent target; the policy
+receives its output without gradient.
 """
 
 from __future__ import annotations
@@ -18,20 +18,22 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import walk_policy
-from mqe_jax.robots.go1 import NUM_JOINTS
-from mqe_jax.train import nn
+from mqe_jax.errors import InputError
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.train import checkpoint, nn
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
-from mqe_jax.train.optim import adam
+from mqe_jax.train.optim import AdamState, adam
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 
-class WalkWorld(Protocol):
-    """What the trainer needs of the walking environment; see `mqe_jax.walk.env.WalkEnv`."""
+class WalkEnvironment(Protocol):
+    """Interface between trainer and walking environment; see `mqe_jax.walk.env.WalkEnv`."""
 
+    robot: Robot
     privileged_size: int
 
-    def reset(self, key: jax.Array, condition: Any = None, level: Any = 1.0, step: Any = 0) -> Any: ...
+    def reset(self, key: jax.Array, spec: Any = None, difficulty: Any = 1.0, step: Any = 0) -> Any: ...
     def step(self, state: Any, action: jax.Array) -> Any: ...
     def autoreset(self, state: Any) -> Any: ...
 
@@ -41,23 +43,23 @@ class WalkConfig:
     """Settings of the walk policy's training; defaults as in walk-these-ways where it has them.
 
     Attributes:
-        num_envs: worlds side by side.
-        rollout_length: steps of each world between updates.
-        iterations: updates in all.
+        num_envs: number of parallel environments.
+        rollout_length: steps per environment and update.
+        iterations: total number of updates.
         epochs: passes over each rollout.
-        minibatches: parts of each pass.
-        learning_rate: at the start; adapted to `target_kl`.
-        target_kl: wanted KL divergence of one pass.
+        minibatches: per epoch.
+        learning_rate: initial value; adapted to `target_kl`.
+        target_kl: target KL divergence per minibatch.
         clip: of the policy ratio.
         gamma: discount.
-        lam: of the advantage estimate.
-        entropy: coefficient.
+        gae_lambda: of generalised advantage estimation.
+        entropy: coefficient of the entropy bonus.
         value: coefficient of the value loss.
-        adaptation: coefficient of the adaptation network's regression.
-        max_grad_norm: gradients are scaled down to it.
-        initial_std: of the actions.
-        curriculum: iterations until slopes, forces and kicks are at their greatest.
-        seed: of everything random.
+        adaptation: coefficient of the adaptation network's regression loss.
+        max_grad_norm: global gradient-norm clip.
+        initial_std: standard deviation of the actions at the start.
+        curriculum: iterations over which slopes, forces and kicks grow to their maxima.
+        seed: of all random numbers.
     """
 
     num_envs: int = 8192
@@ -69,7 +71,7 @@ class WalkConfig:
     target_kl: float = 0.01
     clip: float = 0.2
     gamma: float = 0.99
-    lam: float = 0.95
+    gae_lambda: float = 0.95
     entropy: float = 0.01
     value: float = 1.0
     adaptation: float = 1.0
@@ -82,25 +84,25 @@ class WalkConfig:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkLearner:
-    """Everything that learns.
+    """Learner state.
 
     Attributes:
         params: {"policy": walk policy weights, "log_std": (12,), "critic": layers}.
         optimizer: Adam's state.
-        rate: learning rate ().
+        learning_rate: ().
         iteration: () int32.
         key: random key.
     """
 
     params: dict[str, Any]
     optimizer: Any
-    rate: jax.Array
+    learning_rate: jax.Array
     iteration: jax.Array
     key: jax.Array
 
 
 def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index: jax.Array) -> jax.Array:
-    """Gathers flattened 30-step histories (B, 2100), zero before each episode's start.
+    """Gathers flattened 30-step histories (B, 2100); observations before the episode's start are zero.
 
     Args:
         buffer: observations (29 + T, N, 70): row t + 29 is that of step t.
@@ -116,7 +118,7 @@ def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index:
 
 
 def init_learner(key: jax.Array, config: WalkConfig, privileged_size: int) -> WalkLearner:
-    """Draws the weights."""
+    """Samples the initial weights."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     params = {
         "policy": walk_policy.init_params(policy_key),
@@ -128,12 +130,11 @@ def init_learner(key: jax.Array, config: WalkConfig, privileged_size: int) -> Wa
 
 
 def make_iteration(
-    env: WalkWorld, config: WalkConfig
+    env: WalkEnvironment, config: WalkConfig
 ) -> Callable[..., tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]]:
-    """Makes `iterate(learner, state, history) -> (learner, state, history, metrics)`, one rollout and update.
+    """Returns `iterate(learner, state, history) -> (learner, state, history, metrics)`: one rollout and its update.
 
-    `state` is the batched environment state, `history` each world's last observations (N, 30, 70), the newest
-    being the state's.
+    `state` is the batched environment state, `history` each environment's last observations (N, 30, 70), newest last.
     """
     optimizer = adam(1e-8, max_grad_norm=config.max_grad_norm)
     step = jax.vmap(env.step)
@@ -152,14 +153,22 @@ def make_iteration(
             mean = walk_policy.infer_action(params["policy"], flat, latent)
             action = mean + jnp.exp(params["log_std"]) * jax.random.normal(step_key, mean.shape)
             next_state = step(state, action)
-            # The critic has no history, so the value of the state reached is known before a reset replaces it.
+            # The critic takes no history, so the next state's value needs only the observation before the reset.
             record = {
-                "obs": state.obs, "privileged": state.privileged_obs, "age": state.age, "action": action,
-                "mean": mean, "log_prob": jnp.sum(log_prob(action, mean, params["log_std"]), -1),
-                "next_privileged": next_state.privileged_obs, "reward": next_state.reward,
-                "terminated": next_state.terminated, "truncated": next_state.truncated,
-                "latent_target": state.latent_target, "length": next_state.age, "metrics": next_state.metrics,
-            }  # fmt: skip
+                "obs": state.obs,
+                "privileged": state.privileged_obs,
+                "age": state.age,
+                "action": action,
+                "mean": mean,
+                "log_prob": jnp.sum(log_prob(action, mean, params["log_std"]), -1),
+                "next_privileged": next_state.privileged_obs,
+                "reward": next_state.reward,
+                "terminated": next_state.terminated,
+                "truncated": next_state.truncated,
+                "latent_target": state.latent_target,
+                "length": next_state.age,
+                "metrics": next_state.metrics,
+            }
             next_state = autoreset(next_state)
             fresh = (next_state.age == 0)[:, None, None]
             history = jnp.concatenate([jnp.where(fresh, 0.0, history[:, 1:]), next_state.obs[:, None]], axis=1)
@@ -172,8 +181,8 @@ def make_iteration(
         learner: WalkLearner, state: Any, history: jax.Array
     ) -> tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]:
         key, rollout_key, shuffle_key = jax.random.split(learner.key, 3)
-        level = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
-        state = dataclasses.replace(state, level=jnp.full(config.num_envs, level))
+        difficulty = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
+        state = dataclasses.replace(state, difficulty=jnp.full(config.num_envs, difficulty))
         before = jnp.moveaxis(history[:, :-1], 1, 0)
         state, history, records = rollout(learner, state, history, rollout_key)
         buffer = jnp.concatenate([before, records["obs"]])
@@ -187,7 +196,7 @@ def make_iteration(
             records["terminated"],
             done,
             gamma=config.gamma,
-            gae_lambda=config.lam,
+            gae_lambda=config.gae_lambda,
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
         old_log_std = learner.params["log_std"]
@@ -223,23 +232,79 @@ def make_iteration(
             jax.random.split(shuffle_key, config.epochs)
         )
         (params, optimizer_state, rate), info = jax.lax.scan(
-            minibatch, (learner.params, learner.optimizer, learner.rate), order.reshape(-1, size)
+            minibatch, (learner.params, learner.optimizer, learner.learning_rate), order.reshape(-1, size)
         )
         ended = jnp.sum(done)
         metrics = {name: jnp.mean(values) for name, values in {**info, **records["metrics"]}.items()}
         metrics |= {
-            "reward": jnp.mean(records["reward"]), "rate": rate, "std": jnp.mean(jnp.exp(params["log_std"])),
-            "fall_per_20s": jnp.mean(records["terminated"]) * 1000.0, "level": level,
+            "reward": jnp.mean(records["reward"]),
+            "learning_rate": rate,
+            "std": jnp.mean(jnp.exp(params["log_std"])),
+            "fall_per_20s": jnp.mean(records["terminated"]) * 1000.0,
+            "difficulty": difficulty,
             "episode_length": jnp.sum(records["length"] * done) / jnp.maximum(ended, 1),
-        }  # fmt: skip
+        }
         learner = WalkLearner(params, optimizer_state, rate, learner.iteration + 1, key)
         return learner, state, history, metrics
 
     return iterate
 
 
+def _to_checkpoint(learner: WalkLearner) -> dict[str, Any]:
+    """Returns what a checkpoint holds of a learner: 12 MB instead of 25.
+
+    Adam's second moments are kept as bfloat16 (bits in uint16), its first moments not at all: these restart from zero
+    and recover within some ten minibatches.
+    """
+    half = lambda x: jax.lax.bitcast_convert_type(x.astype(jnp.bfloat16), jnp.uint16)  # noqa: E731
+    return {
+        "params": learner.params,
+        "adam_square": jax.tree.map(half, learner.optimizer.square),
+        "adam_updates": learner.optimizer.updates,
+        "learning_rate": learner.learning_rate,
+        "iteration": learner.iteration,
+        "key": learner.key,
+    }
+
+
+def _from_checkpoint(saved: dict[str, Any]) -> WalkLearner:
+    """Returns the learner that a checkpoint describes."""
+    full = lambda x: jax.lax.bitcast_convert_type(x, jnp.bfloat16).astype(jnp.float32)  # noqa: E731
+    params = saved["params"]
+    optimizer = AdamState(
+        mean=jax.tree.map(jnp.zeros_like, params),
+        square=jax.tree.map(full, saved["adam_square"]),
+        updates=saved["adam_updates"],
+    )
+    return WalkLearner(params, optimizer, saved["learning_rate"], saved["iteration"], saved["key"])
+
+
+def save(run_dir: Path, learner: WalkLearner, robot: Robot, config: WalkConfig) -> Path:
+    """Writes a checkpoint and walk.safetensors into a run's folder; returns the checkpoint's path."""
+    iteration = int(learner.iteration)
+    about = {"robot": robot.name, "config": dataclasses.asdict(config), "iteration": iteration}
+    walk_policy.save_params(learner.params["policy"], run_dir / "walk.safetensors", about)
+    return checkpoint.save_checkpoint(run_dir, _to_checkpoint(learner), iteration, about, keep=2)
+
+
+def restore(run_dir: Path, learner: WalkLearner, robot: Robot) -> WalkLearner:
+    """Returns the learner of a run's newest checkpoint; `learner` itself where there is none.
+
+    Raises:
+        InputError: if the checkpoint is damaged or of another robot.
+    """
+    newest = checkpoint.latest(run_dir)
+    if newest is None:
+        return learner
+    saved = checkpoint.load_checkpoint(newest, jax.eval_shape(_to_checkpoint, learner))
+    if saved.metadata["robot"] != robot.name:
+        trained = saved.metadata["robot"]
+        raise InputError(f"{newest}: trained on {trained}; resume it with --robot {trained}, not {robot.name}")
+    return _from_checkpoint(saved.tree)
+
+
 def train_walk(
-    env: WalkWorld,
+    env: WalkEnvironment,
     config: WalkConfig,
     run_dir: Path,
     *,
@@ -254,36 +319,38 @@ def train_walk(
         env: the walking environment.
         config: settings.
         run_dir: folder of the run.
-        resume: goes on from the folder's checkpoint, with worlds started afresh.
-        max_seconds: stops after so long, with everything saved.
+        resume: continue from the folder's newest checkpoint; the environments are reset.
+        max_seconds: stop after this time, compilation included, with everything saved, s.
         save_every: iterations between checkpoints.
         report: called with the iteration and its metrics every 10 iterations.
-    """
-    from mqe_jax.train import checkpoint
 
+    Raises:
+        InputError: if the checkpoint to resume from is damaged or of another robot.
+    """
+    start = time.monotonic()
     run_dir.mkdir(parents=True, exist_ok=True)
     key = jax.random.PRNGKey(config.seed)
     learner_key, state_key, stagger_key = jax.random.split(key, 3)
     learner = init_learner(learner_key, config, env.privileged_size)
-    newest = checkpoint.latest(run_dir) if resume else None
-    if newest is not None:
-        learner = checkpoint.load_checkpoint(newest, learner).tree
+    if resume:
+        learner = restore(run_dir, learner, env.robot)
         state_key = jax.random.fold_in(state_key, learner.iteration)
-    level = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
+    difficulty = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
     keys = jax.random.split(state_key, config.num_envs)
-    # Worlds start at different points of their time limit so that they do not all reset at once.
+    # Staggered time limits: the environments do not all reset at once.
     steps = jax.random.randint(stagger_key, (config.num_envs,), 0, 900)
-    reset = jax.jit(jax.vmap(lambda k, s: env.reset(k, None, level, s)))
+    reset = jax.jit(jax.vmap(lambda k, s: env.reset(k, None, difficulty, s)))
     state = reset(keys, steps)
     history = jnp.zeros((config.num_envs, HISTORY, OBSERVATION_SIZE)).at[:, -1].set(state.obs)
     iterate = jax.jit(make_iteration(env, config), donate_argnums=(2,))
-    start, first = time.monotonic(), int(learner.iteration)
+    first = int(learner.iteration)
     table = run_dir / "metrics.csv"
     fresh = first == 0 or not table.exists()
     with table.open("w" if fresh else "a", newline="") as file:
         writer: Any = None
         for iteration in range(first + 1, config.iterations + 1):
             learner, state, history, metrics = iterate(learner, state, history)
+            jax.block_until_ready(metrics)  # so that `max_seconds` measures finished work
             last = iteration == config.iterations or (
                 max_seconds is not None and time.monotonic() - start > max_seconds
             )
@@ -299,9 +366,7 @@ def train_walk(
                 if report is not None:
                     report(iteration, row)
             if iteration % save_every == 0 or last:
-                about = {"config": dataclasses.asdict(config), "iteration": iteration}
-                checkpoint.save_checkpoint(run_dir, learner, iteration, about, keep=2)
-                walk_policy.save_params(learner.params["policy"], run_dir / "walk.safetensors", about)
+                save(run_dir, learner, env.robot, config)
             if last:
                 break
     return learner.params["policy"]

@@ -1,8 +1,9 @@
-"""States made by hand: robots and objects put somewhere, at rest."""
+"""Environments shared by tests, and states made by hand: robots and objects placed somewhere, at rest."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,25 +11,40 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs import QuadrupedEnv, State
-from mqe_jax.robots import go1
-from mqe_jax.robots.index import RobotReadings
+from mqe_jax.envs import QuadrupedEnv, State, make
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 
 
+@functools.cache
+def made(task: str) -> Any:
+    """The task on the C engine under position control, created once per process."""
+    return make(task, impl="c", control="position")
+
+
+@functools.cache
+def stepper(task: str) -> Any:
+    """The compiled step of `made(task)`."""
+    return jax.jit(made(task).step)
+
+
 def placed(
-    env: QuadrupedEnv, position: Any, euler: Any = None, objects: Mapping[str, Sequence[float]] | None = None,
+    env: QuadrupedEnv,
+    position: Any,
+    euler: Any = None,
+    objects: Mapping[str, Sequence[float]] | None = None,
     state: State | None = None,
-) -> State:  # fmt: skip
-    """A fresh world with the robots at positions (R, 3), m, with roll, pitch, yaw (R, 3), rad, and default joints.
+) -> State:
+    """An initial state with the robots at positions (R, 3), m, with roll, pitch, yaw (R, 3), rad, and default joints.
 
     Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the reset.
     """
     state = env.reset(jax.random.PRNGKey(0)) if state is None else state
-    index, position = env.robot, jnp.asarray(position, jnp.float32)
+    index, position = env.index, jnp.asarray(position, jnp.float32)
     turn = euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
     qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))
-    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(go1.DEFAULT_JOINTS))
+    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(env.robot.default_joints))
     for name, coordinates in (objects or {}).items():
         qpos = qpos.at[env.objects[name].qpos].set(jnp.asarray(coordinates, jnp.float32))
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
@@ -39,14 +55,20 @@ def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0
     return jnp.stack([jnp.asarray(angle, jnp.float32) for angle in (roll, pitch, yaw)], axis=-1)
 
 
-def readings(position: Any, **euler: Any) -> RobotReadings:
-    """What is read off two robots at positions (2, 3), m, which stand still with the default joints; see `angles`."""
-    joints = jnp.tile(jnp.asarray(go1.DEFAULT_JOINTS, jnp.float32), (2, 1))
+def robot_state(position: Any, **euler: Any) -> RobotState:
+    """The state of two robots at rest at positions (2, 3), m, with the default joints; see `angles`."""
+    joints = jnp.tile(jnp.asarray(GO1.default_joints, jnp.float32), (2, 1))
     none = jnp.zeros((2, 3))
-    return RobotReadings(
-        jnp.asarray(position), euler_to_quaternion(angles(**euler)), none, none, joints, jnp.zeros((2, 12)),
-        jnp.zeros(2), jnp.zeros((2, 2), bool),
-    )  # fmt: skip
+    return RobotState(
+        jnp.asarray(position),
+        euler_to_quaternion(angles(**euler)),
+        none,
+        none,
+        joints,
+        jnp.zeros((2, 12)),
+        jnp.zeros(2),
+        jnp.zeros((2, 2), bool),
+    )
 
 
 def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()) -> State:
@@ -58,7 +80,7 @@ def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, veloc
 
 
 def observation(env: QuadrupedEnv, state: State) -> np.ndarray:
-    """What the agents (A, O) see in a state."""
+    """The agents' observations (A, O) of a state."""
     return np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
 
 
@@ -72,5 +94,5 @@ def terms_of(env: QuadrupedEnv, state: State) -> tuple[dict[str, np.ndarray], np
 
 
 def still(env: QuadrupedEnv) -> jax.Array:
-    """The action of agents that do nothing."""
+    """The zero action of all agents."""
     return jnp.zeros((env.num_agents, env.action_size))

@@ -1,0 +1,140 @@
+"""Recordings of one environment: saved where the physics diverged, and stepped again for analysis."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import pathlib
+import zipfile
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.errors import InputError
+from mqe_jax.files import write_atomically
+from mqe_jax.physics import STATE_FIELDS
+from mqe_jax.settings import to_mapping
+
+# Fields on which a step depends; the others are recomputed by it.
+_FIELDS = ("step", "anchors", "control", "randomized", "task", "assistance", "frozen_steps", "key")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """Consecutive states of one environment within an episode, and the actions taken in them.
+
+    Attributes:
+        task: id of the task.
+        params: its parameters as nested mappings.
+        impl: physics engine.
+        control: action mode.
+        states: the fields of `State` on which a step depends, before each action, by path (T, ...).
+        actions: (T, A, D).
+    """
+
+    task: str
+    params: dict[str, Any]
+    impl: str
+    control: str
+    states: dict[str, np.ndarray]
+    actions: np.ndarray
+
+    def make_env(self, impl: str | None = None) -> QuadrupedEnv:
+        """Creates the recorded environment, on the recorded engine if `impl` is None."""
+        from mqe_jax.envs import make
+
+        return make(self.task, impl=impl or self.impl, control=self.control, num_envs=1, **self.params)
+
+
+def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:
+    """Returns the states (T, ...) of one environment before each action (T, A, D), with automatic reset."""
+
+    def advance(state: State, action: jax.Array) -> tuple[State, State]:
+        return autoreset(env, env.step(state, action)), state
+
+    return jax.jit(lambda start, actions: jax.lax.scan(advance, start, actions)[1])(start, actions)
+
+
+def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
+    """Writes the last episode of a sequence of states to an .npz file, complete or not at all.
+
+    Args:
+        file: to write.
+        env: the environment.
+        states: of one environment before each action (T, ...), as from `trajectory`.
+        actions: (T, A, D).
+    """
+    starts = np.flatnonzero(np.asarray(states.step) == 0)
+    first = int(starts[-1]) if len(starts) else 0
+    about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
+    arrays = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, about=np.array(json.dumps(about)), actions=np.asarray(actions)[first:], **arrays)
+    write_atomically(pathlib.Path(file), buffer.getvalue())
+
+
+def load_recording(file: str | pathlib.Path) -> Recording:
+    """Reads a recording.
+
+    Raises:
+        InputError: if the file is missing, damaged or not a recording.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            about = json.loads(str(arrays["about"]))
+            states = {name.removeprefix("states/"): arrays[name] for name in arrays if name.startswith("states/")}
+            return Recording(**about, states=states, actions=arrays["actions"])
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: cannot be read as a recording ({error})") from None
+
+
+def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
+    """Steps a recording again from its first state; returns the states after each action (T, ...).
+
+    Args:
+        recording: see `load_recording`.
+        env: from `Recording.make_env`, on any engine; by default on the recorded one.
+
+    Raises:
+        InputError: if the recording's arrays do not fit the environment.
+    """
+    env = recording.make_env() if env is None else env
+    start = _restored(env, recording)
+
+    def advance(state: State, action: jax.Array) -> tuple[State, State]:
+        state = env.step(state, action)
+        return state, state
+
+    run = jax.jit(lambda start, actions: jax.lax.scan(advance, start, actions)[1])
+    return run(start, jnp.asarray(recording.actions))
+
+
+def _content(state: State) -> dict[str, Any]:
+    data = {name: getattr(state.data, name) for name in STATE_FIELDS}
+    return {"data": data, **{name: getattr(state, name) for name in _FIELDS}}
+
+
+def _flat(state: State) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_flatten_with_path(_content(state))[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _restored(env: QuadrupedEnv, recording: Recording) -> State:
+    """Returns the recording's first state on the engine of `env`."""
+    blank = env.reset(jax.random.PRNGKey(0))
+    content = _content(blank)
+    leaves = []
+    for name, leaf in _flat(blank).items():
+        saved = recording.states.get(name)
+        if saved is None or saved.shape[1:] != leaf.shape:
+            found = "is missing" if saved is None else f"has shape {saved.shape[1:]}"
+            raise InputError(f"recording of {recording.task}: {name} {found}; expected shape {leaf.shape}")
+        leaves.append(jnp.asarray(saved[0], leaf.dtype))
+    content = jax.tree.unflatten(jax.tree.structure(content), leaves)
+    data = blank.data.replace(**content.pop("data"))
+    return dataclasses.replace(blank, data=data, **content)

@@ -1,0 +1,114 @@
+"""The Unitree Go2 as data.
+
+Source: MuJoCo Menagerie's figures of the Go2 (masses, inertias, limits) and Unitree's description (motor speeds);
+collision shapes are spheres and capsules, which all three engines support.
+
+Choices for position control and the walk policy: default angles as on the Go1, whose legs have the same lengths; gains
+grow with the mass (15.2 kg against 11.3 kg), kp 30 for 20 and kd 0.75 for 0.5, so that the robot sags and is damped
+alike; action scale as on the Go1; torques up to the motors' limits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mqe_jax.robots.robot import (
+    CollisionShape,
+    Link,
+    Robot,
+    VisualShape,
+    WalkSettings,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    sphere,
+)
+
+_FOOT = (-0.002, 0, -0.213)
+
+_WHITE = (0.88, 0.89, 0.90, 1.0)
+_GREY = (0.62, 0.64, 0.66, 1.0)
+_DARK = (0.10, 0.11, 0.12, 1.0)
+_LIGHT = (0.75, 0.95, 1.0, 1.0)
+
+_COLLISION = (
+    # Trunk box 0.376 x 0.094 x 0.114 with the head cylinder in front of it, as one capsule.
+    CollisionShape("trunk", capsule(0.055, (-0.135, 0, 0), (0.28, 0, 0))),
+    CollisionShape("hip", capsule(0.046, (0, 0.075, 0), (0, 0.085, 0))),
+    CollisionShape("thigh", capsule(0.017, (0, 0, -0.02), (0, 0, -0.19))),
+    # Upper and lower shank, which is bent forward.
+    CollisionShape("calf", capsule(0.012, (0.002, 0, -0.02), (0.014, 0, -0.12)), name="calf"),
+    CollisionShape("calf", capsule(0.011, (0.014, 0, -0.12), (0.018, 0, -0.18)), name="shank"),
+    CollisionShape("foot", sphere(0.022, _FOOT)),
+)
+
+_VISUALS = (
+    # Rounded light shell with a stripe along the back in the agent's colour.
+    VisualShape("trunk", ellipsoid((0.235, 0.072, 0.062), (0.0, 0, 0.012)), _WHITE, tint=0.25),
+    VisualShape("trunk", box((0.15, 0.058, 0.045), (0.0, 0, 0.008)), _WHITE, tint=0.25),
+    VisualShape("trunk", ellipsoid((0.19, 0.03, 0.022), (-0.01, 0, 0.062)), tint=1.0),
+    VisualShape("trunk", box((0.14, 0.046, 0.03), (0, 0, -0.032)), _DARK),
+    # Housings of the hip motors.
+    VisualShape("trunk", cylinder(0.044, (0.16, 0.045, 0), (0.225, 0.045, 0)), _GREY),
+    VisualShape("trunk", cylinder(0.044, (0.16, -0.045, 0), (0.225, -0.045, 0)), _GREY),
+    VisualShape("trunk", cylinder(0.044, (-0.16, 0.045, 0), (-0.225, 0.045, 0)), _GREY),
+    VisualShape("trunk", cylinder(0.044, (-0.16, -0.045, 0), (-0.225, -0.045, 0)), _GREY),
+    # Rounded head, dark face, light bar, and the dome of the lidar under the chin.
+    VisualShape("trunk", ellipsoid((0.065, 0.052, 0.043), (0.258, 0, 0.034)), _WHITE, tint=0.25),
+    VisualShape("trunk", box((0.022, 0.04, 0.03), (0.285, 0, 0.034)), _WHITE, tint=0.25),
+    VisualShape("trunk", ellipsoid((0.022, 0.05, 0.033), (0.308, 0, 0.034)), _DARK),
+    VisualShape("trunk", capsule(0.005, (0.326, -0.022, 0.046), (0.326, 0.022, 0.046)), _LIGHT),
+    VisualShape("trunk", cylinder(0.031, (0.292, 0, -0.012), (0.292, 0, 0.004)), _GREY),
+    VisualShape("trunk", sphere(0.031, (0.292, 0, -0.014)), _DARK),
+    # Slim legs: round thigh motor in the agent's colour, light thigh and shank, dark foot.
+    VisualShape("hip", cylinder(0.04, (0, 0.035, 0), (0, 0.08, 0)), _GREY),
+    VisualShape("thigh", cylinder(0.044, (0, -0.02, 0), (0, 0.022, 0)), tint=1.0),
+    VisualShape("thigh", cylinder(0.03, (0, 0.022, 0), (0, 0.027, 0)), _WHITE),
+    VisualShape("thigh", capsule(0.02, (0, 0, -0.02), (-0.016, 0, -0.1)), _WHITE),
+    VisualShape("thigh", capsule(0.015, (-0.016, 0, -0.1), (0, 0, -0.213)), _WHITE),
+    VisualShape("calf", sphere(0.017, (0, 0, 0)), _DARK),
+    VisualShape("calf", capsule(0.009, (0, 0, 0), (0.014, 0, -0.12)), _GREY),
+    VisualShape("calf", capsule(0.008, (0.014, 0, -0.12), _FOOT), _GREY),
+    VisualShape("calf", sphere(0.022, _FOOT), _DARK),
+)
+
+GO2 = Robot(
+    name="go2",
+    title="Unitree Go2",
+    trunk=Link.from_principal(
+        6.921, (0.0211, 0.0, -0.0054), (0.1070, 0.0981, 0.0245), (-0.000543, 0.713435, -0.001738, 0.700719)
+    ),
+    hip=Link.from_principal(
+        0.678, (-0.0054, 0.0019, -0.0001), (8.840e-4, 5.960e-4, 4.800e-4), (0.497014, 0.499245, 0.505462, 0.498237)
+    ),
+    thigh=Link.from_principal(
+        1.152, (-0.0037, -0.0223, -0.0327), (5.950e-3, 5.842e-3, 8.788e-4), (0.829533, 0.084764, -0.020063, 0.551623)
+    ),
+    calf=Link.from_principal(
+        0.2414, (0.0063, -0.0006, -0.1414), (1.490e-3, 1.463e-3, 5.31e-5), (0.710672, 0.001541, -0.004501, 0.703508)
+    ),
+    leg_root=(0.1934, 0.0465),
+    hip_length=0.0955,
+    thigh_length=0.213,
+    foot_position=(_FOOT[0], _FOOT[2]),
+    foot_radius=0.022,
+    default_joints=np.array([0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5]),
+    joint_lower=np.array([-1.0472, -1.5708, -2.7227] * 2 + [-1.0472, -0.5236, -2.7227] * 2),
+    joint_upper=np.array([1.0472, 3.4907, -0.8378] * 2 + [1.0472, 4.5379, -0.8378] * 2),
+    joint_speed_limit=np.tile([30.1, 30.1, 15.7], 4),
+    torque_limit=np.tile([23.7, 23.7, 45.43], 4),
+    kp=30.0,
+    kd=0.75,
+    action_scale=np.tile([0.125, 0.25, 0.25], 4),
+    stand_height=0.30,
+    collision=_COLLISION,
+    visuals=_VISUALS,
+    walk=WalkSettings(
+        weights="walk_go2.safetensors",
+        stance_width=0.28,
+        stance_length=0.438,
+        min_knee_height=0.06,
+        min_trunk_height=0.1,
+    ),
+)

@@ -1,0 +1,32 @@
+"""The robots by name."""
+
+from __future__ import annotations
+
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.go2 import GO2
+from mqe_jax.robots.robot import Robot
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
+
+
+def get(name: str) -> Robot:
+    """Returns a robot by name.
+
+    Raises:
+        InputError: for an unknown name, with the nearest known one.
+    """
+    if name not in ROBOTS:
+        raise InputError(f"robot: unknown name {name!r}{nearest(name, ROBOTS)}; allowed: {', '.join(ROBOTS)}")
+    return ROBOTS[name]
+
+
+def register(robot: Robot) -> Robot:
+    """Adds a robot under its name, so that `mqe_jax.make(task, robot=name)` finds it; returns it.
+
+    Raises:
+        InputError: if another robot has that name.
+    """
+    if ROBOTS.setdefault(robot.name, robot) is not robot:
+        raise InputError(f"robot: the name {robot.name!r} is taken; choose another")
+    return robot

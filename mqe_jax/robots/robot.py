@@ -1,0 +1,282 @@
+"""The type of a robot: a quadruped with twelve joints as one immutable value.
+
+All figures are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y left and z up at
+zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf everywhere in this package. Legs are
+described once, for the left front one; the others are its mirror images.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from mqe_jax.errors import InputError
+
+LEGS = ("FL", "FR", "RL", "RR")
+JOINTS = ("hip", "thigh", "calf")
+NUM_LEGS = len(LEGS)
+NUM_JOINTS = NUM_LEGS * len(JOINTS)
+JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
+LINKS = ("trunk", *JOINTS)
+# Contact groups of collision shapes; `Contacts` says which of them touch what.
+PARTS = ("trunk", "hip", "thigh", "calf", "foot")
+
+Vector = tuple[float, float, float]
+Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """Inertial figures of one rigid link.
+
+    Attributes:
+        mass: kg.
+        com: centre of mass in the link frame (3,), m.
+        inertia: (xx, yy, zz, xy, xz, yz) about the centre of mass, in the axes of the link frame, kg m^2.
+    """
+
+    mass: float
+    com: Vector
+    inertia: tuple[float, float, float, float, float, float]
+
+    @classmethod
+    def from_principal(cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]) -> Link:
+        """Returns a link whose principal `moments` (kg m^2) hold in the frame of a quaternion wxyz."""
+        w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
+        axes = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        return cls(mass, com, _six(axes @ np.diag(moments) @ axes.T))
+
+    def mirrored(self, x: int, y: int) -> Link:
+        """Returns the link reflected by the signs `x` and `y` (each 1 or -1)."""
+        xx, yy, zz, xy, xz, yz = self.inertia
+        cx, cy, cz = self.com
+        return Link(self.mass, (x * cx, y * cy, cz), (xx, yy, zz, x * y * xy, x * xz, y * yz))
+
+    def matrix(self) -> np.ndarray:
+        """Returns the inertia tensor about the centre of mass (3, 3), kg m^2."""
+        xx, yy, zz, xy, xz, yz = self.inertia
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def welded(self, other: Link, position: Vector) -> Link:
+        """Returns this link with `other` fixed to it at `position` (m, link frame, same axes)."""
+        mass = self.mass + other.mass
+        centers = (np.asarray(self.com), np.asarray(position) + np.asarray(other.com))
+        com = (self.mass * centers[0] + other.mass * centers[1]) / mass
+        tensor = np.zeros((3, 3))
+        for link, center in zip((self, other), centers, strict=True):
+            arm = center - com
+            tensor += link.matrix() + link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        return Link(mass, (float(com[0]), float(com[1]), float(com[2])), _six(tensor))
+
+
+def _six(tensor: np.ndarray) -> tuple[float, float, float, float, float, float]:
+    xx, yy, zz, xy, xz, yz = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()
+    return xx, yy, zz, xy, xz, yz
+
+
+@dataclasses.dataclass(frozen=True)
+class Primitive:
+    """A primitive in a link frame; on the right legs y is negated.
+
+    Attributes:
+        kind: sphere, capsule, cylinder, box or ellipsoid.
+        size: radius (1,) of a sphere, capsule or cylinder; half-lengths (3,) of a box or ellipsoid, m.
+        position: centre, or first end of a capsule's or cylinder's axis, m.
+        end: second end of the axis, m; None for the other kinds.
+    """
+
+    kind: Literal["sphere", "capsule", "cylinder", "box", "ellipsoid"]
+    size: tuple[float, ...]
+    position: Vector = (0.0, 0.0, 0.0)
+    end: Vector | None = None
+
+
+def sphere(radius: float, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
+    """Returns a sphere, m."""
+    return Primitive("sphere", (radius,), position)
+
+
+def capsule(radius: float, start: Vector, end: Vector) -> Primitive:
+    """Returns a capsule around the segment from `start` to `end`, m."""
+    return Primitive("capsule", (radius,), start, end)
+
+
+def cylinder(radius: float, start: Vector, end: Vector) -> Primitive:
+    """Returns a cylinder around the segment from `start` to `end`, m."""
+    return Primitive("cylinder", (radius,), start, end)
+
+
+def box(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
+    """Returns a box along the link's axes, m."""
+    return Primitive("box", half_size, position)
+
+
+def ellipsoid(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
+    """Returns an ellipsoid along the link's axes, m."""
+    return Primitive("ellipsoid", half_size, position)
+
+
+@dataclasses.dataclass(frozen=True)
+class CollisionShape:
+    """A shape that touches other things; one of a leg's exists once on each leg.
+
+    Attributes:
+        part: contact group, one of `PARTS`.
+        primitive: its geometry, in the frame of `link`.
+        name: unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so on.
+    """
+
+    part: str
+    primitive: Primitive
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.part not in PARTS:
+            raise InputError(f"CollisionShape.part: unknown part {self.part!r}; allowed: {', '.join(PARTS)}")
+        if not self.name:
+            object.__setattr__(self, "name", self.part)
+
+    @property
+    def link(self) -> str:
+        """The link that carries it: a foot is part of the calf."""
+        return "calf" if self.part == "foot" else self.part
+
+    @property
+    def geom_names(self) -> tuple[str, ...]:
+        """Names of its geoms in the model of one robot, without the robot's prefix."""
+        return (self.name,) if self.part == "trunk" else tuple(f"{leg}_{self.name}" for leg in LEGS)
+
+
+@dataclasses.dataclass(frozen=True)
+class VisualShape:
+    """A massless shape without contacts, for pictures only.
+
+    Attributes:
+        link: trunk, hip, thigh or calf.
+        primitive: its geometry, in the frame of `link`.
+        color: own colour.
+        tint: fraction of the agent's colour mixed into it, in [0, 1].
+    """
+
+    link: str
+    primitive: Primitive
+    color: Color = (0.0, 0.0, 0.0, 1.0)
+    tint: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.link not in LINKS:
+            raise InputError(f"VisualShape.link: unknown link {self.link!r}; allowed: {', '.join(LINKS)}")
+
+    def tinted(self, agent_color: Color) -> Color:
+        """Returns the colour of the shape on a robot of an agent's colour."""
+        own, agent = np.asarray(self.color), np.asarray(agent_color)
+        r, g, b, a = ((1.0 - self.tint) * own + self.tint * agent).tolist()
+        return r, g, b, a
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkSettings:
+    """What the walk policy and its training take from the robot.
+
+    Attributes:
+        weights: file name of the trained weights in `mqe_jax/assets`.
+        stance_width: default distance between left and right feet, m.
+        stance_length: default distance between front and rear feet, m.
+        min_knee_height: a knee below it counts as thigh and calf touching the ground, m.
+        min_trunk_height: a trunk origin below it counts as a fall, m.
+    """
+
+    weights: str
+    stance_width: float
+    stance_length: float
+    min_knee_height: float
+    min_trunk_height: float
+
+
+_JOINT_FIELDS = ("default_joints", "joint_lower", "joint_upper", "joint_speed_limit", "torque_limit", "action_scale")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Robot:
+    """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`.
+
+    Attributes:
+        name: short name, as in the registry.
+        title: full name.
+        trunk: inertial figures of the trunk.
+        hip: of the left front hip; y is mirrored for the right legs, x for the rear ones.
+        thigh: of the left front thigh; y is mirrored for the right legs.
+        calf: of the left front calf with its foot; y is mirrored for the right legs.
+        leg_root: hip joint of the left front leg in the trunk frame (x, y), m.
+        hip_length: hip joint to thigh joint, outward, m.
+        thigh_length: thigh joint to calf joint, downward, m.
+        foot_position: centre of the foot in the calf frame (x, z), m.
+        foot_radius: m.
+        default_joints: angles around which position control and the walk policy act (12,), rad.
+        joint_lower: lower limits (12,), rad.
+        joint_upper: upper limits (12,), rad.
+        joint_speed_limit: of the motors (12,), rad/s; data for users, not enforced by the physics.
+        torque_limit: of the controller (12,), N m.
+        kp: proportional gain, N m/rad.
+        kd: derivative gain, N m s/rad.
+        action_scale: joint target = default + scale x action (12,), rad.
+        stand_height: trunk origin above the ground when standing at the default angles, m: the walk policy's
+            height at a zero height command.
+        collision: shapes that touch other things.
+        visuals: shapes for pictures.
+        walk: what the walk policy takes from it.
+    """
+
+    name: str
+    title: str
+    trunk: Link
+    hip: Link
+    thigh: Link
+    calf: Link
+    leg_root: tuple[float, float]
+    hip_length: float
+    thigh_length: float
+    foot_position: tuple[float, float]
+    foot_radius: float
+    default_joints: np.ndarray
+    joint_lower: np.ndarray
+    joint_upper: np.ndarray
+    joint_speed_limit: np.ndarray
+    torque_limit: np.ndarray
+    kp: float
+    kd: float
+    action_scale: np.ndarray
+    stand_height: float
+    collision: tuple[CollisionShape, ...]
+    visuals: tuple[VisualShape, ...]
+    walk: WalkSettings
+
+    def __post_init__(self) -> None:
+        for name in _JOINT_FIELDS:
+            array = np.array(getattr(self, name), float)
+            if array.shape != (NUM_JOINTS,):
+                raise InputError(f"Robot.{name}: shape {array.shape}; expected ({NUM_JOINTS},)")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if not np.all((self.joint_lower < self.default_joints) & (self.default_joints < self.joint_upper)):
+            raise InputError(f"Robot.default_joints: {self.default_joints} must lie between the joint limits")
+        repeated = [name for name, count in Counter(shape.name for shape in self.collision).items() if count > 1]
+        if repeated:
+            raise InputError(f"Robot.collision: names must differ; {', '.join(repeated)} is there more than once")
+        parts = [shape.part for shape in self.collision]
+        if parts.count("foot") != 1 or "trunk" not in parts:
+            raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")
+
+    def shapes(self, parts: Sequence[str]) -> tuple[CollisionShape, ...]:
+        """Returns the collision shapes of some contact groups."""
+        return tuple(shape for shape in self.collision if shape.part in parts)

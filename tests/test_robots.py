@@ -1,0 +1,169 @@
+"""Robots as values: the registry, mirror symmetry, variants of one's own, and standing under PD control."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mqe_jax import make, robots
+from mqe_jax.errors import InputError
+from mqe_jax.robots import CollisionShape, Contacts, Robot
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.robot import LEGS, PARTS, Link, box, capsule, sphere
+from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax.terrain import Plane, Track
+
+PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
+
+
+def compiled(robot: Robot, num_robots: int = 1, contacts: Contacts | None = None) -> CompiledScene:
+    return compile_scene(Scene(PLANE, num_robots=num_robots, robot=robot, contacts=contacts or Contacts()))
+
+
+def tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
+    """Inertia tensor of a body of the first robot in its link frame (3, 3)."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.body(f"robot0/{body}").iquat)
+    turn = turn.reshape(3, 3)
+    return turn @ np.diag(model.body(f"robot0/{body}").inertia) @ turn.T
+
+
+@pytest.fixture
+def lifted() -> Iterator[Robot]:
+    """A registered variant: a Go1 that is heavier and stands higher."""
+    trunk = dataclasses.replace(GO1.trunk, mass=6.0)
+    joints = GO1.default_joints.reshape(4, 3) * [1.0, 0.8, 0.8]
+    robot = dataclasses.replace(
+        GO1, name="lifted", trunk=trunk, default_joints=joints.ravel(), kp=35.0, stand_height=0.34
+    )
+    yield robots.register(robot)
+    del robots.ROBOTS["lifted"]
+
+
+@pytest.mark.parametrize(("name", "mass"), [("go1", 11.31), ("go2", 15.21)])
+def test_mass_is_the_published_one(name: str, mass: float) -> None:
+    assert compiled(robots.get(name)).model.body_mass.sum() == pytest.approx(mass, abs=0.05)
+
+
+@pytest.mark.parametrize("name", list(robots.ROBOTS))
+def test_legs_are_mirror_images(name: str) -> None:
+    """Centres of mass and full inertia tensors: y of the right legs is negated, x of the rear hips."""
+    model = compiled(robots.get(name)).model
+    for leg in LEGS:
+        for link in ("hip", "thigh", "calf"):
+            signs = np.array([-1.0 if link == "hip" and leg[0] == "R" else 1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])
+            com = model.body(f"robot0/FL_{link}").ipos
+            np.testing.assert_allclose(model.body(f"robot0/{leg}_{link}").ipos, signs * com, atol=1e-12)
+            reflected = np.outer(signs, signs) * tensor(model, f"FL_{link}")
+            np.testing.assert_allclose(tensor(model, f"{leg}_{link}"), reflected, atol=1e-9)
+
+
+def test_principal_inertia_is_turned_into_the_link_frame() -> None:
+    """A quarter turn about z swaps x and y; the compiled model has the principal moments of the Go2's trunk."""
+    turned = Link.from_principal(1.0, (0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5))
+    np.testing.assert_allclose(turned.matrix(), np.diag([2.0, 1.0, 3.0]), atol=1e-12)
+    trunk = compiled(robots.get("go2")).model.body("robot0/trunk")
+    np.testing.assert_allclose(np.sort(trunk.inertia), [0.0245, 0.0981, 0.1070], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", list(robots.ROBOTS))
+def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
+    robot = robots.get(name)
+    scene = compiled(robot)
+    data = mujoco.MjData(scene.model)
+    joints = np.random.default_rng(0).uniform(robot.joint_lower, robot.joint_upper)
+    data.qpos[scene.index.base_qpos[0]] = [1.0, 2.0, 3.0, 1, 0, 0, 0]
+    data.qpos[scene.index.joint_qpos[0]] = joints
+    mujoco.mj_kinematics(scene.model, data)
+    feet = data.geom_xpos[scene.index.foot_geom[0]] - [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(robots.foot_positions(robot, jnp.asarray(joints)), feet, atol=1e-5)
+    knees = data.xpos[scene.index.bodies[0, 3::3]] - [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(robots.knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", list(robots.ROBOTS))
+def test_stands_on_its_default_pose(name: str) -> None:
+    """Two seconds under PD control: upright, at rest, at its standing height, on four feet."""
+    robot = robots.get(name)
+    env = make("go1plane", impl="c", control="position", robot=name, spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0))
+    state, step = env.reset(jax.random.PRNGKey(0)), jax.jit(env.step)
+    for _ in range(100):
+        state = step(state, jnp.zeros((env.num_agents, 12)))
+    robot_state = env.read(state.data)
+    assert not bool(state.terminated)
+    assert float(jnp.abs(robot_state.euler[:, :2]).max()) < 0.1
+    assert float(jnp.abs(robot_state.linear_velocity_w).max()) < 0.1
+    np.testing.assert_allclose(robot_state.position_w[:, 2], robot.stand_height, atol=0.04)
+    assert float(robot_state.trunk_force.max()) == 0.0
+
+
+def test_a_variant_of_ones_own_is_a_robot_of_every_task(lifted: Robot) -> None:
+    """Masses, gains, pose and limits come from the value; its walk weights are those that it names."""
+    env = make("go1gate", impl="c", robot="lifted")
+    model = env.compiled.model
+    assert env.robot is lifted
+    assert model.body("robot1/trunk").mass[0] == pytest.approx(6.0)
+    assert model.actuator("robot0/FL_hip").gainprm[0] == pytest.approx(35.0)
+    np.testing.assert_allclose(env.controller.neutral[0], lifted.default_joints, rtol=1e-6)
+    state = jax.jit(env.step)(env.reset(jax.random.PRNGKey(0)), jnp.zeros((2, 3)))
+    assert bool(jnp.all(jnp.isfinite(state.obs)))
+
+
+def test_collision_sets_are_swapped_as_data() -> None:
+    """Several shapes per link, all of which touch the other robot's: bits, index tables and sensors follow."""
+    shapes = (
+        CollisionShape("trunk", box((0.188, 0.047, 0.057)), name="body"),
+        CollisionShape("trunk", sphere(0.05, (0.27, 0.0, 0.0)), name="head"),
+        CollisionShape("thigh", capsule(0.017, (0, 0, -0.02), (0, 0, -0.19))),
+        CollisionShape("foot", sphere(0.02, (0, 0, -0.213))),
+    )
+    full = Contacts(ground=PARTS, wall=PARTS, robot=PARTS, object=PARTS, robot_target=PARTS)
+    scene = compiled(dataclasses.replace(GO1, collision=shapes), 2, full)
+    assert scene.index.trunk_force.shape == (2, 2, 3) and scene.index.geoms.shape == (2, 2 + 4 + 4)
+    model = scene.model
+    thigh, foot, own = (model.geom(f"robot{i}/{name}") for i, name in ((0, "FL_thigh"), (1, "RR_foot"), (0, "RL_foot")))
+
+    def touch(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
+        return bool(a.contype[0] & b.conaffinity[0] or b.contype[0] & a.conaffinity[0])
+
+    assert touch(thigh, foot) and not touch(thigh, own)
+    slim = compiled(dataclasses.replace(GO1, collision=shapes), 2, Contacts(robot=("trunk", "foot"))).model
+    assert not touch(slim.geom("robot0/FL_foot"), slim.geom("robot1/FL_foot"))
+    assert touch(slim.geom("robot0/FL_foot"), slim.geom("robot1/head"))
+
+
+def test_unknown_names_are_refused_with_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"robot: unknown name 'go3'.*did you mean 'go[12]'.*allowed: go1, go2"):
+        robots.get("go3")
+    with pytest.raises(ValueError, match=r"robot: unknown name 'g01'"):
+        make("go1gate", robot="g01")
+    with pytest.raises(InputError, match=r"'go1' is taken"):
+        robots.register(dataclasses.replace(GO1, kp=10.0))
+
+
+def test_wrong_data_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match=r"Robot\.torque_limit: shape \(3,\); expected \(12,\)"):
+        dataclasses.replace(GO1, torque_limit=np.ones(3))
+    with pytest.raises(InputError, match=r"Robot\.default_joints"):
+        dataclasses.replace(GO1, default_joints=np.zeros(12))
+    with pytest.raises(InputError, match=r"Robot\.collision: names must differ; foot"):
+        dataclasses.replace(GO1, collision=(*GO1.collision, GO1.collision[-1]))
+    with pytest.raises(InputError, match=r"unknown part 'tail'"):
+        CollisionShape("tail", sphere(0.02))
+
+
+def test_missing_walk_weights_say_how_to_make_them() -> None:
+    robots.register(dataclasses.replace(GO1, name="new", walk=dataclasses.replace(GO1.walk, weights="walk_new.x")))
+    try:
+        with pytest.raises(InputError, match=r"no weights for new .*mqe walk train --robot new.*'position'"):
+            make("go1gate", impl="c", robot="new")
+        for control in ("position", "torque"):
+            make("go1gate", impl="c", robot="new", control=control)
+    finally:
+        del robots.ROBOTS["new"]

@@ -1,0 +1,77 @@
+"""Terrain: blocks by name, difficulty, rough ground, and robots that stand on it on the engines."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.errors import InputError
+from mqe_jax.physics import Physics
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax.terrain import BLOCKS, EndWall, Gate, Plane, RoughGround, SpawnArea, Track, block
+
+ROUGH = RoughGround(amplitude=(0.0, 0.08), wavelength=1.0, octaves=3, seed=1)
+
+
+def test_blocks_are_made_by_name() -> None:
+    assert block("gate", width=0.7) == Gate(width=0.7)
+    assert {"spawn", "plane", "gate", "door_gap", "end_wall"} <= set(BLOCKS)
+    with pytest.raises(InputError, match=r"terrain block: unknown name 'gat' \(did you mean 'gate'\?\)"):
+        block("gat")
+    with pytest.raises(InputError, match=r"terrain block gate: unknown parameter 'widht' \(did you mean 'width'\?\)"):
+        block("gate", widht=1.0)
+
+
+def test_difficulty_interpolates_the_ranges_of_blocks() -> None:
+    blocks = (SpawnArea(2.0), Gate(length=(4.0, 2.0), width=(1.0, 0.6)), Plane(1.0), EndWall())
+    for difficulty, gap, length in ((0.0, 1.0, 7.0), (0.5, 0.8, 6.0), (1.0, 0.6, 5.0)):
+        track = Track(blocks, width=3.0, difficulty=difficulty)
+        assert track.length == pytest.approx(length)
+        layout = track.layout()
+        right, left = layout.walls
+        edges = [wall.center[1] + sign * wall.size[1] / 2 for wall, sign in ((right, 1), (left, -1))]
+        assert edges[1] - edges[0] == pytest.approx(gap)
+        assert layout.anchors[0].position[0] == pytest.approx(2.0 + (length - 3.0) / 2)
+    with pytest.raises(InputError, match=r"Track.difficulty: 1.5 is not in \[0, 1\]"):
+        Track(blocks, difficulty=1.5)
+    with pytest.raises(InputError, match=r"gate: width 3.5 must be between 0 and the track's width 3.0"):
+        Track((Gate(width=3.5),)).layout()
+
+
+def test_rough_ground_is_smooth_bounded_and_grows_with_difficulty() -> None:
+    easy, half, hard = (ROUGH.heights(4.0, 3.0, difficulty) for difficulty in (0.0, 0.5, 1.0))
+    assert hard.shape == (31, 41)
+    assert np.ptp(easy) == 0 and np.ptp(half) == pytest.approx(0.04) and np.ptp(hard) == pytest.approx(0.08)
+    assert hard.min() == 0
+    np.testing.assert_array_equal(hard, ROUGH.heights(4.0, 3.0, 1.0))
+    assert np.abs(hard - RoughGround(amplitude=0.08, octaves=3, seed=2).heights(4.0, 3.0)).max() > 0.02
+    assert np.abs(np.diff(hard, axis=1)).max() < 0.04  # 0.1 m apart
+
+
+def rough_scene() -> CompiledScene:
+    track = Track((SpawnArea(2.0, back_wall=False), Plane(2.0)), width=3.0, num_robots=1, rough=ROUGH, walled=False)
+    return compile_scene(Scene(track, num_robots=1))
+
+
+@pytest.mark.parametrize(
+    "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)]
+)
+def test_a_robot_stands_on_rough_ground(impl: str) -> None:
+    """The lowest foot rests on the height field where it stands, and the trunk stays upright."""
+    scene = rough_scene()
+    model, index = scene.model, scene.index
+    physics = Physics(model, impl=impl, num_envs=1)
+    qpos = np.array(model.qpos0)
+    qpos[index.base_qpos[0]] = [2.0, 0.3, 0.42, 1, 0, 0, 0]
+    qpos[index.joint_qpos] = GO1.default_joints
+    ctrl = jnp.zeros(model.nu).at[index.actuator].set(GO1.default_joints)
+    data = physics.init(jnp.asarray(qpos), jnp.zeros(model.nv), jnp.zeros((0, 3)), ctrl)
+    after = jax.jit(lambda data: jax.lax.scan(lambda d, _: (physics.step(d, ctrl), None), data, None, 50)[0])(data)
+    position, quaternion = np.split(np.asarray(after.qpos)[index.base_qpos[0]], [3])
+    heights = ROUGH.heights(4.0, 3.0)
+    below = heights[round((position[1] + 1.5) / 0.1), round(position[0] / 0.1)]
+    assert position[2] - below == pytest.approx(GO1.stand_height, abs=0.05)
+    assert quaternion[0] > 0.98 and np.abs(np.asarray(after.qvel)).max() < 1.0
