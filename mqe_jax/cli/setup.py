@@ -33,8 +33,10 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def make_env(task: str, impl: str, overrides: Mapping[str, Any], num_envs: int) -> tuple[Any, VectorEnv]:
-    """Returns a task and its vectorised environment with automatic reset."""
+def make_env(
+    task: str, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
+) -> tuple[Any, VectorEnv]:
+    """Returns a task and its vectorised environment with automatic reset; `copies` as of `VectorEnv`."""
     for name in ("impl", "num_envs"):
         if name in overrides:
             flag = name.replace("_", "-")
@@ -42,8 +44,8 @@ def make_env(task: str, impl: str, overrides: Mapping[str, Any], num_envs: int) 
     device = platform()
     if impl == "warp" and device != "gpu":
         raise InputError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax")
-    env = make(task, impl=impl, num_envs=num_envs, **overrides)
-    return env, VectorEnv(env, num_envs)
+    env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
+    return env, VectorEnv(env, num_envs, copies)
 
 
 def platform() -> str:
