@@ -19,9 +19,9 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     real = commands.make_env
 
-    def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int) -> Any:
+    def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
         if task != "fake":
-            return real(task, impl, overrides, num_envs)
+            return real(task, impl, overrides, num_envs, copies)
         env = FakeEnv()
         return env, FakeVectorEnv(env, num_envs)
 
@@ -34,7 +34,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "fake"
     patch = pytest.MonkeyPatch()
     env = FakeEnv()
-    patch.setattr(commands, "make_env", lambda task, impl, overrides, n: (env, FakeVectorEnv(env, n)))
+    patch.setattr(commands, "make_env", lambda task, impl, overrides, n, copies=1: (env, FakeVectorEnv(env, n)))
     assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     patch.undo()
     return folder

@@ -17,6 +17,7 @@ from mqe_jax.cli.setup import make_env, parse_overrides, train_config
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import PLANNERS
+from mqe_jax.settings import override
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy, runner
 from mqe_jax.viz import curves, recording
@@ -101,15 +102,26 @@ def train(arguments: Train) -> None:
     """Trains into the run folder."""
     overrides = _overrides(arguments)
     config = train_config(arguments.task, arguments.config, given(arguments.settings), overrides, arguments.algorithm)
+    if arguments.num_seeds < 1:
+        raise InputError(f"num_seeds: {arguments.num_seeds} is not allowed; it must be at least 1")
     run_dir = arguments.run_dir or Path("runs") / arguments.task
-    _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
+    configs, folders = [config], [run_dir]
+    if arguments.num_seeds > 1:
+        configs = [override(config, {"seed": config.seed + i}) for i in range(arguments.num_seeds)]
+        folders = [run_dir / f"seed{each.seed}" for each in configs]
+    _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs, len(configs))
+    eval_env = None
+    if config.evaluation.every is not None:
+        episodes = config.evaluation.episodes
+        _, eval_env = make_env(arguments.task, arguments.impl, config.env, episodes, 2 * len(configs))
     try:
-        runner.train(vector_env, config, run_dir, resume=arguments.resume)
+        runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env)
     except KeyboardInterrupt:
-        say(f"mqe: stopped; go on with: mqe train {arguments.task} --run-dir {run_dir} --resume")
+        say(f"mqe: stopped; continue with the same command and --resume; the run is in {run_dir}")
         raise
-    curves.draw_curve([run_dir], run_dir / "curve.png", arguments.task)
-    say(f"mqe: {run_dir} holds the policy, metrics.csv, curve.png; measure it with: mqe eval {run_dir}")
+    curves.draw_curve(folders, run_dir / "curve.png", arguments.task)
+    example = folders[0]
+    say(f"mqe: {run_dir} holds policy, metrics.csv and curve.png; evaluate with: mqe eval {example}")
 
 
 def evaluate(arguments: Eval) -> dict[str, Any]:

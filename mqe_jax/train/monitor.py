@@ -106,6 +106,10 @@ class EvaluationLog:
         self.absolute = None
         self._write({})
 
+    def last_steps(self) -> int | None:
+        """Returns the environment steps of the last evaluation, or None."""
+        return self.evaluations[-1]["env_steps"] if self.evaluations else None
+
     def best(self) -> dict[str, Any] | None:
         """Returns the best evaluation whose policy is on disk."""
         there = [e for e in self.evaluations if _best_path(self._run_dir, e).is_file()]

@@ -89,9 +89,8 @@ def train_seeds(
         fail("evaluation.every", configs[0].evaluation.every, "none where no environments are given to evaluate on")
     folders = [Path(run_dir) for run_dir in run_dirs]
     learner = make_learner(env, configs[0])
-    newest = [
-        prepare_folder(folder, resume, (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)) for folder in folders
-    ]
+    left_by_a_run = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
+    newest = [prepare_folder(folder, resume, left_by_a_run) for folder in folders]
     with contextlib.ExitStack() as locks:
         for folder in folders:
             locks.enter_context(locked(folder))
@@ -150,13 +149,9 @@ class _Training:
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
         total_steps = config.num_updates * config.steps_per_update
         with contextlib.ExitStack() as logs:
-            files = [
-                [
-                    logs.enter_context(contextlib.closing(log(folder, self._env_steps)))
-                    for log in (CsvLog, TensorBoardLog)
-                ]
-                for folder in self._folders
-            ]
+            files = [[log(folder, self._env_steps) for log in (CsvLog, TensorBoardLog)] for folder in self._folders]
+            for log in (log for pair in files for log in pair):
+                logs.callback(log.close)
             try:
                 with ProgressLog(config.task or self._env.name, self._env_steps, total_steps) as progress_log:
                     while self._env_steps < total_steps:
@@ -225,11 +220,7 @@ class _Training:
 
     def _evaluate(self) -> None:
         """Evaluates every seed's policy, once per update."""
-        if (
-            self._monitor is None
-            or (log := self._evaluations[0]).evaluations
-            and (log.evaluations[-1]["env_steps"] == self._env_steps)
-        ):
+        if self._monitor is None or self._evaluations[0].last_steps() == self._env_steps:
             return
         policies = self._policies()
         steps = [self._env_steps] * len(policies)
