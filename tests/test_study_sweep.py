@@ -130,7 +130,7 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
     sweep = load(tmp_path)
     sweeps.prepare(sweep, tmp_path / "study")
     sweeps.prepare(override(sweep, {"tasks": ("go1gate", "go1plane")}), tmp_path / "study")
-    with pytest.raises(InputError, match="settings: .* name another folder"):
+    with pytest.raises(InputError, match=r"settings: .* name another folder"):
         sweeps.prepare(override(sweep, {"settings": {"total_steps": 9}}), tmp_path / "study")
 
 
