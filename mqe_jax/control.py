@@ -137,7 +137,7 @@ class ControlState:
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """Turns actions into actuator targets and steps the physics under them.
+    """Computes actuator targets from actions and steps the physics under them.
 
     Attributes:
         mode: one of `MODES`.

@@ -235,8 +235,12 @@ def _expected_shapes() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def _nested(flat: Mapping[str, np.ndarray], source: str) -> Params:
-    """Checks names and shapes of flat weights and nests them."""
+def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
+    """Returns flat weights as nested float32 arrays.
+
+    Raises:
+        InputError: for missing names or other shapes; the message starts with `source`.
+    """
     params: Params = {"adaptation": {}, "body": {}}
     for name, shape in _expected_shapes().items():
         if name not in flat:
@@ -252,7 +256,7 @@ ASSETS = pathlib.Path(__file__).parent / "assets"
 
 
 def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
-    """Reads weights from a safetensors file; those shipped for the robot if `path` is None.
+    """Reads weights as float32 from a safetensors file; those shipped for the robot if `path` is None.
 
     Raises:
         InputError: if the file is missing, damaged, or holds other names or shapes.
@@ -261,27 +265,27 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     from safetensors.numpy import load_file
 
     file = pathlib.Path(path) if path is not None else ASSETS / robot.walk.weights
-    make = f"make it with 'mqe walk train --robot {robot.name}' or 'mqe walk convert'"
+    train = f"train it with 'mqe walk train --robot {robot.name}'"
     if not file.is_file() and path is None:
         raise InputError(
-            f"walk policy: no weights for {robot.name} ({file.name}) are shipped; {make} and give the file as "
-            "walk_policy (--weights), or use control 'position' or 'torque'"
+            f"walk policy: none for {robot.name} is shipped (assets/{file.name}); {train} and give the weights as "
+            "walk_policy=FILE, or use control 'position' or 'torque'"
         )
     if not file.is_file():
-        raise InputError(f"walk policy: no file {file}; {make}")
+        raise InputError(f"walk policy: no file {file}; {train} or make it with 'mqe walk convert'")
     try:
         flat = load_file(file)
     except SafetensorError as error:
         raise InputError(f"walk policy {file}: not a safetensors file ({error})") from None
-    return _nested(flat, str(file))
+    return nested_params(flat, str(file))
 
 
 def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
-    """Writes weights and metadata to a safetensors file, atomically."""
+    """Writes weights as float16 (3.6 MB) and metadata to a safetensors file, atomically."""
     from safetensors.numpy import save
 
     flat = {
-        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float32)
+        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16)
         for part, layers in params.items()
         for layer, arrays in layers.items()
         for kind, array in arrays.items()

@@ -32,7 +32,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     reason = _gpu_missing() if marked else ""
     for item in marked if reason else []:
         item.add_marker(pytest.mark.skip(reason=reason))
-    if os.environ.get("MQE_SOAK") == "1" or "soak" in config.getoption("-m", default=""):
+    if os.environ.get("MQE_SOAK") == "1" or "soak" in str(config.getoption("-m", default="")):
         return
     for item in items:
         if item.get_closest_marker("soak"):

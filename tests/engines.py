@@ -1,4 +1,4 @@
-"""The same worlds on two engines, and worlds full of random actions on Warp.
+"""Agreement of two engines on the same episodes, and random actions in crowds of environments on Warp.
 
 `python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp`, or `... crowd FOLDER warp`.
 """
@@ -23,16 +23,16 @@ from mqe_jax.planners import PLANNERS, scripted_policy
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
 
-def settled(task: str, worlds: int) -> tuple[Any, State]:
-    """Worlds of a task on MuJoCo's C engine in which the robots stand after their drop."""
-    env: Any = make(task, impl="c", control="position", episode_length=1000.0, num_envs=worlds)
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
-    states = rolled(env, states, jnp.zeros((SETTLE, worlds, env.num_agents, 12)))[0]
+def settled(task: str, num_envs: int) -> tuple[Any, State]:
+    """Environments of a task on MuJoCo's C engine in which the robots stand after their drop."""
+    env: Any = make(task, impl="c", control="position", episode_length=1000.0, num_envs=num_envs)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
+    states = rolled(env, states, jnp.zeros((SETTLE, num_envs, env.num_agents, 12)))[0]
     return env, states
 
 
 def rolled(env: Any, states: State, actions: jax.Array) -> tuple[State, jax.Array]:
-    """Steps worlds through actions (T, N, A, D), without auto-reset; returns the last states and qpos (T, N, nq)."""
+    """Steps environments through actions (T, N, A, D), without auto-reset: the last states, and qpos (T, N, nq)."""
 
     def advance(states: State, action: jax.Array) -> tuple[State, jax.Array]:
         states = jax.vmap(env.step)(states, action)
@@ -41,32 +41,32 @@ def rolled(env: Any, states: State, actions: jax.Array) -> tuple[State, jax.Arra
     return jax.jit(lambda s, a: jax.lax.scan(advance, s, a))(states, actions)
 
 
-def actions_of(env: Any, worlds: int) -> jax.Array:
+def actions_of(env: Any, num_envs: int) -> jax.Array:
     """Joint targets about the default (T, N, A, 12), the same for every engine."""
-    return 0.5 * jax.random.normal(jax.random.PRNGKey(1), (STEPS, worlds, env.num_agents, 12))
+    return 0.5 * jax.random.normal(jax.random.PRNGKey(1), (STEPS, num_envs, env.num_agents, 12))
 
 
-def played(task: str, worlds: int) -> dict[str, np.ndarray]:
-    """Physics states of worlds in play, on the C engine: the task's planner acts, for all robots in a match.
+def played(task: str, num_envs: int) -> dict[str, np.ndarray]:
+    """Physics states of environments in play, on the C engine: the task's planner acts, for all robots in a match.
 
-    Of each world's first `PLAY` steps the one is taken in which objects move fastest and robots touch most.
+    Of each environment's first `PLAY` steps, the one in which objects move fastest and robots touch most.
     """
-    env: Any = make(task, impl="c", num_envs=worlds)
-    worlds_env, plan = VectorEnv(env, worlds), jax.vmap(scripted_policy(env) if task in PLANNERS else ahead)
+    env: Any = make(task, impl="c", num_envs=num_envs)
+    vector_env, plan = VectorEnv(env, num_envs), jax.vmap(scripted_policy(env) if task in PLANNERS else ahead)
     robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 
     def advance(states: State, _: None) -> tuple[State, Any]:
-        states = worlds_env.step(states, plan(states.obs))
+        states = vector_env.step(states, plan(states.obs))
         robot_state = jax.vmap(env.read)(states.data)
         touching = jnp.any(robot_state.touching, axis=(1, 2)) | jnp.any(robot_state.trunk_force > 1.0, axis=1)
         busy = jnp.minimum(jnp.linalg.norm(states.data.qvel[:, rest], axis=-1), 1.0) + 2.0 * touching
         return states, (busy, {name: getattr(states.data, name) for name in STATE_FIELDS})
 
-    states = jax.jit(worlds_env.reset)(jax.random.PRNGKey(2))
+    states = jax.jit(vector_env.reset)(jax.random.PRNGKey(2))
     busy, fields = jax.jit(lambda s: jax.lax.scan(advance, s, None, PLAY))(states)[1]
     best = np.argmax(np.asarray(busy), axis=0)
-    return {name: np.asarray(field)[best, np.arange(worlds)] for name, field in fields.items()}
+    return {name: np.asarray(field)[best, np.arange(num_envs)] for name, field in fields.items()}
 
 
 def ahead(obs: jax.Array) -> jax.Array:
@@ -74,22 +74,22 @@ def ahead(obs: jax.Array) -> jax.Array:
     return jnp.zeros((len(obs), 3)).at[:, 0].set(0.5)
 
 
-def record(task: str, worlds: int = 8) -> dict[str, np.ndarray]:
-    """What the C engine makes of worlds under those actions: their states at first, and qpos (T, 2 N, nq).
+def record(task: str, num_envs: int = 8) -> dict[str, np.ndarray]:
+    """Reference trajectories of the C engine under those actions: initial states, and qpos (T, 2 N, nq).
 
-    The first half of the worlds are of standing robots, the others in play.
+    The first half of the environments have standing robots, the others are in play.
     """
-    env, states = settled(task, worlds)
+    env, states = settled(task, num_envs)
     twice = lambda x, y: jnp.concatenate([jnp.asarray(x), jnp.asarray(y, x.dtype)])  # noqa: E731
     first = {name: getattr(states.data, name) for name in STATE_FIELDS}
-    data = {name: twice(first[name], field) for name, field in played(task, worlds).items()}
+    data = {name: twice(first[name], field) for name, field in played(task, num_envs).items()}
     others = jax.tree.map(lambda x: twice(x, x), without_data(states))
     base = jax.tree.map(lambda x: twice(x, x), states.data)
     states = State(data=base.replace(**data), **others)
     return {
         **{f"data/{name}": np.asarray(field) for name, field in data.items()},
         **{f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(others))},
-        "qpos": np.asarray(rolled(env, states, actions_of(env, 2 * worlds))[1]),
+        "qpos": np.asarray(rolled(env, states, actions_of(env, 2 * num_envs))[1]),
     }
 
 
@@ -99,50 +99,50 @@ def without_data(states: State) -> dict[str, Any]:
 
 
 def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
-    """How far an engine's trajectory is from the recorded one of the C engine, from the same states and actions.
+    """Distance of an engine's trajectories from the recorded ones of the C engine, same states and actions.
 
     Returns:
-        `standing/robots_1` and the like: of the worlds of standing robots and of those in play, the largest difference
-        of any position (m), quaternion or joint angle (rad) of robots and of objects after one step, and, as median
-        and maximum over the worlds, after 20.
+        `standing/robots_1` and so on, for standing robots and for play: the largest difference of any position (m),
+        quaternion or joint angle (rad) of robots and of objects after one step, and after 20 steps its median and
+        maximum over environments.
     """
-    worlds = len(reference["data/qpos"])
-    env: Any = make(task, impl=engine, control="position", episode_length=1000.0, num_envs=worlds)
-    fresh = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), worlds))
+    num_envs = len(reference["data/qpos"])
+    env: Any = make(task, impl=engine, control="position", episode_length=1000.0, num_envs=num_envs)
+    fresh = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
     data = fresh.data.replace(**{name: jnp.asarray(reference[f"data/{name}"]) for name in STATE_FIELDS})
     parts = without_data(fresh)
     leaves = [jnp.asarray(reference[f"leaf/{i}"]) for i in range(len(jax.tree.leaves(parts)))]
     states = dataclasses.replace(fresh, data=data, **jax.tree.unflatten(jax.tree.structure(parts), leaves))
-    apart = np.abs(np.asarray(rolled(env, states, actions_of(env, worlds))[1]) - reference["qpos"])
+    apart = np.abs(np.asarray(rolled(env, states, actions_of(env, num_envs))[1]) - reference["qpos"])
     robots = np.concatenate([env.index.base_qpos, env.index.joint_qpos], axis=1).ravel()
     rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
     figures = {}
     for number, kind in enumerate(("standing", "play")):
         for name, columns in (("robots", robots), ("objects", rest)):
             if len(columns):
-                worst = apart[:, np.arange(worlds) // (worlds // 2) == number][..., columns].max(-1)
+                worst = apart[:, np.arange(num_envs) // (num_envs // 2) == number][..., columns].max(-1)
                 figures[f"{kind}/{name}_1"] = float(worst[0].max())
                 figures[f"{kind}/{name}_20"] = float(np.median(worst[-1]))
                 figures[f"{kind}/{name}_20_max"] = float(worst[-1].max())
     return figures
 
 
-def crowd(task: str, worlds: int = 4096, steps: int = 1000) -> dict[str, Any]:
-    """Random actions on Warp: steps with an overflow, diverged worlds, and whether all stayed finite."""
-    worlds_env = VectorEnv(make(task, impl="warp", num_envs=worlds), worlds)
-    env: Any = worlds_env.env
+def crowd(task: str, num_envs: int = 4096, steps: int = 1000) -> dict[str, Any]:
+    """Random actions on Warp: steps with an overflow, diverged environments, and whether all numbers stayed finite."""
+    vector_env = VectorEnv(make(task, impl="warp", num_envs=num_envs), num_envs)
+    env: Any = vector_env.env
 
     def advance(state: State, key: jax.Array) -> tuple[State, Any]:
-        action = jax.random.uniform(key, (worlds, env.num_agents, env.action_size), minval=-1.0)
-        state = worlds_env.step(state, action)
+        action = jax.random.uniform(key, (num_envs, env.num_agents, env.action_size), minval=-1.0)
+        state = vector_env.step(state, action)
         finite = jnp.all(jnp.isfinite(state.obs)) & jnp.all(jnp.isfinite(state.reward))
         return state, (env.physics.overflow(state.data), jnp.sum(state.metrics["diverged"]), finite)
 
     run = jax.jit(lambda s, k: jax.lax.scan(advance, s, k))
-    state = jax.jit(worlds_env.reset)(jax.random.PRNGKey(0))
+    state = jax.jit(vector_env.reset)(jax.random.PRNGKey(0))
     overflow, diverged, finite = run(state, jax.random.split(jax.random.PRNGKey(1), steps))[1]
     return {
-        "worlds": worlds,
+        "num_envs": num_envs,
         "steps": steps,
         "overflows": int(np.sum(np.asarray(overflow))),
         "diverged": int(np.sum(np.asarray(diverged))),

@@ -29,12 +29,12 @@ class ProbeState:
 
 @dataclass(frozen=True)
 class Probe:
-    """N worlds with one random sign `hidden` per episode.
+    """N environments with one random sign `hidden` per episode.
 
-    `show(hidden (N,), step (N,)) -> (N, F)` is what agents see besides their id;
-    `pay(hidden, action (N, A, D))` is the team's reward (N,), or each agent's own (N, A). Episodes of even worlds end
-    after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates` says whether that
-    is a termination (with `even_truncate` only in odd worlds). The shorter kind is a success.
+    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id; `pay(hidden, action (N, A, D))` is the
+    reward of the first team (N,), and its negative that of a second one, or each agent's own (N, A). Episodes of even
+    environments end after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates`
+    says whether that is a termination (with `even_truncate` only in odd environments). The shorter kind is a success.
     """
 
     show: Callable[[jax.Array, jax.Array], jax.Array]
@@ -47,6 +47,7 @@ class Probe:
     odd_episode_steps: int | None = None
     terminates: bool = True
     even_truncate: bool = False
+    teams: tuple[tuple[int, ...], ...] = ((0, 1),)
     name: str = "probe"
 
     @property
@@ -79,7 +80,13 @@ class Probe:
             reward=jnp.zeros((n, self.num_agents)),
             terminated=zero > 0,
             truncated=zero > 0,
-            metrics={"reward/pay": zero, "average_step_reward": zero, "success": zero, "diverged": zero},
+            metrics={
+                "reward/pay": zero,
+                "average_step_reward": zero,
+                "success": zero,
+                "team0/win": zero,
+                "diverged": zero,
+            },
             key=key,
             step=step,
         )
@@ -87,8 +94,10 @@ class Probe:
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
         key, draw = jax.random.split(state.key)
         pay = self.pay(state.hidden, action)
-        own = jnp.broadcast_to(pay.reshape(self.num_envs, -1), (self.num_envs, self.num_agents))
-        pay = jnp.mean(own, axis=-1)
+        if pay.ndim == 2:
+            reward, pay = pay, jnp.mean(pay, axis=-1)
+        else:
+            reward = pay[:, None] * jnp.array([1.0 if agent in self.teams[0] else -1.0 for agent in range(2)])
         step = state.step + 1
         odd = self.odd_episode_steps or self.max_episode_steps
         limit = jnp.where(jnp.arange(self.num_envs) % 2, odd, self.max_episode_steps)
@@ -107,13 +116,14 @@ class Probe:
             privileged_obs=privileged,
             final_obs=final_obs,
             final_privileged_obs=final_privileged,
-            reward=own,
+            reward=reward,
             terminated=done & terminates,
             truncated=done & ~terminates,
             metrics={
                 "reward/pay": pay,
                 "average_step_reward": pay,
                 "success": short.astype(jnp.float32),
+                "team0/win": short.astype(jnp.float32),
                 "diverged": jnp.zeros(done.shape),
             },
             key=key,
@@ -132,7 +142,7 @@ def show_hidden_first(hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def show_step_and_parity(hidden: jax.Array, step: jax.Array) -> jax.Array:
-    """Shows the step modulo 4, one-hot, and whether the world is odd."""
+    """Shows the step modulo 4, one-hot, and whether the environment is odd."""
     parity = (jnp.arange(hidden.shape[0]) % 2).astype(jnp.float32)
     return jnp.concatenate([jax.nn.one_hot(step % 4, 4), parity[:, None]], axis=-1)
 

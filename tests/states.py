@@ -29,6 +29,12 @@ def stepper(task: str) -> Any:
     return jax.jit(made(task).step)
 
 
+@functools.cache
+def initial(env: QuadrupedEnv) -> State:
+    """An initial state of an environment, computed once per process."""
+    return jax.jit(env.reset)(jax.random.PRNGKey(0))
+
+
 def placed(
     env: QuadrupedEnv,
     position: Any,
@@ -40,7 +46,7 @@ def placed(
 
     Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the reset.
     """
-    state = env.reset(jax.random.PRNGKey(0)) if state is None else state
+    state = initial(env) if state is None else state
     index, position = env.index, jnp.asarray(position, jnp.float32)
     turn = euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
     qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))

@@ -11,8 +11,8 @@ from tests import engines
 @pytest.mark.soak
 @pytest.mark.parametrize("task", list(TASKS))
 def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
-    """Standing robots and worlds in play under random joint targets: contacts make small differences grow."""
-    figures = engines.disagreement(task, "jax", engines.record(task, worlds=4))
+    """Standing robots and episodes in play under random joint targets: contacts make small differences grow."""
+    figures = engines.disagreement(task, "jax", engines.record(task, num_envs=4))
     assert figures["standing/robots_1"] < 1e-3, figures
     assert figures["standing/robots_20"] < 0.02 and figures["standing/robots_20_max"] < 0.1, figures
     assert figures.get("standing/objects_20_max", 0.0) < 0.02, figures

@@ -15,7 +15,7 @@ from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import scripted_policy
-from tests.states import made, observation, placed, stepper, still, with_object
+from tests.states import initial, made, observation, placed, stepper, still, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -340,16 +340,16 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
     robots = attack.read(state.data)
     rest = idle.controller.default_commands
     np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
-    told = np.asarray(attack.npc_commands(state, robots))[0]
+    commands = np.asarray(attack.npc_commands(state, robots))[0]
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
-    np.testing.assert_allclose(told[:2], [0.5, 0.5], atol=1e-6)
-    np.testing.assert_array_equal(told[3:], rest[3:])
+    np.testing.assert_allclose(commands[:2], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(commands[3:], rest[3:])
 
 
 def test_the_defender_stands_while_the_agents_give_torques() -> None:
     """It follows joint targets of the walk policy, whatever an agent's action means."""
     env: Any = make("go1football-defender", impl="c", control="torque")
-    state = standing(env, env.reset(jax.random.PRNGKey(0)), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+    state = standing(env, initial(env), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
     np.testing.assert_allclose(env.controller.neutral[:2], 0)
     step = jax.jit(env.step)
     for _ in range(50):

@@ -16,7 +16,7 @@ from mqe_jax.envs.match import Match
 from mqe_jax.objects import Cylinder, Door
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import made, observation, placed, stepper, still, terms_of
+from tests.states import initial, made, observation, placed, stepper, still, terms_of
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
 PI = np.pi
@@ -40,7 +40,7 @@ def test_teams_and_zero_sum(task: str) -> None:
     env = made(task)
     half = env.num_agents // 2
     assert env.teams == (tuple(range(half)), tuple(range(half, 2 * half)))
-    state = env.reset(jax.random.PRNGKey(0))
+    state = initial(env)
     for seed in range(3):
         action = jax.random.uniform(jax.random.PRNGKey(seed), (env.num_agents, 12), minval=-1.0)
         state = stepper(task)(state, action)
@@ -139,13 +139,13 @@ def test_tug_result_and_end() -> None:
 def test_the_arena_moves_the_middle_and_spawn_noise_counts() -> None:
     env: Any = make("go1tug", impl="c", control="position", arena=(4.0, 6.0), spawn_noise=0.05)
     assert env.center == (2.1, 0.0)
-    spawn = np.asarray(jax.vmap(env.spawn)(jax.random.split(jax.random.PRNGKey(0), 64)))
+    spawn = np.asarray(jax.jit(jax.vmap(env.spawn))(jax.random.split(jax.random.PRNGKey(0), 64)))
     assert np.abs(spawn[..., 0] - 2.1).max() <= 1.05 and 0.04 < np.abs(np.abs(spawn[..., 1]) - 2.5).max() <= 0.05
 
 
 def test_a_diverged_match_is_a_draw() -> None:
     env = made("go1wrestling")
-    state = env.reset(jax.random.PRNGKey(0))
+    state = initial(env)
     state = dataclasses.replace(state, data=state.data.replace(qvel=jnp.full_like(state.data.qvel, jnp.nan)))
     after = stepped(env, state)
     assert after.terminated and float(after.metrics["diverged"]) == 1
@@ -307,7 +307,7 @@ def test_the_bridge_carries_a_robot_and_its_side_does_not() -> None:
 )
 def test_robots_start_as_listed(task: str, colors: tuple[int, int]) -> None:
     env = made(task)
-    spawn = np.asarray(jax.vmap(env.spawn)(jax.random.split(jax.random.PRNGKey(0), 64)))
+    spawn = np.asarray(jax.jit(jax.vmap(env.spawn))(jax.random.split(jax.random.PRNGKey(0), 64)))
     mean = {
         "go1tug": [[1.6, -2.5, 0.34, PI / 2], [1.6, 2.5, 0.34, -PI / 2]],
         "go1revolvingdoor": [[0.5, -1, 0.42, 0], [0.5, 1, 0.42, 0]],

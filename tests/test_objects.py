@@ -19,7 +19,7 @@ from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import scripted_policy
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import made, with_object
+from tests.states import initial, made, with_object
 
 STEP = 0.02
 
@@ -117,7 +117,7 @@ def test_a_sheep_by_itself_wanders() -> None:
 
 
 def test_sheep_observation(herd: Any) -> None:
-    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[8.5, 0.4]]))
+    state = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.4]]))
     for number in range(9):
         state = with_object(herd, state, f"sheep{number}", [number, -0.1 * number])
     robots = herd.read(state.data)
@@ -140,7 +140,7 @@ def test_a_herd_wanders_and_stays_together() -> None:
 
 def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     env: Any = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
-    state = env.reset(jax.random.PRNGKey(0))
+    state = initial(env)
     state = with_object(env, state, "sheep0", [2.0, 1.0])
     index = env.index.base_qpos
     qpos = state.data.qpos.at[index[0, :2]].set(jnp.array([1.2, 1.0])).at[index[1, :2]].set(jnp.array([0.5, -1.5]))
@@ -159,7 +159,7 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
 
 
 def test_pushbox_rewards_and_success(box_env: Any) -> None:
-    state = dataclasses.replace(box_env.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[4.5, 0.2]]))
+    state = dataclasses.replace(initial(box_env), anchors=jnp.array([[4.5, 0.2]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.float32(4.47)))
     robots, no = box_env.read(state.data), jnp.array(False)
     before = with_object(box_env, state, "box", [4.49, 0.2, 0.5, 1, 0, 0, 0])
@@ -177,7 +177,7 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
 
 
 def test_pushbox_observation(box_env: Any) -> None:
-    state = with_object(box_env, box_env.reset(jax.random.PRNGKey(0)), "box", [3.0, 0.4, 0.5, 0.8, 0, 0, 0.6])
+    state = with_object(box_env, initial(box_env), "box", [3.0, 0.4, 0.5, 0.8, 0, 0, 0.6])
     robots = box_env.read(state.data)
     obs = np.asarray(box_env.observation_layout.pack(box_env.observe(state, robots)))
     info = np.asarray(robots.base_info)
@@ -188,14 +188,14 @@ def test_pushbox_observation(box_env: Any) -> None:
 
 def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
     easy = made("go1sheep-easy")
-    state = dataclasses.replace(easy.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[5.0, 0.3]]))
+    state = dataclasses.replace(initial(easy), anchors=jnp.array([[5.0, 0.3]]))
     state = dataclasses.replace(state, task=dataclasses.replace(state.task, x=jnp.array([4.98])))
     state = with_object(easy, state, "sheep0", [5.01, 0.3])
     robots, no = easy.read(state.data), jnp.array(False)
     reward, _ = weigh(easy.rewards(state, robots, no)[0], easy.params.rewards, 2)
     np.testing.assert_allclose(reward, [1 + 2 * 0.03] * 2, atol=1e-4)
 
-    state = dataclasses.replace(herd.reset(jax.random.PRNGKey(0)), anchors=jnp.array([[8.5, 0.0]]))
+    state = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.0]]))
     for number in range(9):  # two are through; the others stand 3 m and 4 m away from the gate: hypot = 5
         state = with_object(herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0])
     reward, _ = weigh(herd.rewards(state, herd.read(state.data), no)[0], herd.params.rewards, 2)
@@ -204,7 +204,7 @@ def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
 
 
 def test_the_herd_starts_as_listed(herd: Any) -> None:
-    states = jax.vmap(herd.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
+    states = jax.jit(jax.vmap(herd.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
     sheep = np.asarray(jax.vmap(herd.sheep)(states.data))
     rows = np.stack(np.meshgrid([3.5, 5.0, 6.5], [-1.5, 0.0, 1.5], indexing="ij"), -1).reshape(9, 2)
     assert np.abs(sheep - rows).max() <= 0.3 and np.abs(sheep - rows).max() > 0.25

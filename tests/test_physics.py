@@ -1,4 +1,4 @@
-"""Physics on three engines: the compiled robot's figures, agreement with MuJoCo, worlds that stay whole."""
+"""Physics on three engines: the compiled robot's figures, agreement with MuJoCo, states that stay finite."""
 
 from __future__ import annotations
 
@@ -128,8 +128,8 @@ def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
     assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
 
 
-def test_gate_moves_with_the_world() -> None:
-    """Walls stand where each world's gate was drawn, and stop a robot there."""
+def test_gate_stands_where_each_environment_drew_it() -> None:
+    """Walls stand where each environment's gate was drawn, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     gap = states.anchors[:, 0]

@@ -19,7 +19,7 @@ from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import angles, made, placed, robot_state, stepper
+from tests.states import angles, initial, made, placed, robot_state, stepper
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
@@ -37,7 +37,7 @@ def step(env: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def fresh(env: Any) -> State:
-    return jax.jit(env.reset)(jax.random.PRNGKey(0))
+    return initial(env)
 
 
 def on_plank(x: float, height: float = 0.31) -> list[float]:

@@ -15,6 +15,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
 
 
@@ -49,14 +50,26 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
     network = make_learner(env, config).network
     seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
     value, _ = network.value(state.params, (), jnp.zeros((4, 2), bool), jnp.zeros((4, 2, 2, 7)), seen)
-    mean = state.value_normalizer.mean / state.value_normalizer.weight
-    square = state.value_normalizer.square / state.value_normalizer.weight
-    value = value * jnp.sqrt(square - mean**2) + mean
+    value = value_denormalize(state.value_normalizer, value)
     for agent in range(2):
         forever = np.full(4, 1 / (1 - 0.8))
         ending = [(1 - 0.8 ** (4 - s)) / (1 - 0.8) for s in range(4)]
         np.testing.assert_allclose(value[:, 0, agent], forever, atol=0.3)
         np.testing.assert_allclose(value[:, 1, agent], ending, atol=0.3)
+
+
+def test_small_rewards_are_learnt_as_large_ones() -> None:
+    """The same training at rewards of 1 and of 0.001: the same values up to the scale."""
+    values = []
+    for scale in (1.0, 1e-3):
+        env = Probe(probes.show_hidden, lambda h, a, s=scale: s * h, num_envs=16)
+        state, metrics = learn(env, small(num_envs=16, ppo__epochs=1), 30)
+        value, _ = make_learner(env, small(num_envs=16)).network.value(
+            state.params, (), jnp.zeros((1, 2), bool), jnp.zeros((1, 2, 2, 3)), jnp.array([[[1.0], [-1.0]]])
+        )
+        values.append(value_denormalize(state.value_normalizer, value[0]) / scale)
+        assert float(metrics["explained_variance"]) > 0.5
+    np.testing.assert_allclose(values[0], values[1], rtol=0.02)
 
 
 VARIANTS = {
@@ -77,6 +90,20 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     _, metrics = learn(env, small(**VARIANTS[variant]), 60)
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["episode_length"]) == 4.0
+
+
+def test_joint_values_of_a_match_are_per_team() -> None:
+    """In a zero-sum match the values of the two teams are opposite; averaged over both they would be 0."""
+    env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, teams=((1,), (0,)))
+    config = small(ppo={"ratio": "joint", "value": "joint", "gamma": 0.5}, network__critic_input="observations")
+    state, metrics = learn(env, config, 40)
+    network = make_learner(env, config).network
+    obs = state.rollout.env_state.obs[None]
+    value, _ = network.value(state.params, (), jnp.zeros((1, 32), bool), obs, jnp.zeros((1, 32, 5)))
+    value = value_denormalize(state.value_normalizer, value)[0]
+    assert value.shape == (32, 2)
+    assert float(value[:, 0].min()) > 0.5 and float(value[:, 1].max()) < -0.5
+    assert np.isfinite(float(metrics["loss/policy"]))
 
 
 def test_memory_carries_a_sign_through_an_episode() -> None:
@@ -107,7 +134,7 @@ class OnePass(NamedTuple):
 
 @pytest.fixture(scope="module")
 def one_pass() -> OnePass:
-    """Runs updates of one epoch over one batch, with memory; odd worlds have longer episodes."""
+    """Runs updates of one epoch over one batch, with memory; odd environments have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
     learner = make_learner(
         env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
@@ -136,11 +163,13 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
 
-def test_success_is_averaged_over_episode_ends(one_pass: OnePass) -> None:
-    """Even worlds end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
+def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) -> None:
+    """Even environments end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
     metrics = one_pass.metrics[0]
     assert float(metrics["episodes"]) == 2 * 4 + 2 * 2
     assert float(metrics["success"]) == pytest.approx(2 / 3)
+    assert float(metrics["team0/win"]) == pytest.approx(2 / 3)
+    assert float(metrics["episode_return"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
     assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
 
 
@@ -155,3 +184,60 @@ def test_settings_must_fit_the_environment() -> None:
     ):
         with pytest.raises(InputError, match=f"^{message}"):
             make_learner(env, small(**values))
+
+
+class WrongSize(Probe):
+    @property
+    def observation_size(self) -> int:
+        return 7
+
+
+def test_a_wrong_observation_size_is_named() -> None:
+    env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
+    with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); its sizes say \(4, 2, 7\)"):
+        make_learner(env, small(num_envs=4))
+
+
+class Tuple(NamedTuple):
+    """A state that is a NamedTuple, without anything privileged; integer rewards, and a term of the score."""
+
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    step: jax.Array
+
+
+class Foreign:
+    """One agent; ends after 4 steps; nothing but its clock is observed."""
+
+    name, num_envs, num_agents, action_size = "foreign", 4, 1, 1
+    observation_size, privileged_observation_size, max_episode_steps = 1, 0, 4
+
+    def _state(self, step: jax.Array, done: jax.Array) -> Tuple:
+        obs, nothing = step[:, None, None].astype(jnp.float32), jnp.zeros((4, 0))
+        reward = jnp.ones((4, 1), jnp.int32)
+        return Tuple(obs, nothing, obs, nothing, reward, done, jnp.zeros(4, bool), {}, step)
+
+    def reset(self, key: jax.Array) -> Tuple:
+        return self._state(jnp.zeros(4, jnp.int32), jnp.zeros(4, bool))
+
+    def step(self, state: Tuple, action: jax.Array) -> Tuple:
+        step = state.step + 1
+        return self._state(jnp.where(step >= 4, 0, step), step >= 4)
+
+
+def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered() -> None:
+    config = small(num_envs=4, stagger_episodes=True, network__critic_input="observations", ppo__epochs=1)
+    config = override(config, {"normalization.observations": True})
+    config = override(config, {"curriculum.failure_bootstrap": 0.5})
+    state = make_learner(Foreign(), config).init(jax.random.PRNGKey(1))
+    assert len(np.unique(state.rollout.env_state.step)) > 1
+    _, metrics = learn(Foreign(), config, 1)
+    assert all(np.isfinite(float(value)) for value in metrics.values())
+    with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
+        make_learner(Foreign(), small(num_envs=4))

@@ -48,6 +48,12 @@ def test_gae_broadcasts_flags_over_agents() -> None:
     np.testing.assert_allclose(advantage[1], 1.0)
 
 
+def test_gae_of_integer_rewards_keeps_fractions_of_the_bootstrap() -> None:
+    ones = jnp.ones((1, 1), jnp.int32)
+    advantage, _ = gae(ones, jnp.zeros((1, 1)), 2.0 * ones, 0.3 * ones, ones.astype(bool), gamma=1.0, gae_lambda=1.0)
+    np.testing.assert_allclose(advantage, [[1.0 + 0.7 * 2.0]], rtol=1e-6)
+
+
 def test_clipped_surrogate_by_hand() -> None:
     log_ratio = jnp.log(jnp.array([1.5, 1.5, 0.5, 0.5, 5.0]))
     advantage = jnp.array([1.0, -1.0, 1.0, -1.0, -1.0])
@@ -78,9 +84,13 @@ def test_gaussian_density_entropy_and_divergence() -> None:
 def test_ratio_functions_by_hand() -> None:
     new = jnp.array([[0.1, 0.2], [0.3, 0.4]])  # 2 agents, 2 dimensions
     old = jnp.zeros((2, 2))
-    np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
-    np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
-    np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
+    both, rivals = ((0, 1),), ((1,), (0,))
+    np.testing.assert_allclose(loss.ratio_per_agent(new, old, both), [[0.3], [0.7]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_per_dimension(new, old, both), new)
+    np.testing.assert_allclose(loss.ratio_joint(new, old, both), [[1.0]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_joint(new, old, rivals), [[0.7], [0.3]], rtol=1e-6)
+    np.testing.assert_allclose(loss.team_mean(new[:, 0], both), [0.2], rtol=1e-6)
+    np.testing.assert_allclose(loss.team_mean(new[:, 0], rivals), [0.3, 0.1], rtol=1e-6)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:
@@ -95,12 +105,22 @@ def test_running_statistics_merge_as_one_batch() -> None:
     np.testing.assert_allclose(running_normalize(constant, jnp.array([7.0])), [0.0], atol=1e-4)
 
 
-def test_value_statistics_are_debiased_and_invertible() -> None:
-    target = jnp.array([1.0, 3.0])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_value_statistics_are_debiased_and_invertible_at_any_scale(scale: float) -> None:
+    target = scale * jnp.array([1.0, 3.0])
     statistics = value_update(value_init(), target, 0.99)
     np.testing.assert_allclose(value_normalize(statistics, target), [-1.0, 1.0], rtol=1e-3)
-    np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target)
-    np.testing.assert_allclose(value_normalize(value_init(), target), target)
+    np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target, rtol=1e-6)
+
+
+def test_value_statistics_at_their_limits() -> None:
+    target = jnp.array([1.0, 3.0])
+    np.testing.assert_array_equal(value_normalize(value_init(enabled=False), target), target)
+    np.testing.assert_array_equal(value_denormalize(value_init(enabled=False), target), target)
+    np.testing.assert_array_equal(value_denormalize(value_init(), target), 0.0)
+    for constant in (0.0, 5.0):
+        statistics = value_update(value_init(), jnp.full((3,), constant), 0.99)
+        assert float(jnp.abs(value_normalize(statistics, jnp.float32(constant)))) < 0.1
 
 
 def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:
@@ -150,3 +170,14 @@ def test_weights_are_drawn_without_lapack() -> None:
     # Its decompositions wait for each other in XLA's threads and can stop a program on two cores for good.
     lowered = jax.jit(lambda key: nn.orthogonal(key, (8, 4), 1.0)).lower(jax.random.PRNGKey(0))
     assert "custom_call" not in lowered.as_text()
+
+
+def test_a_bounded_parameter_comes_back_from_beyond_its_bounds() -> None:
+    x = jnp.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+
+    def slope(direction: float) -> jax.Array:
+        return jax.grad(lambda x: jnp.sum(direction * nn.bounded(x, -1.5, 1.5)))(x)
+
+    np.testing.assert_allclose(nn.bounded(x, -1.5, 1.5), [-1.5, -1.0, 0.0, 1.0, 1.5])
+    np.testing.assert_allclose(slope(1.0), [0, 1, 1, 1, 1])  # descent lowers x: back from above, never farther down
+    np.testing.assert_allclose(slope(-1.0), [-1, -1, -1, -1, 0])

@@ -229,7 +229,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
         policy.act(np.zeros((3, 3, 2)), memory)
     result = evaluate(PROBE, policy.act, 8, jax.random.PRNGKey(0), memory=policy.initial_memory(4))
-    assert result.episodes == 8 and result.mean_length == 4.0
+    assert result.episodes == 8 and result.episode_length == 4.0
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
@@ -319,7 +319,8 @@ def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     # 10 episodes over 4 environments: 3, 3, 2, 2
     assert result.episodes == 10
     assert result.success_rate == pytest.approx(5 / 10)
-    assert result.mean_length == pytest.approx((5 * 2 + 5 * 30) / 10)
+    assert result.episode_length == pytest.approx((5 * 2 + 5 * 30) / 10)
+    assert result.episode_return == pytest.approx((5 * 2 + 5 * 30) / 10)  # 1 a step
     assert result.average_step_reward == pytest.approx(1.0)
     assert result.terms == {"pay": pytest.approx(1.0)}
     assert result.to_dict()["diverged"] == 0

@@ -127,14 +127,22 @@ def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.P
     write_torchscript(tmp_path / "a.jit", adaptation)
     write_torchscript(tmp_path / "b.jit", body)
     params = convert.convert(tmp_path / "a.jit", tmp_path / "b.jit")
-    walk_policy.save_params(params, tmp_path / "walk.safetensors")
-    params = walk_policy.load_params(GO1, tmp_path / "walk.safetensors")
     history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
     latent = apply(adaptation, history)
     np.testing.assert_allclose(walk_policy.infer_latent(params, jnp.asarray(history)), latent, atol=2e-5)
     action = apply(body, np.concatenate([history, latent], axis=1))
     found = walk_policy.infer_action(params, jnp.asarray(history), jnp.asarray(latent))
     np.testing.assert_allclose(found, action, atol=2e-5)
+
+
+def test_weights_are_stored_as_float16_and_loaded_as_float32(tmp_path: pathlib.Path) -> None:
+    params = walk_policy.init_params(jax.random.PRNGKey(0))
+    file = tmp_path / "walk.safetensors"
+    walk_policy.save_params(params, file)
+    assert file.stat().st_size < 3.7e6
+    found = walk_policy.load_params(GO1, file)
+    assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-7), found, params)
 
 
 def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:

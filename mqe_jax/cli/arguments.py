@@ -306,6 +306,7 @@ class WalkConvert:
     """Such as body_latest.jit."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """Weights to write (.safetensors)."""
+    robot: Robot = "go1"
 
     def run(self) -> dict[str, Any] | None:
         return _commands("walk_commands").walk_convert(self)

@@ -67,7 +67,7 @@ def walk_eval(arguments: WalkEval) -> dict[str, Any]:
 
 def walk_convert(arguments: WalkConvert) -> None:
     """Converts official checkpoints."""
-    from mqe_jax import walk_policy
+    from mqe_jax import robots, walk_policy
     from mqe_jax.walk import convert
 
     if arguments.output.suffix != ".safetensors":
@@ -76,5 +76,5 @@ def walk_convert(arguments: WalkConvert) -> None:
         if not path.is_file():
             raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
     params = convert.convert(arguments.adaptation, arguments.body)
-    walk_policy.save_params(params, arguments.output)
+    walk_policy.save_params(params, arguments.output, {"robot": robots.get(arguments.robot).name})
     say(f"mqe: wrote {arguments.output}")

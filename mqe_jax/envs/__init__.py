@@ -76,7 +76,7 @@ def make(
         control: action mode: 'command', 'position' or 'torque'.
         num_envs: maximum batch size; sizes Warp's contact buffer.
         overrides: task parameters by name; nested ones as mappings or, from a dict, by dotted names:
-            `make("go1gate", gate_width=0.8, rewards={"collision": -5.0})`.
+            `make("go1gate", robot="go2", gate_width=0.8, rewards={"collision": -5.0})`.
 
     Raises:
         InputError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.

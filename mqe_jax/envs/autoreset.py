@@ -15,7 +15,7 @@ _KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_ob
 
 
 def autoreset(env: QuadrupedEnv, state: State) -> State:
-    """Replaces the state of one environment by a fresh one if its episode has ended.
+    """Replaces the state of one environment by a new initial state if its episode has ended.
 
     Resets the whole state, without a forward pass. `reward`, `terminated`, `truncated`, `metrics` and `final_obs`
     still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept.
@@ -40,6 +40,7 @@ class VectorEnv:
     Attributes:
         env: the task.
         num_envs: number of environments N.
+        teams: agents of each team.
         max_episode_steps: environment steps until the time limit.
     """
 

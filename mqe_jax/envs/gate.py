@@ -87,7 +87,7 @@ class GateState:
 class Go1Gate(QuadrupedEnv):
     """Narrow Gate.
 
-    - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is drawn at reset.
+    - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is sampled at reset.
     - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2.
     - Reward: see `GateRewards`; shared.
     - End: a fall, a collision, or 10 s. Success: both are through without a collision.

@@ -72,9 +72,10 @@ def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, a
     starts = np.flatnonzero(np.asarray(states.step) == 0)
     first = int(starts[-1]) if len(starts) else 0
     about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
-    arrays = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
+    arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
+    arrays |= {"about": np.array(json.dumps(about)), "actions": np.asarray(actions)[first:]}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, about=np.array(json.dumps(about)), actions=np.asarray(actions)[first:], **arrays)
+    np.savez_compressed(buffer, **arrays)
     write_atomically(pathlib.Path(file), buffer.getvalue())
 
 

@@ -103,7 +103,7 @@ def build_robot(
     Args:
         robot: which one.
         number: its place among the robots of the scene, for its collision bits.
-        num_robots: how many robots share the scene.
+        num_robots: robots in the scene.
         contacts: which parts touch what.
         visual: whether to add the visual geoms.
         friction: sliding friction of its shapes, which takes precedence over the other shape's.

@@ -186,7 +186,7 @@ class VisualShape:
 
 @dataclasses.dataclass(frozen=True)
 class WalkSettings:
-    """What the walk policy and its training take from the robot.
+    """Settings of the walk policy and its training that depend on the robot.
 
     Attributes:
         weights: file name of the trained weights in `mqe_jax/assets`.

@@ -120,6 +120,9 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
     critic_out = 1 if own else dims.values
     critic_shared = share or not own
 
+    low = -math.inf if settings.log_std_min is None else settings.log_std_min
+    high = math.inf if settings.log_std_max is None else settings.log_std_max
+
     def init(key: jax.Array) -> Params:
         actor_key, critic_key = jax.random.split(key)
 
@@ -164,11 +167,7 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
         mean, memory = run(params["actor"], share, memory, is_first, obs)
         if settings.action_mean == "tanh":
             mean = jnp.tanh(mean)
-        log_std = params["log_std"]
-        if settings.log_std_max is not None:
-            log_std = jnp.minimum(log_std, settings.log_std_max)
-        if settings.log_std_min is not None:
-            log_std = jnp.maximum(log_std, settings.log_std_min)
+        log_std = nn.bounded(params["log_std"], low, high)
         return mean, jnp.broadcast_to(log_std, mean.shape), memory
 
     def act(

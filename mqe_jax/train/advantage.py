@@ -24,6 +24,8 @@ def gae(
     `done` (terminated or truncated) cuts the trace. Source: Schulman et al., arXiv 1506.02438.
     """
 
+    reward = reward.astype(jnp.result_type(reward, jnp.float32))  # integers would round fractions of a bootstrap
+
     def as_reward(flag: jax.Array) -> jax.Array:
         flag = flag.reshape(flag.shape + (1,) * (reward.ndim - flag.ndim))
         return jnp.broadcast_to(flag, reward.shape).astype(reward.dtype)

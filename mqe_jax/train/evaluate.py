@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
-from mqe_jax.train.types import Memory, VectorEnv
+from mqe_jax.train.types import Memory, VectorEnv, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable by JAX."""
@@ -30,7 +30,9 @@ class EvalResult:
     success_rate: float  # fraction of episodes
     average_step_reward: float  # mean over steps of the sum of reward terms
     terms: dict[str, float]  # mean over steps of each reward term
-    mean_length: float  # steps per episode
+    episode_return: float  # undiscounted, mean over the agents of team 0
+    episode_length: float  # steps
+    overflow: int  # counted steps in which the engine dropped contacts
     diverged: int  # episodes that ended because the physics diverged
     success: dict[str, float]  # other outcomes by name, mean over episodes, from metrics `success/<name>`
     match: dict[str, float]  # win_rate, draw_rate, loss_rate of team 0; empty without an opponent
@@ -46,6 +48,7 @@ class _Progress(NamedTuple):
     memory: Memory
     finished: jax.Array  # (N,) int32, finished episodes
     steps: jax.Array  # (N,) int32, counted steps
+    returns: jax.Array  # (N,), rewards of team 0 over counted steps
     step_sums: dict[str, jax.Array]  # (N,) each, over counted steps
     end_sums: dict[str, jax.Array]  # (N,) each, over the last steps of counted episodes
 
@@ -135,7 +138,7 @@ def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:
     state = env.reset(key)
     zeros = {name: jnp.zeros((env.num_envs,)) for name in state.metrics}
     none = jnp.zeros((env.num_envs,), jnp.int32)
-    return _Progress(state, memory, none, none, zeros, zeros)
+    return _Progress(state, memory, none, none, jnp.zeros((env.num_envs,)), zeros, zeros)
 
 
 def _run_block(
@@ -147,6 +150,8 @@ def _run_block(
     quota: jax.Array,
     block: int,
 ) -> _Progress:
+    own = np.array(teams_of(env)[0])
+
     def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
         action, memory = act(p.env_state.obs, p.memory, step_key)
         state = env.step(p.env_state, action)
@@ -164,6 +169,7 @@ def _run_block(
                 memory=jax.tree.map(restart, memory, initial_memory),
                 finished=p.finished + (counted & done),
                 steps=p.steps + counted,
+                returns=p.returns + jnp.where(counted, jnp.mean(state.reward[:, own], axis=-1), 0.0),
                 step_sums=step_sums,
                 end_sums=end_sums,
             ),
@@ -187,7 +193,9 @@ def _result(task: str, episodes: int, progress: _Progress) -> EvalResult:
         success_rate=per_episode.get("success", float("nan")),
         average_step_reward=per_step.get("average_step_reward", float("nan")),
         terms={n.removeprefix("reward/"): v for n, v in per_step.items() if n.startswith("reward/")},
-        mean_length=steps / episodes,
+        episode_return=total(progress.returns) / episodes,
+        episode_length=steps / episodes,
+        overflow=round(per_step.get("overflow", 0.0) * steps),
         diverged=round(per_episode.get("diverged", 0.0) * episodes),
         success={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
         match={f"{n}_rate": per_episode[f"team0/{n}"] for n in ("win", "draw", "loss") if f"team0/{n}" in per_episode},

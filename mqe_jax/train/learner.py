@@ -6,18 +6,19 @@ differ in the ratio that PPO clips, the kind of value, and the network; all thre
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, Teams, clipped_surrogate, ratio_joint, value_loss
+from mqe_jax.train.loss import RATIOS, clipped_surrogate, team_mean, value_loss
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
     ValueStatistics,
@@ -30,7 +31,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, Transition, VectorEnv
+from mqe_jax.train.types import Batch, Params, Teams, Transition, VectorEnv, replace_fields, teams_of
 
 Metrics = dict[str, jax.Array]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -66,7 +67,7 @@ class Learner(NamedTuple):
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     """Returns the sizes that a network is built for."""
     agents = env.num_agents
-    teams = tuple(getattr(env, "teams", None) or (tuple(range(agents)),))
+    teams = teams_of(env)
     return EnvDims(
         agents=agents,
         observation=env.observation_size,
@@ -83,15 +84,9 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     Raises:
         InputError: where the settings do not fit the environment.
     """
-    if env.num_envs != config.num_envs:
-        fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
-    assistance = config.curriculum.assistance
-    if assistance and not hasattr(jax.eval_shape(env.reset, jax.random.PRNGKey(0)), "assistance"):
-        fail("curriculum.assistance", assistance, f"0: the state of the environment {env.name} has no such field")
-    if config.stagger_episodes and not hasattr(env, "max_episode_steps"):
-        fail("stagger_episodes", True, f"false: the environment {env.name} has no max_episode_steps")
+    _check_environment(env, config)
     dims = env_dims(env, config)
-    network, teams = config.network.build(dims), dims.teams
+    network = config.network.build(dims)
     _check_divisible(config, network)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
@@ -108,13 +103,14 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
                 obs_normalizer=ObservationNormalizer(
                     running_init(env.observation_size), running_init(env.privileged_observation_size)
                 ),
-                value_normalizer=value_init(),
+                value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
                 rollout=RolloutState(
                     env_state=env_state,
                     memory=network.initial_memory(env.num_envs),
                     is_first=jnp.ones((env.num_envs,), bool),
                     episode_steps=jnp.zeros((env.num_envs,), jnp.int32),
+                    episode_return=jnp.zeros((env.num_envs,)),
                 ),
                 key=key,
                 updates=jnp.zeros((), jnp.int32),
@@ -138,9 +134,9 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
         )
-        batch, value_normalizer, batch_metrics = _prepare(network, config, teams, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(network, config, dims.teams, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
-            network, optimizer, config, teams, state, value_normalizer, batch, epoch_key
+            network, optimizer, config, dims.teams, state, value_normalizer, batch, epoch_key
         )
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
@@ -164,6 +160,32 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
     return Learner(init, update, network)
 
 
+def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
+    """Checks the shapes of the environment's state, and that it has what the settings need."""
+    if env.num_envs != config.num_envs:
+        fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
+    expected = {
+        "obs": (count, agents, env.observation_size),
+        "final_obs": (count, agents, env.observation_size),
+        "privileged_obs": (count, privileged),
+        "final_privileged_obs": (count, privileged),
+        "reward": (count, agents),
+        "terminated": (count,),
+        "truncated": (count,),
+    }
+    for name, shape in expected.items():
+        found = getattr(state, name).shape
+        if found != shape:
+            raise InputError(f"env: {name} of {env.name} has shape {found}; its sizes say {shape}")
+    assistance = config.curriculum.assistance
+    if assistance and not hasattr(state, "assistance"):
+        fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
+    if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
+        fail("stagger_episodes", True, f"false: {env.name} lacks max_episode_steps or its state a field step")
+
+
 def _check_divisible(config: TrainConfig, network: Network) -> None:
     """Checks that rollouts split into chunks, and these into minibatches."""
     if config.rollout_steps % network.chunk_length:
@@ -177,7 +199,7 @@ def _check_divisible(config: TrainConfig, network: Network) -> None:
 
 def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
     """Sets the assistance of every environment, which takes effect with its next episode."""
-    env_state = dataclasses.replace(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
+    env_state = replace_fields(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
     return state._replace(env_state=env_state)
 
 
@@ -185,7 +207,7 @@ def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
     """Sets every environment's clock to a random step, so that the first episodes end at different steps."""
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
     step = jax.random.randint(key, env_state.step.shape, 0, limit, env_state.step.dtype)
-    return dataclasses.replace(env_state, step=step)
+    return replace_fields(env_state, step=step)
 
 
 def _strongly_typed(state: TrainState) -> TrainState:
@@ -221,7 +243,7 @@ def _prepare(
     value, next_value = value_denormalize(value_normalizer, pair)
     reward = transitions.reward
     if config.ppo.value == "joint":
-        reward = jnp.stack([jnp.mean(reward[..., jnp.array(team)], axis=-1) for team in teams], axis=-1)
+        reward = team_mean(reward, teams)
     progress = state.updates.astype(jnp.float32) / config.num_updates
     curriculum = config.curriculum
     kept = curriculum.failure_bootstrap * jnp.maximum(1.0 - progress / curriculum.failure_bootstrap_until, 0.0)
@@ -262,8 +284,9 @@ def _prepare(
 
 def _chunks(x: jax.Array, length: int) -> jax.Array:
     """Cuts time into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
-    x = x.reshape(x.shape[0] // length, length, *x.shape[1:])
-    return jnp.swapaxes(x, 0, 1).reshape(length, -1, *x.shape[3:])
+    parts, envs = x.shape[0] // length, x.shape[1]
+    x = x.reshape(parts, length, *x.shape[1:])
+    return jnp.swapaxes(x, 0, 1).reshape(length, parts * envs, *x.shape[3:])
 
 
 def _take(batch: Batch, index: jax.Array) -> Batch:
@@ -285,20 +308,16 @@ def _loss(
     """Returns the PPO loss () of a minibatch and its parts."""
     ppo = config.ppo
     now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
-    advantage = batch.advantage[..., None]
-    if ppo.ratio == "joint":
-        log_ratio = ratio_joint(now.log_prob, batch.log_prob, teams)
-    else:
-        log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
-        if ppo.value == "joint":
-            number = {agent: team for team, members in enumerate(teams) for agent in members}
-            advantage = advantage[..., jnp.array([number[agent] for agent in range(len(number))]), :]
-    surrogate = clipped_surrogate(log_ratio, advantage, ppo.clip, ppo.dual_clip)
+    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob, teams)
+    advantage = batch.advantage
+    if ppo.value == "joint" and ppo.ratio != "joint":  # each agent's ratio with its team's advantage
+        advantage = advantage[..., _team_of(teams)]
+    surrogate = clipped_surrogate(log_ratio, advantage[..., None], ppo.clip, ppo.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
     critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
     mean_entropy = jnp.mean(now.entropy)
-    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
+    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob, teams)
     metrics = {
         "loss/policy": policy_loss,
         "loss/value": critic_loss,
@@ -307,6 +326,12 @@ def _loss(
         "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32)),
     }
     return policy_loss + ppo.value_coef * critic_loss - entropy_coef * mean_entropy, metrics
+
+
+def _team_of(teams: Teams) -> np.ndarray:
+    """Returns the index of each agent's team (A,)."""
+    team_of = {agent: index for index, team in enumerate(teams) for agent in team}
+    return np.array([team_of[agent] for agent in range(len(team_of))])
 
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-Teams = tuple[tuple[int, ...], ...]
-"""Indices of the agents of each team."""
+from mqe_jax.train.types import Teams
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -77,7 +77,7 @@ def value_loss(
     return jnp.maximum(unclipped, loss(clipped - target))
 
 
-def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
+def ratio_per_agent(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
     """Returns one log-ratio per agent from log-densities per dimension: (..., A, D) -> (..., A, 1).
 
     Source: MAPPO, Yu et al., arXiv 2103.01955.
@@ -85,23 +85,28 @@ def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
     return jnp.sum(new - old, axis=-1, keepdims=True)
 
 
-def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
+def ratio_per_dimension(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
     """Returns one log-ratio per action dimension, as OpenRL does: (..., A, D) -> (..., A, D)."""
     return new - old
 
 
-def ratio_joint(new: jax.Array, old: jax.Array, teams: Teams | None = None) -> jax.Array:
-    """Returns the log of the product of each team's ratios, of one team by default: (..., A, D) -> (..., T, 1).
+def ratio_joint(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
+    """Returns the log of the product of the ratios of each team's agents: (..., A, D) -> (..., teams, 1).
 
     Source: JRPO, PPO on the joint policy of a team.
     """
     per_agent = jnp.sum(new - old, axis=-1)
-    members = [jnp.array(team) for team in teams or (tuple(range(per_agent.shape[-1])),)]
-    return jnp.stack([jnp.sum(per_agent[..., team], axis=-1) for team in members], axis=-1)[..., None]
+    return jnp.stack([jnp.sum(per_agent[..., np.array(team)], axis=-1) for team in teams], axis=-1)[..., None]
 
 
-RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+RATIOS: dict[str, Callable[[jax.Array, jax.Array, Teams], jax.Array]] = {
     "agent": ratio_per_agent,
     "dimension": ratio_per_dimension,
+    "joint": ratio_joint,
 }
-"""Log-ratio functions of one agent by the name of `ppo.ratio`; `joint`, which also takes teams, is `ratio_joint`."""
+"""Log-ratio functions by the name of `ppo.ratio`."""
+
+
+def team_mean(x: jax.Array, teams: Teams) -> jax.Array:
+    """Returns the mean over each team's agents: (..., A) -> (..., teams)."""
+    return jnp.stack([jnp.mean(x[..., np.array(team)], axis=-1) for team in teams], axis=-1)

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import nearest
 from mqe_jax.settings import build, fail, record
-from mqe_jax.train.types import Memory, NetworkMemory, Params
+from mqe_jax.train.types import Memory, NetworkMemory, Params, Teams
 
 
 class EnvDims(NamedTuple):
@@ -33,7 +33,7 @@ class EnvDims(NamedTuple):
     observation: int
     privileged: int
     action: int
-    teams: tuple[tuple[int, ...], ...]  # agents of each team; one team where all cooperate
+    teams: Teams  # one team where all cooperate
     values: int  # V: one value per agent, or one per team
 
 

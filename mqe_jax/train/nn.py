@@ -107,3 +107,29 @@ def gru(params: Params, h: jax.Array, x: jax.Array, *, precision: str | None = P
     update = jax.nn.sigmoid(update_x + update_h)
     candidate = jnp.tanh(candidate_x + reset * candidate_h)
     return (1.0 - update) * candidate + update * h
+
+
+@jax.custom_vjp
+def bounded(x: jax.Array, low: float, high: float) -> jax.Array:
+    """Clips a parameter to [low, high] so that gradient descent can bring it back from beyond a bound.
+
+    The gradient is that of the identity within the bounds. Beyond them it passes where a descent step leads back, and
+    is 0 where it would lead farther out.
+    """
+    return jnp.clip(x, low, high)
+
+
+def _bounded_forward(x: jax.Array, low: float, high: float) -> tuple[jax.Array, tuple[jax.Array, float, float]]:
+    return jnp.clip(x, low, high), (x, low, high)
+
+
+def _bounded_backward(
+    saved: tuple[jax.Array, float, float], gradient: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    x, low, high = saved
+    outwards = ((x < low) & (gradient > 0.0)) | ((x > high) & (gradient < 0.0))
+    zero = jnp.zeros(())
+    return jnp.where(outwards, 0.0, gradient), zero, zero
+
+
+bounded.defvjp(_bounded_forward, _bounded_backward)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-_MIN_STD = 1e-2
+_OBSERVATION_MIN_STD = 1e-2
+_VALUE_MIN_STD = 1e-3  # of the root mean square
+_TINY = 1e-12
 
 
 class RunningStatistics(NamedTuple):
@@ -28,7 +31,7 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
 
     Source: Chan, Golub and LeVeque 1979, the parallel form of Welford's algorithm.
     """
-    batch = batch.reshape(-1, batch.shape[-1])
+    batch = batch.reshape(math.prod(batch.shape[:-1]), batch.shape[-1])
     batch_samples = jnp.float32(batch.shape[0])
     batch_mean = jnp.mean(batch, axis=0)
     batch_variance = jnp.mean(jnp.square(batch - batch_mean), axis=0)
@@ -49,7 +52,7 @@ def running_normalize(statistics: RunningStatistics, x: jax.Array, limit: float 
 
     The standard deviation is floored at 0.01, so that a constant entry becomes 0 and not noise.
     """
-    std = jnp.maximum(jnp.sqrt(statistics.variance), _MIN_STD)
+    std = jnp.maximum(jnp.sqrt(statistics.variance), _OBSERVATION_MIN_STD)
     return jnp.clip((x - statistics.mean) / std, -limit, limit)
 
 
@@ -61,9 +64,12 @@ class ValueStatistics(NamedTuple):
     weight: jax.Array
 
 
-def value_init() -> ValueStatistics:
-    """Returns statistics that leave values unchanged until the first update."""
-    return ValueStatistics(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
+def value_init(enabled: bool = True) -> ValueStatistics:
+    """Returns statistics before the first update; if not `enabled`, those that leave values unchanged.
+
+    Before the first update the scale of rewards is unknown, and every value counts as 0 in units of reward.
+    """
+    return ValueStatistics(jnp.zeros(()), jnp.float32(not enabled), jnp.float32(not enabled))
 
 
 def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -> ValueStatistics:
@@ -78,19 +84,20 @@ def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -
 
 
 def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
-    """Returns mean and standard deviation, 0 and 1 before the first update."""
-    seen = statistics.weight > 0.0
-    weight = jnp.where(seen, statistics.weight, 1.0)
-    mean = statistics.mean / weight
-    variance = statistics.square / weight - jnp.square(mean)
-    std = jnp.sqrt(jnp.maximum(variance, _MIN_STD**2))
-    return jnp.where(seen, mean, 0.0), jnp.where(seen, std, 1.0)
+    """Returns mean and standard deviation, both 0 before the first update.
+
+    The deviation is at least a thousandth of the root mean square, so that the normalisation is the same at any scale
+    of rewards and float32 rounding of nearly constant targets is not magnified.
+    """
+    weight = jnp.where(statistics.weight > 0.0, statistics.weight, 1.0)
+    mean, square = statistics.mean / weight, statistics.square / weight
+    return mean, jnp.sqrt(jnp.maximum(square - jnp.square(mean), _VALUE_MIN_STD**2 * square))
 
 
 def value_normalize(statistics: ValueStatistics, value: jax.Array) -> jax.Array:
     """Returns the normalised value of one in units of reward."""
     mean, std = _value_moments(statistics)
-    return (value - mean) / std
+    return (value - mean) / jnp.maximum(std, _TINY)
 
 
 def value_denormalize(statistics: ValueStatistics, value: jax.Array) -> jax.Array:

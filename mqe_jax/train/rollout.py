@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import NetworkMemory, Params, Transition, VectorEnv
+from mqe_jax.train.types import NetworkMemory, Params, Transition, VectorEnv, is_outcome, teams_of
 
 
 class RolloutState(NamedTuple):
@@ -19,6 +20,7 @@ class RolloutState(NamedTuple):
     memory: NetworkMemory
     is_first: jax.Array  # (N,) bool, the next step is the first of an episode
     episode_steps: jax.Array  # (N,) int32, steps since the episode began
+    episode_return: jax.Array  # (N,) sum of rewards since then, mean over the agents of team 0
 
 
 class ObservationNormalizer(NamedTuple):
@@ -51,10 +53,11 @@ def rollout(
 ) -> tuple[RolloutState, Transition, dict[str, jax.Array]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
-    The environment gets `action_scale` times the sampled action. Its metrics are means over steps and environments,
-    except: names that begin with `success` are means over the steps that ended an episode (NaN where none did), and
-    `diverged` is a count.
+    The environment gets `action_scale` times the sampled action. Metrics: those of the environment are means over steps
+    and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
+    episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts.
     """
+    own = np.array(teams_of(env)[0])
 
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, dict[str, jax.Array]]]:
         before = state.env_state
@@ -79,12 +82,15 @@ def rollout(
             done=done,
         )
         episode_steps = state.episode_steps + 1
-        sums = _sums(after.metrics, done, episode_steps)
+        episode_return = state.episode_return + jnp.mean(after.reward[:, own], axis=-1)
+        of_episodes = {"episode_length": episode_steps.astype(jnp.float32), "episode_return": episode_return}
+        sums = _sums({**after.metrics, **of_episodes}, done)
         state = RolloutState(
             env_state=after,
             memory=NetworkMemory(actor_memory, critic_memory),
             is_first=done,
             episode_steps=jnp.where(done, 0, episode_steps),
+            episode_return=jnp.where(done, 0.0, episode_return),
         )
         return state, (transition, sums)
 
@@ -92,19 +98,16 @@ def rollout(
     return state, transitions, _means(sums, length * env.num_envs)
 
 
-def _at_episode_end(name: str) -> bool:
-    return name.startswith("success")
+def _per_episode(name: str) -> bool:
+    return is_outcome(name) or name in ("episode_length", "episode_return")
 
 
-def _sums(metrics: dict[str, jax.Array], done: jax.Array, episode_steps: jax.Array) -> dict[str, jax.Array]:
-    """Returns the sums over environments of one step."""
+def _sums(metrics: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array]:
+    """Returns the sums over environments of one step: metrics (N,) -> ()."""
     sums = {
-        name: jnp.sum(jnp.where(done, value, 0.0) if _at_episode_end(name) else value)
-        for name, value in metrics.items()
+        name: jnp.sum(jnp.where(done, value, 0.0) if _per_episode(name) else value) for name, value in metrics.items()
     }
-    sums["episodes"] = jnp.sum(done.astype(jnp.float32))
-    sums["episode_length"] = jnp.sum(jnp.where(done, episode_steps, 0).astype(jnp.float32))
-    return sums
+    return {**sums, "episodes": jnp.sum(done.astype(jnp.float32))}
 
 
 def _means(sums: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
@@ -113,9 +116,9 @@ def _means(sums: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
     episodes = totals["episodes"]
     means = {}
     for name, total in totals.items():
-        if name in ("episodes", "diverged"):
+        if name in ("episodes", "diverged", "overflow"):
             means[name] = total
-        elif _at_episode_end(name) or name == "episode_length":
+        elif _per_episode(name):
             means[name] = jnp.where(episodes > 0, total / jnp.maximum(episodes, 1.0), jnp.nan)
         else:
             means[name] = total / samples

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import jax
+
+from mqe_jax.errors import InputError
 
 PyTree = Any
 Params = dict[str, Any]
@@ -12,13 +15,17 @@ Params = dict[str, Any]
 Memory = Any
 """Recurrent state: a pytree of arrays with leading axis N, or an empty one for networks without memory."""
 
+Teams = tuple[tuple[int, ...], ...]
+"""Agents of each team; every agent is in one."""
+
 
 class EnvState(Protocol):
     """The fields of a batched environment state that the learner reads; N environments of A agents.
 
     obs (N, A, O) is the input of the next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the
     state reached by the step, before any reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool;
-    metrics maps names to (N,), and every name is present from the reset on.
+    metrics maps names to (N,), and every name is present from the reset on. Metrics are averaged over steps, except
+    for outcomes of episodes (see `is_outcome`) and the counts `diverged` and `overflow`.
     """
 
     @property
@@ -43,7 +50,11 @@ class VectorEnv(Protocol):
     """N environments with automatic reset; `reset` and `step` are pure and may be jitted.
 
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with the fields
-    of `EnvState`.
+    of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to what it allows.
+
+    Optional attributes: `teams` (tuple of tuples of agents; one team by default): joint ratios and joint values are
+    per team. `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
+    which `curriculum.assistance` sets (see `replace_fields`).
     """
 
     @property
@@ -60,6 +71,31 @@ class VectorEnv(Protocol):
     def action_size(self) -> int: ...
     def reset(self, key: jax.Array) -> Any: ...
     def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
+def replace_fields(state: Any, **fields: jax.Array) -> Any:
+    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or with a `replace` of its own.
+
+    Raises:
+        InputError: for another kind of state.
+    """
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        return dataclasses.replace(state, **fields)
+    for method in ("_replace", "replace"):
+        if hasattr(state, method):
+            return getattr(state, method)(**fields)
+    kind = type(state).__name__
+    raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
+
+
+def teams_of(env: VectorEnv) -> Teams:
+    """Returns the environment's teams; one of all agents where it names none."""
+    return tuple(map(tuple, getattr(env, "teams", (range(env.num_agents),))))
+
+
+def is_outcome(metric: str) -> bool:
+    """Returns whether a metric describes an episode and counts on its last step, such as `success` or `team0/win`."""
+    return metric.startswith(("success", "team"))
 
 
 class NetworkMemory(NamedTuple):

@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 
 from mqe_jax.errors import InputError
-from mqe_jax.walk_policy import Params, _nested
+from mqe_jax.walk_policy import Params, nested_params
 
 
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
@@ -19,6 +19,9 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
     Returns:
         `{"0.weight": (out, in), "0.bias": (out,), ...}`.
+
+    Raises:
+        InputError: if the file is not such an archive.
     """
     from mqe_jax.walk.torchscript import read_state
 
@@ -32,4 +35,4 @@ def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) ->
     """Reads the official pair of TorchScript checkpoints into this package's weights."""
     flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
     flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}
-    return _nested(flat, f"{adaptation}, {body}")
+    return nested_params(flat, f"{adaptation}, {body}")

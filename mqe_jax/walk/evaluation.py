@@ -60,7 +60,7 @@ SCENARIOS = {
 
 
 def make_env(robot: Robot, impl: str, episodes: int) -> WalkEnv:
-    """Makes the evaluation environment: no randomisation, commands kept for the whole episode."""
+    """Returns the evaluation environment: no randomisation, commands kept for the whole episode."""
     task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
     return WalkEnv(robot, task, impl=impl, num_envs=episodes)
 

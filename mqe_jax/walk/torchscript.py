@@ -60,7 +60,7 @@ class _Unpickler(pickle.Unpickler):
             return dict
         if module == "torch.jit._pickle":
             return lambda value, *_: value
-        raise ValueError(f"holds {module}.{name}, which no network of linear layers needs")
+        raise ValueError(f"holds {module}.{name}, which a network of linear layers does not need")
 
     def persistent_load(self, pid: Any) -> np.ndarray:
         kind, dtype, key = pid[:3]
@@ -93,6 +93,6 @@ def read_state(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                 walk(value, f"{prefix}{name}.")
 
     if not isinstance(root, _Module):
-        raise ValueError("its root is no module")
+        raise ValueError("its root is not a module")
     walk(root, "")
     return state
