@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +25,7 @@ def dims(teams: tuple[tuple[int, ...], ...]) -> EnvDims:
     return EnvDims(agents=agents, observation=5, privileged=1, action=2, teams=teams, values=agents)
 
 
-def made(teams: tuple[tuple[int, ...], ...], **settings: object) -> tuple[Network, Params, jax.Array]:
+def made(teams: tuple[tuple[int, ...], ...], **settings: Any) -> tuple[Network, Params, jax.Array]:
     """A network with strong weights, so that every path counts, and observations (4, A, 5)."""
     network = Mat(gain=1.0, width=8, **settings).build(dims(teams))
     network = network._replace(init=jax.jit(network.init), act=jax.jit(network.act), evaluate=jax.jit(network.evaluate))

@@ -37,10 +37,10 @@ def settings(seed: int, **values: Any) -> TrainConfig:
     return override(build(TrainConfig, defaults), {name.replace("__", "."): value for name, value in values.items()})
 
 
-def assert_close(one: Any, other: Any, **tolerance: float) -> None:
+def assert_close(one: Any, other: Any, rtol: float = 1e-7, atol: float = 1e-5) -> None:
     """Compares two learner states, leaf by leaf."""
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(a, b, **tolerance)
+        np.testing.assert_allclose(a, b, rtol=rtol, atol=atol)
 
 
 class Stop(Exception):
@@ -65,7 +65,7 @@ def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path) -> None:
     (folders[1] / "checkpoints" / "step_000000000032.safetensors").unlink()  # killed between two seeds' checkpoints
     states = train_seeds(PROBE, configs, folders, resume=True)
     alone = train(PROBE, configs[1], tmp_path / "alone")
-    assert_close(states[1].params, alone.params, rtol=1e-4, atol=1e-5)
+    assert_close(states[1].params, alone.params, rtol=1e-4)
     assert int(states[1].updates) == 4
     together = (folders[1] / "metrics.csv").read_text().splitlines()
     assert len(together) == len((tmp_path / "alone" / "metrics.csv").read_text().splitlines()) == 5
@@ -81,7 +81,7 @@ def test_one_update_of_seeds_together_is_that_of_each_alone() -> None:
     states, metrics = jax.jit(jax.vmap(learner.update))(jax.vmap(init)(keys))
     for i, key in enumerate(keys):
         state, own = update(init(key))
-        assert_close(jax.tree.map(lambda x: x[i], states).params, state.params, atol=1e-5)  # noqa: B023
+        assert_close(jax.tree.map(lambda x: x[i], states).params, state.params)  # noqa: B023
         np.testing.assert_allclose(metrics["average_step_reward"][i], own["average_step_reward"], atol=1e-5)
 
 
