@@ -11,9 +11,9 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 pytho
   $(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
 # How many test files run side by side.
 TEST_JOBS ?= 2
-SOURCES := $(wildcard mqe_jax tests examples)
+SOURCES := $(wildcard mqe_jax tests examples tools)
 
-.PHONY: help install demo test check fmt clean system
+.PHONY: help install demo test soak check fmt clean system
 
 help: ## Say what the targets do
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -39,10 +39,15 @@ demo: $(STAMP) system ## Train Narrow Gate on the CPU, print before and after, l
 test: $(STAMP) ## Run the tests
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
 
+soak: $(STAMP) ## Run the heavy tests too (about an hour)
+	MQE_SOAK=1 $(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
+
 check: $(STAMP) ## Lint, formatting, types
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	$(BIN)/check-jsonschema --builtin-schema vendor.citation-file-format CITATION.cff
 
 fmt: $(STAMP) ## Format and fix what can be fixed
 	$(BIN)/ruff format $(SOURCES)

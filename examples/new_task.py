@@ -19,7 +19,6 @@ from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object
 from mqe_jax.planners import PLANNERS, scripted_policy
 from mqe_jax.planners.steering import Observation, go_to, pose
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
@@ -148,7 +147,7 @@ class Go1Catch(QuadrupedEnv):
 
     def scene(self) -> Scene:
         track = Track(blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1)
-        return Scene(track, num_robots=1, contacts=Contacts(object=("trunk", "foot")), objects=(Mouse("mouse"),))
+        return Scene(track, num_robots=1, objects=(Mouse("mouse"),))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Samples the mouse's initial position."""

@@ -6,6 +6,12 @@ GROUND_BIT, WALL_BIT, OBJECT_BIT = 1, 2, 4
 MAX_ROBOTS = 16
 
 
-def robot_bit(number: int) -> int:
-    """Returns the contype bit of robot `number`, which only other robots' shapes answer to: none touches itself."""
-    return 8 << number
+def robot_bits(number: int) -> tuple[int, int]:
+    """Returns (contype, conaffinity) of all shapes of robot `number`.
+
+    Its contype is a bit of its own; its conaffinity has the bits of ground, walls, objects and every other robot. So
+    robots collide with each other with all of their body and never with themselves.
+    """
+    first = 2 * OBJECT_BIT
+    own, robots = first << number, (first << MAX_ROBOTS) - first
+    return own, GROUND_BIT | WALL_BIT | OBJECT_BIT | (robots & ~own)

@@ -22,7 +22,7 @@ Color = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
-# Collides with ground, walls, other objects, and the robot parts listed in `Contacts.object`.
+# Collides with ground, walls, other objects and robots.
 _FREE = {"contype": OBJECT_BIT, "conaffinity": GROUND_BIT | WALL_BIT | OBJECT_BIT}
 # The same without the ground: bodies whose joints fix their height.
 _HELD = {"contype": OBJECT_BIT, "conaffinity": WALL_BIT | OBJECT_BIT}

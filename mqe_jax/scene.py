@@ -14,7 +14,6 @@ from mqe_jax import robots
 from mqe_jax.collision import MAX_ROBOTS
 from mqe_jax.errors import InputError
 from mqe_jax.objects import Object, ObjectIndex, index_objects
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import Robot
 from mqe_jax.terrain import Layout, Track, build_terrain
@@ -28,7 +27,7 @@ class Scene:
         track: ground, walls and spawn poses.
         num_robots: R.
         robot: all R of them.
-        contacts: which parts of the robots touch what.
+        contacts: set of the robots' collision shapes, one of `mqe_jax.robots.CONTACTS`.
         objects: movable and fixed objects, added after the robots.
         colors: of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty.
         friction: sliding friction of the robots' shapes and the ground.
@@ -44,7 +43,7 @@ class Scene:
     track: Track
     num_robots: int = 2
     robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
-    contacts: Contacts = dataclasses.field(default_factory=Contacts)
+    contacts: str = "full"
     objects: tuple[Object, ...] = ()
     colors: tuple[int, ...] = ()
     friction: float = 1.0
@@ -119,8 +118,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
         body = robots.build_robot(
             scene.robot,
             number,
-            scene.num_robots,
-            scene.contacts,
+            contacts=scene.contacts,
             visual=visual,
             friction=scene.friction,
             torque_control=number < scene.torque_robots,
@@ -129,7 +127,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
         spec.attach(body, prefix=robots.prefix(number), frame=spec.worldbody.add_frame())
     for item in scene.objects:
         item.add(spec, visual)
-    robots.add_sensors(spec, scene.robot, scene.num_robots, scene.contacts, feet=scene.foot_sensors)
+    robots.add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
     if visual:
         spec.worldbody.add_light(
             pos=(scene.track.length / 2, 0, 8),
@@ -152,7 +150,9 @@ def compile_scene(scene: Scene) -> CompiledScene:
     return CompiledScene(
         scene=scene,
         model=model,
-        index=robots.index_robots(model, scene.robot, scene.num_robots, scene.contacts, feet=scene.foot_sensors),
+        index=robots.index_robots(
+            model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors
+        ),
         objects=index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),

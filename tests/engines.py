@@ -59,7 +59,7 @@ def played(task: str, num_envs: int) -> dict[str, np.ndarray]:
     def advance(states: State, _: None) -> tuple[State, Any]:
         states = vector_env.step(states, plan(states.obs))
         robot_state = jax.vmap(env.read)(states.data)
-        touching = jnp.any(robot_state.touching, axis=(1, 2)) | jnp.any(robot_state.trunk_force > 1.0, axis=1)
+        touching = jnp.any(robot_state.trunk_force > 1.0, axis=1)
         busy = jnp.minimum(jnp.linalg.norm(states.data.qvel[:, rest], axis=-1), 1.0) + 2.0 * touching
         return states, (busy, {name: getattr(states.data, name) for name in STATE_FIELDS})
 

@@ -46,7 +46,7 @@ class FakeData:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FakeState:
-    """As the environments' State, for one world or (in FakeVectorEnv) many."""
+    """As the environments' State, for one environment or (in FakeVectorEnv) many."""
 
     data: FakeData
     obs: jax.Array
@@ -85,6 +85,7 @@ class FakeEnv:
         )
         zero = jnp.zeros(())
         metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
+        metrics["overflow"] = zero
         obs = data.qpos[self.robot_x][:, None]
         return FakeState(data, obs, obs[:, 0], obs, obs[:, 0], jnp.zeros(2), false, false, metrics, key, jnp.int32(0))
 
@@ -99,6 +100,7 @@ class FakeEnv:
             "average_step_reward": total,
             "success": jnp.all(obs > 1.2).astype(jnp.float32),
             "diverged": jnp.zeros(()),
+            "overflow": (qpos[0] > 1.21).astype(jnp.float32),
         }
         end = state.step >= 9
         reward = jnp.full(2, total)
@@ -108,7 +110,7 @@ class FakeEnv:
 
 
 class FakeVectorEnv:
-    """`FakeEnv` in `num_envs` worlds that start anew when they end."""
+    """`num_envs` of `FakeEnv` with automatic reset."""
 
     def __init__(self, env: Any, num_envs: int) -> None:
         self.env, self.num_envs = env, num_envs

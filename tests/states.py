@@ -73,7 +73,6 @@ def robot_state(position: Any, **euler: Any) -> RobotState:
         joints,
         jnp.zeros((2, 12)),
         jnp.zeros(2),
-        jnp.zeros((2, 2), bool),
     )
 
 

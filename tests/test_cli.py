@@ -8,9 +8,16 @@ import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import cli
-from mqe_jax.cli import arguments, commands
+from mqe_jax.cli import arguments, commands, setup
+from mqe_jax.envs import QuadrupedEnv
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
+
+
+def replace_make_env(patch: pytest.MonkeyPatch, make_env: Any) -> None:
+    """Replaces the function that makes environments, for training and for the other commands."""
+    for module in (setup, commands):
+        patch.setattr(module, "make_env", make_env)
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +32,7 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         env = FakeEnv()
         return env, FakeVectorEnv(env, num_envs)
 
-    monkeypatch.setattr(commands, "make_env", make_env)
+    replace_make_env(monkeypatch, make_env)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +41,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "fake"
     patch = pytest.MonkeyPatch()
     env = FakeEnv()
-    patch.setattr(commands, "make_env", lambda task, impl, overrides, n, copies=1: (env, FakeVectorEnv(env, n)))
+    replace_make_env(patch, lambda task, impl, overrides, n, copies=1: (env, FakeVectorEnv(env, n)))
     assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     patch.undo()
     return folder
@@ -84,6 +91,36 @@ def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]
     assert result["average_step_reward"] == pytest.approx(0.05)
 
 
+def test_dropped_contacts_are_counted_and_warned_of(capfd: pytest.CaptureFixture[str]) -> None:
+    command = ["eval", "fake", "--json", "--episodes", "2", "--planner"]
+    assert cli.main([*command, "forward"]) == 0  # two steps of each episode beyond x = 1.21 m
+    out, err = capfd.readouterr()
+    assert json.loads(out)["overflow"] == 4
+    assert [line for line in err.splitlines() if "dropped contacts in 4 environment steps" in line]
+    assert cli.main([*command, "idle"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out)["overflow"] == 0 and "dropped" not in err
+
+
+def test_a_divergence_is_recorded_and_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.19)  # in the tenth step of 0.02 s
+    monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
+    task = ["go1gate", "--impl", "c", "--control", "position", "--planner", "random", "--json"]
+    folder = ["--dump-diverged", str(tmp_path / "dump")]
+    assert cli.main(["eval", *task, "--episodes", "2", "--num-envs", "2", *folder]) == 0
+    out, err = capfd.readouterr()
+    files = sorted((tmp_path / "dump").iterdir())
+    assert json.loads(out)["diverged"] == 2 and "mqe replay" in err
+    assert files[0].name == "diverged_0000.npz"
+    clip = tmp_path / "clip.png"
+    assert cli.main(["replay", str(files[0]), "-o", str(clip), "--json"]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["steps"] == result["diverged_after"] == 10 and result["first_step"] == 0
+    assert clip.stat().st_size > 500
+
+
 def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     table = tmp_path / "speed.csv"
     result: dict[str, Any] = {}
@@ -92,7 +129,7 @@ def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest
         assert cli.main(arguments) == 0
         result = json.loads(capfd.readouterr().out)
     figures = ["task", "impl", "num_envs", "env_steps_per_s", "bare_env_steps_per_s", "ratio", "compile_s"]
-    assert list(result)[:7] == figures
+    assert list(result)[:7] == figures and result["overflow"] >= 0
     assert len(table.read_text().splitlines()) == 3
 
 
@@ -117,7 +154,7 @@ BAD = {
         ["gate_width", "'wide'", "number"],
     ),
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
-    "worlds": (["bench", "go1gate", "--num-envs", "0"], ["num_envs", "0"]),
+    "environments": (["bench", "go1gate", "--num-envs", "0"], ["num_envs", "0"]),
     "episodes": (["eval", "fake", "--episodes", "0"], ["episodes", "0", "at least 1"]),
     "planner": (["eval", "fake", "--planner", "randm"], ["'randm'", "random"]),
     "no scripted planner": (["eval", "fake", "--planner", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
@@ -136,6 +173,7 @@ BAD = {
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .gif, .png"]),
     "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
+    "recording": (["replay", "none.npz"], ["none.npz"]),
     "weights": (["walk", "eval", "--weights", "none.safetensors"], ["none.safetensors"]),
     "checkpoint": (["walk", "convert", "a.jit", "b.jit", "-o", "w.safetensors"], ["a.jit"]),
 }

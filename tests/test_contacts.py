@@ -47,17 +47,17 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     if name == "seesaw":  # onto its near end
         place += [-1.6, 0.0, 0.15]
     angle = 2 * np.pi * np.arange(robots) / robots
-    data.qpos[index.base_qpos[:, 0]] = place[0] + REACH.get(name, 0.3) * np.cos(angle)
-    data.qpos[index.base_qpos[:, 1]] = place[1] + REACH.get(name, 0.3) * np.sin(angle)
-    data.qpos[index.base_qpos[:, 2]] = place[2]
+    data.qpos[index.base_qpos[:, 0]] = place[0] + REACH.get(name, 0.15) * np.cos(angle)
+    data.qpos[index.base_qpos[:, 1]] = place[1] + REACH.get(name, 0.15) * np.sin(angle)
+    data.qpos[index.base_qpos[:, 2]] = place[2] + 0.35 * np.arange(robots)  # one falls upon the other
     contacts, rows, touched = [], [], 0
     for _ in range(100):
-        data.ctrl[index.actuator] = env.robot.default_joints + 0.4 * random.standard_normal((robots, 12))
+        data.ctrl[index.actuator] = env.robot.default_joints + 0.2 * random.standard_normal((robots, 12))
         mujoco.mj_step(model, data, 4)
         contacts.append(data.ncon)
         rows.append(data.nefc)
         touched += bool(name and np.any(data.contact.geom == env.objects[name].geom))
-    assert max(contacts) >= 4 * robots - 2, "nobody touches anything: the scene is not crowded"
+    assert max(contacts) >= 2 * robots, "nobody touches anything: the scene is not crowded"
     assert not name or touched >= 10, f"{name} was touched in {touched} of 100 steps: nobody is at it"
     assert max(contacts) <= env.params.contacts_per_robot * robots
     assert max(rows) <= env.params.constraints_per_robot * robots

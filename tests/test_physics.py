@@ -110,8 +110,8 @@ def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> N
 
 
 @pytest.mark.parametrize("impl", IMPLS)
-def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
-    """Two robots that overlap touch each other; a robot lying on its belly feels the ground."""
+def test_trunk_force_is_read(impl: str) -> None:
+    """Two robots that overlap feel each other; a robot lying on its belly feels the ground."""
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
     state = env.reset(jax.random.PRNGKey(0))
     index = env.index
@@ -122,9 +122,7 @@ def test_trunk_force_and_robot_contact_are_read(impl: str) -> None:
     ctrl = jnp.asarray(state.data.ctrl)
     after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)))(both)
     robot_state = jax.vmap(env.read)(after)
-    assert bool(robot_state.touching[0, 0, 1]) and bool(robot_state.touching[0, 1, 0])
     assert float(robot_state.trunk_force[0].min()) > 1.0
-    assert not bool(robot_state.touching[1].any())
     assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
 
 

@@ -22,7 +22,7 @@ def env() -> FakeEnv:
 @pytest.fixture(scope="module")
 def episode(env: FakeEnv) -> recording.Episode:
     act = planner("forward", env)
-    return recording.record(env, act, (), jax.random.PRNGKey(0), worlds=2, seconds=1.0)[1]
+    return recording.record(env, act, (), jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
 
 
 def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, episode: recording.Episode) -> None:

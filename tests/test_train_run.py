@@ -28,7 +28,9 @@ from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.policy import load_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
+from mqe_jax.train.types import Trace
 
+KEY = jax.random.PRNGKey(0)
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 
 
@@ -239,6 +241,30 @@ def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, Train
     assert newest is not None
     with pytest.raises(ValueError, match="holds a checkpoint; a policy is needed"):
         load_policy(newest)
+
+
+class Traces:
+    """A recorder that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.all: list[Trace] = []
+
+    def snapshot(self, env_state: Any) -> Any:
+        return env_state.hidden
+
+    def add(self, trace: Trace) -> None:
+        self.all.append(trace)
+
+
+def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
+    training, evaluation = Traces(), Traces()
+    train(PROBE, settings(), tmp_path, recorder=training)
+    assert len(training.all) == 5 and training.all[0].snapshot.shape == (4, 4)
+    assert training.all[0].action.shape == (4, 4, 2, 1) and training.all[0].diverged.shape == (4, 4)
+    evaluate(
+        PROBE, load_policy(tmp_path).act, 4, KEY, memory=load_policy(tmp_path).initial_memory(4), recorder=evaluation
+    )
+    assert evaluation.all[0].snapshot.shape == (50, 4)
 
 
 TREE = {

@@ -32,7 +32,7 @@ First steps:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "bench", "demo", "walk", "sweep", "report")
+COMMANDS = ("tasks", "train", "eval", "render", "replay", "bench", "demo", "walk", "sweep", "report")
 Repeated = tyro.conf.UseAppendAction
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
@@ -82,6 +82,16 @@ TaskRobot = Annotated[
 ]
 
 
+DumpDiverged = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="FOLDER",
+        help="Record the last 64 steps of environments whose physics diverges there (see `mqe replay`). "
+        "Keeps the states of two rollouts in memory.",
+    ),
+]
+
+
 @dataclass(frozen=True)
 class Tasks:
     """List the tasks with their agents, observation and action sizes, and time limits."""
@@ -114,6 +124,7 @@ class Train:
     control: Control = None
     robot: TaskRobot = None
     set: Set = field(default_factory=list)
+    dump_diverged: DumpDiverged = None
     settings: Annotated[Any, tyro.conf.Suppress] = None
 
     def run(self) -> dict[str, Any] | None:
@@ -145,6 +156,7 @@ class Eval:
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Folder of the run whose policy is used. Default: the run given."""
     set: Set = field(default_factory=list)
+    dump_diverged: DumpDiverged = None
 
     def run(self) -> dict[str, Any] | None:
         return _commands().evaluate(self)
@@ -183,6 +195,22 @@ class Render:
 
     def run(self) -> dict[str, Any] | None:
         return _commands().render(self)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Step a recording of a divergence again, and render it on request."""
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """Recording that `--dump-diverged` wrote (.npz)."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """Clip or picture to write: .mp4, .gif or .png."""
+    impl: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Engine: jax, warp or c. Default: the recorded one."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any] | None:
+        return _commands().replay(self)
 
 
 @dataclass(frozen=True)
@@ -257,7 +285,7 @@ class Report:
 
 @dataclass(frozen=True)
 class WalkTrain:
-    """Train the walk policy's weights from scratch (GPU)."""
+    """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
     """Folder of the run: weights, curve, checkpoints."""
@@ -269,6 +297,12 @@ class WalkTrain:
     """PPO updates of 24 steps."""
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time limit, after which the training stops with everything saved, s."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to fine-tune, also of another robot. Default: from scratch."""
+    initial_std: float = 1.0
+    """Standard deviation of the actions at the start."""
+    curriculum: int = 400
+    """Iterations over which slopes, forces and kicks grow to their full size."""
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1
@@ -340,6 +374,7 @@ def _parser(wanted: Sequence[str]) -> Any:
         Annotated[train, subcommand("train", description=Train.__doc__)],
         Annotated[Eval, subcommand("eval")],
         Annotated[Render, subcommand("render")],
+        Annotated[Replay, subcommand("replay")],
         Annotated[Bench, subcommand("bench")],
         Annotated[Demo, subcommand("demo")],
         Annotated[Walk, subcommand("walk")],

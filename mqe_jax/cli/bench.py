@@ -1,8 +1,9 @@
-"""Throughput: environment steps per second with walk policy and resets, and of the bare physics."""
+"""Throughput: environment steps per second with walk policy and resets, and of the physics alone."""
 
 from __future__ import annotations
 
 import csv
+import io
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -14,12 +15,14 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
+from mqe_jax.files import write_atomically
+from mqe_jax.settings import fail
 
 
-def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, float]:
-    """Returns (seconds of the first call, which compiles; median seconds of `repeats` further calls).
+def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, float, Any]:
+    """Returns the seconds of the first call, which compiles, the median seconds of `repeats` further ones, the state.
 
-    `run(state) -> state`; every call goes on from the last one's state and is waited for.
+    `run(state) -> state`; each call continues from the previous state and is synchronised.
     """
     began = time.perf_counter()
     state = jax.block_until_ready(run(state))
@@ -29,7 +32,7 @@ def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, f
         began = time.perf_counter()
         state = jax.block_until_ready(run(state))
         seconds.append(time.perf_counter() - began)
-    return first, median(seconds)
+    return first, median(seconds), state
 
 
 def bench(
@@ -37,37 +40,39 @@ def bench(
 ) -> dict[str, str | int | float]:
     """Measures one task on one engine.
 
-    An environment step is one step of one world. `env_steps_per_s` has everything in it: control, walk
-    policy, 4 physics steps, observations, rewards, resets of the worlds that end, under random actions drawn
-    inside the same scan. `bare_env_steps_per_s` is the same scene and number of physics steps under a
-    constant control, without policy, reward and resets. `compile_s` is what the first full call took beyond
-    a usual one.
+    An environment step is one step of one environment. `env_steps_per_s` includes everything: control, walk policy,
+    physics steps, observations, rewards and automatic resets, under random actions sampled inside the same scan.
+    `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without policy, reward
+    and resets. `compile_s` is the first call minus the median call. `overflow` counts the environment steps of one call
+    in which the engine may have dropped contacts or constraints.
     """
     for name, value in (("steps", steps), ("repeats", repeats)):
         if value < 1:
-            raise InputError(f"{name}: {value} is not allowed; it must be at least 1")
+            fail(name, value, "at least 1")
     count, agents, width = vector_env.num_envs, env.num_agents, env.action_size
 
     @jax.jit
-    def full(carry: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
-        def one(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:
+    def full(carry: tuple[Any, jax.Array, jax.Array]) -> tuple[Any, jax.Array, jax.Array]:
+        def one(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], jax.Array]:
             state, key = carry
             key, action_key = jax.random.split(key)
             action = jax.random.uniform(action_key, (count, agents, width), minval=-1.0, maxval=1.0)
-            return (vector_env.step(state, action), key), None
+            state = vector_env.step(state, action)
+            return (state, key), jnp.sum(state.metrics["overflow"])
 
-        return jax.lax.scan(one, carry, None, steps)[0]
+        (state, key), overflow = jax.lax.scan(one, carry[:2], None, steps)
+        return state, key, jnp.sum(overflow)
 
     state = jax.block_until_ready(jax.jit(vector_env.reset)(key))
-    first, full_s = timed(full, (state, key), repeats)
+    first, full_s, (_, _, overflow) = timed(full, (state, key, jnp.zeros(())), repeats)
 
     @jax.jit
     def bare(data: Any) -> Any:
         step = jax.vmap(lambda d: env.physics.step(d, d.ctrl))
         return jax.lax.scan(lambda d, _: (step(d), None), data, None, steps)[0]
 
-    # A fresh reset: the robots stand or fall under the control that the reset wrote.
-    _, bare_s = timed(bare, jax.tree.map(jnp.copy, state.data), repeats)
+    # From a reset: the robots stand or fall under the constant control that it set.
+    _, bare_s, _ = timed(bare, jax.tree.map(jnp.copy, state.data), repeats)
     full_rate, bare_rate = count * steps / full_s, count * steps / bare_s
     return {
         "task": vector_env.name,
@@ -77,13 +82,14 @@ def bench(
         "bare_env_steps_per_s": round(bare_rate, 1),
         "ratio": round(full_rate / bare_rate, 4),
         "compile_s": round(max(first - full_s, 0.0), 2),
+        "overflow": round(float(overflow)),
         "device": device_name(),
         "jax": jax.__version__,
     }
 
 
 def device_name() -> str:
-    """The hardware that JAX runs on, in words: the GPU's name, or the number of CPU cores."""
+    """Returns the name of the GPU, or the number of CPU cores."""
     device = jax.devices()[0]
     if device.platform != "cpu":
         return device.device_kind
@@ -92,7 +98,7 @@ def device_name() -> str:
 
 
 def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a CSV file, written whole; InputError where the file has other columns."""
+    """Appends a row to a CSV file, written atomically; InputError where the file has other columns."""
     rows: list[dict[str, Any]] = []
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:
@@ -101,12 +107,8 @@ def append_csv(path: Path, row: Mapping[str, Any]) -> None:
                 raise InputError(f"csv: {path} has other columns; it must have {', '.join(row)}")
             rows = list(reader)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(row), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows([*rows, row])
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(row), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([*rows, row])
+    write_atomically(path, text.getvalue().encode())

@@ -1,4 +1,4 @@
-"""Implementations of the subcommands, imported when one of them runs."""
+"""Implementations of the subcommands, imported lazily."""
 
 from __future__ import annotations
 
@@ -7,33 +7,36 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from mqe_jax.cli import bench as benchmark
-from mqe_jax.cli.arguments import Bench, Eval, Render, Tasks, Train
+from mqe_jax.cli.arguments import Bench, Eval, Render, Replay, Tasks, Train
 from mqe_jax.cli.flags import given
 from mqe_jax.cli.output import print_table, say
 from mqe_jax.cli.players import PLANNER_NAMES, Player
-from mqe_jax.cli.setup import make_env, parse_overrides, train_config
+from mqe_jax.cli.recorder import DivergenceRecorder
+from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
 from mqe_jax.envs import ALIASES, TASKS
+from mqe_jax.envs import replay as recordings
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import PLANNERS
-from mqe_jax.settings import override
+from mqe_jax.settings import fail, override
 from mqe_jax.train import evaluate as evaluation
-from mqe_jax.train import policy, runner
+from mqe_jax.train import runner
+from mqe_jax.train.policy import load_policy
 from mqe_jax.viz import curves, recording
 from mqe_jax.viz import render as rendering
 from mqe_jax.viz.clips import check_output
 
 
 def is_run(target: str) -> bool:
-    """Whether the argument is meant as a run's folder rather than as a task's id."""
+    """Returns whether RUN|TASK is the folder of a run."""
     return os.sep in target or Path(target).exists()
 
 
 def find_player(arguments: Eval | Render, default: str) -> Player:
-    """Reads RUN|TASK, --policy and --planner; `default` acts on a task where nobody is named."""
+    """Returns the player of RUN|TASK, --policy and --planner; `default` is the planner of a task without either."""
     target = arguments.target
-    given = _overrides(arguments)
     if arguments.planner is not None and arguments.policy is not None:
         raise InputError("planner: give --planner or --policy, not both")
     for flag, name, allowed in (
@@ -42,41 +45,51 @@ def find_player(arguments: Eval | Render, default: str) -> Player:
     ):
         if name is not None and name not in allowed:
             raise InputError(f"{flag}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}")
-    run = arguments.policy
+    task, overrides, run = ALIASES.get(target, target), _overrides(arguments), arguments.policy
     if is_run(target):
-        _check_run(target)
-        config = runner.load_run_config(target)
-        if config.task is None:
-            raise InputError(f"{target}: its {runner.CONFIG_FILE} names no task")
-        task, env_values = config.task, {**config.env, **given}
+        config = _run_config(target)
+        task, overrides = config.task, {**config.env, **overrides}
         run = Path(target) if run is None and arguments.planner is None else run
-    else:
-        task, env_values = ALIASES.get(target, target), given
     if run is not None:
-        return Player(task, env_values, policy.load_policy(run), arguments.opponent)
+        return Player(task, overrides, load_policy(run), arguments.opponent)
     if default == "scripted" and task not in PLANNERS:
         default = "forward"
-    return Player(task, env_values, arguments.planner or default, arguments.opponent)
+    return Player(task, overrides, arguments.planner or default, arguments.opponent)
 
 
 def _overrides(arguments: Train | Eval | Render | Bench) -> dict[str, Any]:
-    """Task parameters given by --set, --control and --robot."""
+    """Returns the task parameters given by --set, --control and --robot."""
     flags = {"control": arguments.control, "robot": arguments.robot}
     return parse_overrides(arguments.set) | {name: value for name, value in flags.items() if value is not None}
 
 
-def _check_run(target: str) -> None:
+def _run_config(target: str) -> Any:
+    """Returns the settings of a run's folder."""
     if not Path(target).is_dir():
         raise InputError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
-        raise InputError(f"run: {target!r} holds no {runner.CONFIG_FILE}; it is not the folder of a training")
+        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not the folder of a training")
+    config = runner.load_run_config(target)
+    if config.task is None:
+        raise InputError(f"{target}: {runner.CONFIG_FILE} has no 'task' entry")
+    return config
+
+
+def _recorder(env: Any, folder: Path | None) -> DivergenceRecorder | None:
+    return None if folder is None else DivergenceRecorder(env, folder)
+
+
+def _say_recorded(recorder: DivergenceRecorder | None) -> None:
+    if recorder is not None and recorder.written:
+        first = recorder.written[0]
+        say(f"mqe: recorded {len(recorder.written)} divergences; step the first again with: mqe replay {first}")
 
 
 def tasks(arguments: Tasks) -> dict[str, Any] | None:
-    """Lists the tasks, each from an environment made with its own parameters."""
+    """Lists the tasks with their default parameters."""
     rows = []
     for name, task in TASKS.items():
-        env = task(control="position", num_envs=1)  # the same sizes, without reading the walk policy
+        env = task(control="position", num_envs=1)  # the same sizes, without loading the walk policy
         rows.append(
             {
                 "task": name,
@@ -100,72 +113,107 @@ def tasks(arguments: Tasks) -> dict[str, Any] | None:
 
 def train(arguments: Train) -> None:
     """Trains into the run folder."""
-    overrides = _overrides(arguments)
-    config = train_config(arguments.task, arguments.config, given(arguments.settings), overrides, arguments.algorithm)
+    config = train_config(
+        arguments.task, arguments.config, given(arguments.settings), _overrides(arguments), arguments.algorithm
+    )
     if arguments.num_seeds < 1:
-        raise InputError(f"num_seeds: {arguments.num_seeds} is not allowed; it must be at least 1")
+        fail("num_seeds", arguments.num_seeds, "at least 1")
     run_dir = arguments.run_dir or Path("runs") / arguments.task
     configs, folders = [config], [run_dir]
     if arguments.num_seeds > 1:
         configs = [override(config, {"seed": config.seed + i}) for i in range(arguments.num_seeds)]
         folders = [run_dir / f"seed{each.seed}" for each in configs]
-    _, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs, len(configs))
-    eval_env = None
-    if config.evaluation.every is not None:
-        episodes = config.evaluation.episodes
-        _, eval_env = make_env(arguments.task, arguments.impl, config.env, episodes, 2 * len(configs))
+    vector_env, eval_env = environments(arguments.impl, config, len(configs))
+    recorder = _recorder(vector_env.env, arguments.dump_diverged)
     try:
-        runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env)
+        runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
     except KeyboardInterrupt:
-        say(f"mqe: stopped; continue with the same command and --resume; the run is in {run_dir}")
+        say(f"mqe: stopped; resume with the same command and --resume; the run is in {run_dir}")
         raise
+    finally:
+        _say_recorded(recorder)
     curves.draw_curve(folders, run_dir / "curve.png", arguments.task)
-    example = folders[0]
-    say(f"mqe: {run_dir} holds policy, metrics.csv and curve.png; evaluate with: mqe eval {example}")
+    say(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 
 
 def evaluate(arguments: Eval) -> dict[str, Any]:
-    """Measures a policy and prints a table, or gives the object for `--json`."""
+    """Evaluates a policy; prints a table, or returns the object for `--json`."""
     if arguments.episodes < 1:
-        raise InputError(f"episodes: {arguments.episodes} is not allowed; it must be at least 1")
+        fail("episodes", arguments.episodes, "at least 1")
     player = find_player(arguments, "random")
     num_envs = min(arguments.num_envs, arguments.episodes)
     env, vector_env = make_env(player.task, arguments.impl, player.overrides, num_envs)
+    recorder = _recorder(env, arguments.dump_diverged)
     result = evaluation.evaluate(
         vector_env,
         player.act(env, arguments.deterministic),
         arguments.episodes,
         jax.random.PRNGKey(arguments.seed),
         memory=player.memory(num_envs),
-    ).to_dict()
+        recorder=recorder,
+    )
+    _say_recorded(recorder)
+    if result.overflow:
+        say(
+            f"mqe: warning: the engine may have dropped contacts in {result.overflow} environment steps; "
+            "raise --set contacts_per_robot and --set constraints_per_robot"
+        )
+    if not arguments.json:
+        print_table(result.to_dict())
+    return result.to_dict()
+
+
+def replay(arguments: Replay) -> dict[str, Any]:
+    """Steps a recording again; prints a table, or returns the object for `--json`."""
+    if arguments.output is not None:
+        check_output(arguments.output)
+    recorded = recordings.load_recording(arguments.file)
+    env = recorded.make_env(arguments.impl)
+    states = recordings.replay(recorded, env)
+    diverged = np.flatnonzero(np.asarray(states.metrics["diverged"]))
+    speed = np.abs(np.asarray(states.data.qvel)).max(axis=1)
+    result = {
+        "task": recorded.task,
+        "impl": env.impl,
+        "steps": len(recorded.actions),
+        "first_step": int(recorded.states["step"][0]),
+        "diverged_after": int(diverged[0]) + 1 if len(diverged) else None,
+        "max_speed_before": float(np.nanmax(speed[:-1])) if len(speed) > 1 else None,
+        "max_speed": float(np.nanmax(speed)) if np.any(np.isfinite(speed)) else None,
+    }
+    if arguments.output is not None:
+        finite = np.all(np.isfinite(recorded.states["data/qpos"]), axis=1)
+        qpos, position, turn = (recorded.states[f"data/{name}"][finite] for name in ("qpos", "mocap_pos", "mocap_quat"))
+        rendering.render_episode(env, recording.Episode(qpos, position, turn, env.dt), arguments.output)
+        say(f"mqe: wrote {arguments.output}")
     if not arguments.json:
         print_table(result)
     return result
 
 
 def render(arguments: Render) -> None:
-    """Draws an episode into a file."""
+    """Renders an episode to a file."""
     for name, value in (("best_of", arguments.best_of), ("seconds", arguments.seconds)):
         if not value > 0:
-            raise InputError(f"{name}: {value} is not allowed; it must be greater than 0")
+            fail(name, value, "greater than 0")
     for name, value in (("width", arguments.width), ("fps", arguments.fps)):
         if value is not None and not 0 < value <= 4096:
-            raise InputError(f"{name}: {value} is not allowed; it must be between 1 and 4096")
+            fail(name, value, "between 1 and 4096")
     check_output(arguments.output)
     player = find_player(arguments, "scripted")
     env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
-    drawn_by = draw(
+    renderer = draw(
         env,
         player,
         arguments.output,
         seed=arguments.seed,
-        worlds=arguments.best_of,
+        episodes=arguments.best_of,
         seconds=arguments.seconds,
         deterministic=not arguments.sample,
         size=None if arguments.width is None else (arguments.width, round(arguments.width * 9 / 32) * 2),
         fps=arguments.fps,
     )
-    say(f"mqe: wrote {arguments.output} ({drawn_by})")
+    say(f"mqe: wrote {arguments.output} ({renderer})")
 
 
 def draw(
@@ -174,20 +222,20 @@ def draw(
     path: Path,
     *,
     seed: int,
-    worlds: int = 1,
+    episodes: int = 1,
     seconds: float = 20.0,
     deterministic: bool = True,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
 ) -> str:
-    """Plays `worlds` episodes and draws the best one; returns what drew it."""
-    act, memory = player.act(env, deterministic), player.memory(worlds)
-    episodes = recording.record(env, act, memory, jax.random.PRNGKey(seed), worlds=worlds, seconds=seconds)
-    return rendering.render_episode(env, recording.best(episodes), path, size=size, fps=fps)
+    """Runs `episodes` episodes and renders the best one; returns the name of the renderer."""
+    act, memory = player.act(env, deterministic), player.memory(episodes)
+    recorded = recording.record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
+    return rendering.render_episode(env, recording.best(recorded), path, size=size, fps=fps)
 
 
 def bench(arguments: Bench) -> dict[str, Any]:
-    """Measures throughput and prints a table, or gives the object for `--json`."""
+    """Measures throughput; prints a table, or returns the object for `--json`."""
     overrides = _overrides(arguments)
     env, vector_env = make_env(arguments.task, arguments.impl, overrides, arguments.num_envs)
     key = jax.random.PRNGKey(arguments.seed)

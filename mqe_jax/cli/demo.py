@@ -28,26 +28,26 @@ DEMO_TASK = "go1gate"
 
 
 def demo(arguments: Demo) -> None:
-    """Trains from scratch, measures before and after, draws curve and video; goes on where it stopped."""
+    """Trains from scratch, evaluates before and after, writes curve and video; resumes an interrupted run."""
     began, run_dir = time.perf_counter(), arguments.run_dir
     config = train_config(DEMO_TASK, arguments.config)
     check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
     _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)
-    size = f"{config.num_envs} worlds, {config.total_steps / 1e6:g} M steps"
+    size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     say(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
     untrained = make_learner(vector_env, config)
     state = jax.jit(untrained.init)(runner.initial_key(config))
     before = policy.policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
     del state
-    say("mqe demo: measuring the untrained policy")
+    say("mqe demo: evaluating the untrained policy")
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
     try:
         runner.train(training_env, config, run_dir, resume=True)
     except KeyboardInterrupt:
-        say("mqe: stopped; the same command goes on from here")
+        say("mqe: stopped; the same command resumes from here")
         raise
     after = policy.load_policy(run_dir)
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
@@ -58,23 +58,23 @@ def demo(arguments: Demo) -> None:
         check_output(video)
     except InputError:
         video = run_dir / "video.gif"
-    say("mqe demo: drawing an episode")
+    say("mqe demo: rendering an episode")
     draw(
         env,
         Player(DEMO_TASK, dict(config.env), after),
         video,
         seed=config.seed + 1,
-        worlds=16,
+        episodes=16,
         size=(640, 360),
     )
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
-    print(f"took {(time.perf_counter() - began) / 60:.1f} minutes; measure it again with: mqe eval {run_dir}")
+    print(f"took {(time.perf_counter() - began) / 60:.1f} minutes; evaluate it again with: mqe eval {run_dir}")
 
 
 def _measure(env: VectorEnv, policy: policy.Policy, episodes: int, config: TrainConfig) -> dict[str, Any]:
-    """Evaluates a policy on its mean actions."""
+    """Evaluates a policy with its mean actions."""
 
     def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         return policy.act(obs, memory, key, deterministic=True)
@@ -85,7 +85,7 @@ def _measure(env: VectorEnv, policy: policy.Policy, episodes: int, config: Train
 
 
 def _summary(result: Mapping[str, Any]) -> str:
-    """One line of the figures that a person looks for."""
+    """Returns the main figures in one line."""
     parts = [f"both robots through {result['success_rate']:.0%}"]
     if "success/one" in result:
         parts.append(f"at least one {result['success/one']:.0%}")

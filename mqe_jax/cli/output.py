@@ -1,4 +1,4 @@
-"""What commands print."""
+"""Output of the commands."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 
 
 def say(text: str) -> None:
+    """Prints a line to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def print_table(values: Mapping[str, Any]) -> None:
-    """Prints names and numbers below each other."""
+    """Prints one name and value per line."""
     flat = {}
     for name, value in values.items():
         flat.update({f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value})

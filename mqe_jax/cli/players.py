@@ -1,4 +1,4 @@
-"""Who acts in an evaluation or a clip: a trained policy, a planner or something simpler, and the opponent."""
+"""Policies for evaluation and rendering: trained, scripted or trivial, and the opponent in a match."""
 
 from __future__ import annotations
 
@@ -12,68 +12,44 @@ import jax.numpy as jnp
 from mqe_jax.envs import TaskParams
 from mqe_jax.errors import InputError
 from mqe_jax.planners import scripted_policy
-from mqe_jax.train import policy
+from mqe_jax.train.evaluate import Act
+from mqe_jax.train.policy import Policy
 
 PLANNER_NAMES = ("scripted", "random", "idle", "forward")
-
-Act = Callable[[jax.Array, Any, jax.Array], tuple[jax.Array, Any]]
-
-
-def against(act: Act, opponent: Act, env: Any) -> Act:
-    """Lets `act` play team 0 and `opponent`, which remembers nothing, team 1."""
-    second = jnp.asarray([agent in env.teams[1] for agent in range(env.num_agents)])[:, None]
-
-    def both(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        own_key, other_key = jax.random.split(key)
-        action, memory = act(obs, memory, own_key)
-        return jnp.where(second, opponent(obs, (), other_key)[0], action), memory
-
-    return both
-
-
-def planner(name: str, env: Any) -> Act:
-    """What acts without training; `act` as in `evaluate`. InputError where the task has no scripted planner."""
-    shape = (env.num_agents, env.action_size)
-    plan = _scripted(env) if name == "scripted" else None
-
-    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        if plan is not None:
-            return plan(obs), memory
-        if name == "random":
-            return jax.random.uniform(key, (len(obs), *shape), minval=-1.0, maxval=1.0), memory
-        action = jnp.zeros((len(obs), *shape))
-        return (action.at[..., 0].set(0.25) if name == "forward" else action), memory
-
-    return act
-
-
-def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
-    """The task's planner for a batch of worlds: observations (N, A, O) to actions (N, A, 3)."""
-    plan = scripted_policy(env)
-    if env.control != "command":
-        raise InputError(f"planner: 'scripted' gives walk commands; control must be 'command', not {env.control!r}")
-    if tuple(env.params.commands) != TaskParams.commands:
-        raise InputError(f"commands: {env.params.commands}; planner 'scripted' gives {TaskParams.commands}")
-    return jax.vmap(plan)
 
 
 @dataclasses.dataclass(frozen=True)
 class Player:
-    """Who acts on what: a task with its parameters, and a trained policy or a planner's name."""
+    """A task with its parameters, and the policy that plays it.
+
+    Attributes:
+        task: id of the task.
+        overrides: of the task's parameters.
+        policy: trained policy, or one of `PLANNER_NAMES`.
+        opponent: of team 1 in a match: one of `PLANNER_NAMES`, or self; None is idle.
+    """
 
     task: str
     overrides: dict[str, Any]
-    policy: policy.Policy | str
+    policy: Policy | str
     opponent: str | None = None
 
     def act(self, env: Any, deterministic: bool) -> Act:
-        """The batched `act`, against the opponent in a match; InputError where it does not fit the task."""
+        """Returns the batched `act` of all agents.
+
+        Raises:
+            InputError: where the policy or the opponent does not fit the task.
+        """
         act = self._own_act(env, deterministic)
         if self.opponent is not None and len(env.teams) < 2:
-            raise InputError(f"opponent: {self.task} is no match; leave --opponent out")
+            raise InputError(f"opponent: {self.task} is not a competitive task; omit --opponent")
         if len(env.teams) < 2 or self.opponent == "self":
             return act
         return against(act, planner(self.opponent or "idle", env), env)
+
+    def memory(self, num_envs: int) -> Any:
+        """Returns the policy's memory at an episode's start."""
+        return () if isinstance(self.policy, str) else self.policy.initial_memory(num_envs)
 
     def _own_act(self, env: Any, deterministic: bool) -> Act:
         if isinstance(self.policy, str):
@@ -91,6 +67,40 @@ class Player:
 
         return act
 
-    def memory(self, num_envs: int) -> Any:
-        """What the policy remembers at an episode's start."""
-        return () if isinstance(self.policy, str) else self.policy.initial_memory(num_envs)
+
+def against(act: Act, opponent: Act, env: Any) -> Act:
+    """Returns `act` for team 0 with `opponent`, which has no memory, for team 1."""
+    second = jnp.asarray([agent in env.teams[1] for agent in range(env.num_agents)])[:, None]
+
+    def both(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        own_key, other_key = jax.random.split(key)
+        action, memory = act(obs, memory, own_key)
+        return jnp.where(second, opponent(obs, (), other_key)[0], action), memory
+
+    return both
+
+
+def planner(name: str, env: Any) -> Act:
+    """Returns the `act` of an untrained policy; InputError where the task has no scripted one."""
+    shape = (env.num_agents, env.action_size)
+    plan = _scripted(env) if name == "scripted" else None
+
+    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        if plan is not None:
+            return plan(obs), memory
+        if name == "random":
+            return jax.random.uniform(key, (len(obs), *shape), minval=-1.0, maxval=1.0), memory
+        action = jnp.zeros((len(obs), *shape))
+        return (action.at[..., 0].set(0.25) if name == "forward" else action), memory
+
+    return act
+
+
+def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
+    """Returns the task's scripted policy for a batch: observations (N, A, O) to actions (N, A, 3)."""
+    plan = scripted_policy(env)
+    if env.control != "command":
+        raise InputError(f"planner: 'scripted' outputs walk commands; control must be 'command', not {env.control!r}")
+    if tuple(env.params.commands) != TaskParams.commands:
+        raise InputError(f"commands: {env.params.commands}; planner 'scripted' outputs {TaskParams.commands}")
+    return jax.vmap(plan)

@@ -48,6 +48,15 @@ def make_env(
     return env, VectorEnv(env, num_envs, copies)
 
 
+def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[VectorEnv, VectorEnv | None]:
+    """Returns training and evaluation environments (None without evaluation) of seeds trained together."""
+    task = config.task or ""
+    _, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    if config.evaluation.every is None:
+        return env, None
+    return env, make_env(task, impl, config.env, config.evaluation.episodes, 2 * seeds)[1]
+
+
 def platform() -> str:
     """Returns the platform of JAX; raises an InputError where JAX_PLATFORMS names one that is missing."""
     try:

@@ -9,21 +9,12 @@ from typing import Any
 
 from mqe_jax.cli.arguments import Report, Sweep
 from mqe_jax.cli.output import say
-from mqe_jax.cli.setup import make_env, train_config
+from mqe_jax.cli.setup import environments, train_config
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.train.config import TrainConfig
-
-
-def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
-    """Returns training and evaluation environments (None without evaluation) of seeds trained together."""
-    task = config.task or ""
-    _, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
-    if config.evaluation.every is None:
-        return env, None
-    return env, make_env(task, impl, config.env, config.evaluation.episodes, 2 * seeds)[1]
 
 
 def sweep(arguments: Sweep) -> dict[str, Any]:

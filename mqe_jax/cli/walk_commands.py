@@ -14,16 +14,26 @@ from mqe_jax.train.checkpoint import prepare_folder
 
 def walk_train(arguments: WalkTrain) -> None:
     """Trains the walk policy into the run folder."""
-    from mqe_jax import robots
+    from mqe_jax import robots, walk_policy
     from mqe_jax.walk import training as walk
     from mqe_jax.walk.env import WalkEnv
 
-    for name in ("num_envs", "iterations"):
+    for name in ("num_envs", "iterations", "curriculum"):
         if getattr(arguments, name) < 1:
             raise InputError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
+    if not 0.0 < arguments.initial_std <= 10.0:
+        raise InputError(f"initial_std: {arguments.initial_std} is not allowed; it must be above 0 and at most 10")
+    robot = robots.get(arguments.robot)
+    policy = None if arguments.weights is None else walk_policy.load_params(robot, arguments.weights)
     prepare_folder(arguments.run_dir, arguments.resume, ("metrics.csv", "walk.safetensors"))
-    env: Any = WalkEnv(robots.get(arguments.robot), impl=arguments.impl, num_envs=arguments.num_envs)
-    config = walk.WalkConfig(num_envs=arguments.num_envs, iterations=arguments.iterations, seed=arguments.seed)
+    env: Any = WalkEnv(robot, impl=arguments.impl, num_envs=arguments.num_envs)
+    config = walk.WalkConfig(
+        num_envs=arguments.num_envs,
+        iterations=arguments.iterations,
+        initial_std=arguments.initial_std,
+        curriculum=arguments.curriculum,
+        seed=arguments.seed,
+    )
 
     def report(iteration: int, row: dict[str, float]) -> None:
         shown = ("reward", "episode_length", "kl", "difficulty")
@@ -36,6 +46,7 @@ def walk_train(arguments: WalkTrain) -> None:
             config,
             arguments.run_dir,
             resume=arguments.resume,
+            policy=policy,
             max_seconds=arguments.max_seconds,
             report=report,
         )

@@ -130,6 +130,7 @@ class QuadrupedEnv:
         self._scene = dataclasses.replace(
             scene,
             robot=self.robot,
+            contacts=self.params.contacts,
             friction=self.params.friction,
             solver_iterations=self.params.solver_iterations,
             torque_robots=torque_robots,

@@ -13,7 +13,6 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import Positive, Range, fail, record
@@ -102,8 +101,7 @@ class Go1Bridge(Duel):
         span = second - first - length
         deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
         track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
-        contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
-        return Scene(track, num_robots=2, contacts=contacts, objects=(*blocks, deck), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(*blocks, deck), colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """One robot on each platform, facing the bridge."""

@@ -15,7 +15,6 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.objects import Door
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
@@ -115,11 +114,9 @@ class Go1RevolvingDoor(Duel):
             inertia=params.door_inertia,
             damping=params.door_damping,
         )
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         return Scene(
             Track(blocks=blocks, width=params.track_width, wall_height=0.85),
             num_robots=2,
-            contacts=contacts,
             objects=(door,),
             colors=(0, 2),
         )

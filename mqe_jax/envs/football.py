@@ -19,7 +19,6 @@ from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.objects import Ball
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
@@ -83,9 +82,8 @@ class Football(QuadrupedEnv):
             wall_height=params.wall_height,
         )
         ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
         robots = len(self.kick_off)
-        return Scene(track, num_robots=robots, contacts=contacts, objects=(ball,), colors=self.colors)
+        return Scene(track, num_robots=robots, objects=(ball,), colors=self.colors)
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """The kick-off poses."""

@@ -14,7 +14,6 @@ from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, record
@@ -103,8 +102,7 @@ class Go1Gate(QuadrupedEnv):
         params = self.params
         gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
         track = Track(blocks=(SpawnArea(2.0), gate, Plane(1.0), EndWall()), width=params.track_width)
-        contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk", "foot"), object=())
-        return Scene(track, num_robots=2, contacts=contacts)
+        return Scene(track, num_robots=2)
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> GateState:
         return GateState(self.target_distance(robot_state))

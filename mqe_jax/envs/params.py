@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from mqe_jax import robots
 from mqe_jax.control import check_commands
 from mqe_jax.envs.randomization import Randomization
@@ -34,6 +36,8 @@ class TaskParams:
         actuator_network: weights file of an actuator network that replaces PD control; PD control if None.
         friction: sliding friction of robots and ground.
         solver_iterations: maximum solver iterations per physics step.
+        contacts: set of the robots' collision shapes: full, or minimal (trunk and feet), which is several times faster
+            on MJX-JAX and lets limbs pass through everything.
         contacts_per_robot: contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest
             contacts, and on average over all environments on Warp.
         constraints_per_robot: constraint buffer size per robot on Warp, per environment.
@@ -63,6 +67,7 @@ class TaskParams:
     actuator_network: str | None = None
     friction: Positive = 1.0
     solver_iterations: PositiveInt = 4
+    contacts: Literal["full", "minimal"] = "full"
     contacts_per_robot: PositiveInt = 12
     constraints_per_robot: PositiveInt = 64
     privileged_contact_forces: bool = False

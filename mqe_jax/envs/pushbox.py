@@ -13,7 +13,6 @@ from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.objects import Box
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
@@ -102,8 +101,7 @@ class Go1PushBox(QuadrupedEnv):
         gate = Gate(5.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(SpawnArea(2.0), gate, EndWall()), width=params.track_width)
         box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
-        contacts = Contacts(robot=("trunk", "foot"), object=("trunk", "foot", "calf"))
-        return Scene(track, num_robots=2, contacts=contacts, objects=(box,))
+        return Scene(track, num_robots=2, objects=(box,))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Samples the box's initial position."""

@@ -115,20 +115,21 @@ def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
     return run(start, jnp.asarray(recording.actions))
 
 
-def _content(state: State) -> dict[str, Any]:
+def content(state: State) -> dict[str, Any]:
+    """Returns the fields on which a step depends, those of `data` nested; any leading axes."""
     data = {name: getattr(state.data, name) for name in STATE_FIELDS}
     return {"data": data, **{name: getattr(state, name) for name in _FIELDS}}
 
 
 def _flat(state: State) -> dict[str, Any]:
-    leaves = jax.tree_util.tree_flatten_with_path(_content(state))[0]
+    leaves = jax.tree_util.tree_flatten_with_path(content(state))[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _restored(env: QuadrupedEnv, recording: Recording) -> State:
     """Returns the recording's first state on the engine of `env`."""
     blank = env.reset(jax.random.PRNGKey(0))
-    content = _content(blank)
+    fields = content(blank)
     leaves = []
     for name, leaf in _flat(blank).items():
         saved = recording.states.get(name)
@@ -136,6 +137,6 @@ def _restored(env: QuadrupedEnv, recording: Recording) -> State:
             found = "is missing" if saved is None else f"has shape {saved.shape[1:]}"
             raise InputError(f"recording of {recording.task}: {name} {found}; expected shape {leaf.shape}")
         leaves.append(jnp.asarray(saved[0], leaf.dtype))
-    content = jax.tree.unflatten(jax.tree.structure(content), leaves)
-    data = blank.data.replace(**content.pop("data"))
-    return dataclasses.replace(blank, data=data, **content)
+    fields = jax.tree.unflatten(jax.tree.structure(fields), leaves)
+    data = blank.data.replace(**fields.pop("data"))
+    return dataclasses.replace(blank, data=data, **fields)

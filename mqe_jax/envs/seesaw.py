@@ -14,7 +14,6 @@ from mqe_jax.envs.base import QuadrupedEnv, State
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Platform, Seesaw
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
@@ -139,8 +138,7 @@ class Go1Seesaw(QuadrupedEnv):
             "platform", center=params.platform, size=params.platform_size, column=params.platform_column
         )
         # Plank and platform collide as ground.
-        contacts = Contacts(ground=("trunk", "foot"), wall=("trunk", "foot"), robot=("trunk",), object=())
-        return Scene(track, num_robots=2, contacts=contacts, objects=(plank, platform))
+        return Scene(track, num_robots=2, objects=(plank, platform))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Places the plank at its initial angle, with the near end on the ground."""

@@ -15,7 +15,6 @@ from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_a
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
@@ -138,10 +137,8 @@ class Go1SheepEasy(QuadrupedEnv):
         spawn = SpawnArea(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
-        touching = ("trunk", "foot")
-        contacts = Contacts(ground=touching, wall=touching, robot=touching, object=touching)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
-        return Scene(track, num_robots=2, contacts=contacts, objects=flock)
+        return Scene(track, num_robots=2, objects=flock)
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Samples the sheep's initial positions."""

@@ -16,7 +16,6 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.objects import Cylinder
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
@@ -125,8 +124,7 @@ class Go1Tug(Duel):
             friction=params.cylinder_friction,
             reach=reach,
         )
-        contacts = Contacts(robot=("trunk",), object=("trunk", "foot", "calf"))
-        return Scene(track, num_robots=2, contacts=contacts, objects=(cylinder,), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(cylinder,), colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """One robot on each side, facing the centre."""

@@ -13,7 +13,6 @@ from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.objects import Platform, Ring
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, record
@@ -90,8 +89,7 @@ class Go1Wrestling(Duel):
         platform = Platform("platform", center=(x, y, top), size=params.platform)
         ring = Ring("ring", center=(x, y, top), radius=params.ring_radius)
         track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
-        contacts = Contacts(wall=(), robot=("trunk", "foot", "calf"), object=())
-        return Scene(track, num_robots=2, contacts=contacts, objects=(platform, ring), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=(platform, ring), colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Facing each other across the ring."""

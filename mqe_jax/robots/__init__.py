@@ -1,16 +1,16 @@
 """Robots: their type, data, body tree, index tables and kinematics."""
 
-from mqe_jax.robots.build import Contacts, build_robot
+from mqe_jax.robots.build import build_robot
 from mqe_jax.robots.index import RobotIndex, RobotState, add_sensors, index_robots, prefix, read_robots
 from mqe_jax.robots.kinematics import foot_positions, knee_positions
 from mqe_jax.robots.registry import ROBOTS, get, register
-from mqe_jax.robots.robot import NUM_JOINTS, CollisionShape, Link, Robot, VisualShape, WalkSettings
+from mqe_jax.robots.robot import CONTACTS, NUM_JOINTS, CollisionShape, Link, Robot, VisualShape, WalkSettings
 
 __all__ = [
+    "CONTACTS",
     "NUM_JOINTS",
     "ROBOTS",
     "CollisionShape",
-    "Contacts",
     "Link",
     "Robot",
     "RobotIndex",

@@ -28,11 +28,13 @@ _DARK = (0.13, 0.14, 0.16, 1.0)
 _GREY = (0.32, 0.34, 0.37, 1.0)
 _WHITE = (0.9, 0.95, 1.0, 1.0)
 
+# Trunk box 0.376 x 0.094 x 0.114 and the head box 0.27 ahead of its centre as one capsule, wide enough to leave at most
+# 2 cm of their edges outside; hip cylinders r 0.046; thigh boxes 0.034 x 0.0245; calf boxes 0.016 x 0.016; feet.
 _COLLISION = (
-    # Trunk box 0.376 x 0.094 x 0.114 with the head in front of it, as one capsule.
-    CollisionShape("trunk", capsule(0.055, (-0.135, 0, 0), (0.235, 0, 0))),
-    CollisionShape("thigh", capsule(0.017, (0, 0, -0.02), (0, 0, -0.19))),
-    CollisionShape("calf", capsule(0.01, (0, 0, -0.03), (0, 0, -0.18))),
+    CollisionShape("trunk", capsule(0.065, (-0.125, 0, 0), (0.245, 0, 0))),
+    CollisionShape("hip", sphere(0.05, (0, 0.06, 0))),
+    CollisionShape("thigh", capsule(0.018, (0, 0, -0.01), (0, 0, -0.2))),
+    CollisionShape("calf", capsule(0.011, (0, 0, -0.01), (0, 0, -0.2))),
     CollisionShape("foot", sphere(0.02, (0, 0, -0.213))),
 )
 

@@ -32,14 +32,13 @@ _GREY = (0.62, 0.64, 0.66, 1.0)
 _DARK = (0.10, 0.11, 0.12, 1.0)
 _LIGHT = (0.75, 0.95, 1.0, 1.0)
 
+# As on the Go1: one capsule for trunk box and head cylinder, which leaves at most 2 cm of their edges outside. One
+# capsule follows the bent shank.
 _COLLISION = (
-    # Trunk box 0.376 x 0.094 x 0.114 with the head cylinder in front of it, as one capsule.
-    CollisionShape("trunk", capsule(0.055, (-0.135, 0, 0), (0.28, 0, 0))),
-    CollisionShape("hip", capsule(0.046, (0, 0.075, 0), (0, 0.085, 0))),
-    CollisionShape("thigh", capsule(0.017, (0, 0, -0.02), (0, 0, -0.19))),
-    # Upper and lower shank, which is bent forward.
-    CollisionShape("calf", capsule(0.012, (0.002, 0, -0.02), (0.014, 0, -0.12)), name="calf"),
-    CollisionShape("calf", capsule(0.011, (0.014, 0, -0.12), (0.018, 0, -0.18)), name="shank"),
+    CollisionShape("trunk", capsule(0.065, (-0.125, 0, 0), (0.265, 0, 0))),
+    CollisionShape("hip", sphere(0.05, (0, 0.065, 0))),
+    CollisionShape("thigh", capsule(0.018, (0, 0, -0.01), (0, 0, -0.2))),
+    CollisionShape("calf", capsule(0.013, (0.004, 0, -0.01), (0.014, 0, -0.19))),
     CollisionShape("foot", sphere(0.022, _FOOT)),
 )
 

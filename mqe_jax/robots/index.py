@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.errors import InputError
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.robot import JOINT_NAMES, NUM_LEGS, Robot
 from mqe_jax.rotation import quaternion_to_euler, rotate_inverse
 
@@ -29,13 +27,12 @@ class RobotIndex:
         actuator: rows of ctrl (R, 12).
         trunk_body: trunk body ids (R,).
         bodies: all body ids of each robot (R, 13).
-        foot_geom: foot shape ids (R, 4); (R, 0) where feet touch nothing.
+        foot_geom: foot shape ids (R, 4).
         geoms: collision shape ids of each robot (R, G).
         trunk_force: addresses in sensordata of the strongest contact force on each of the trunk's T shapes
             (R, T, 3), contact frame, N.
         foot_force: addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless
             the scene has foot sensors.
-        touch: (robot, robot, address in sensordata) of each robot-robot contact counter (S, 3).
     """
 
     base_qpos: np.ndarray
@@ -49,7 +46,6 @@ class RobotIndex:
     geoms: np.ndarray
     trunk_force: np.ndarray
     foot_force: np.ndarray
-    touch: np.ndarray
 
     @property
     def num_robots(self) -> int:
@@ -62,66 +58,33 @@ def prefix(number: int) -> str:
     return f"robot{number}/"
 
 
-def _geom_names(robot: Robot, parts: tuple[str, ...]) -> list[str]:
-    return [name for shape in robot.shapes(parts) for name in shape.geom_names]
+def _geom_names(robot: Robot, part: str) -> list[str]:
+    return [name for shape in robot.shapes() if shape.part == part for name in shape.geom_names]
 
 
-def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, contacts: Contacts, *, feet: bool = False) -> None:
-    """Adds the trunk (and foot) contact force and robot-robot contact sensors, which all engines compute alike.
-
-    Raises:
-        InputError: if the trunk touches nothing.
-    """
-    geom = mujoco.mjtObj.mjOBJ_GEOM
-    force_bits, found_bits, strongest = 1 << 1, 1 << 0, 2
-    if "trunk" not in contacts.parts():
-        raise InputError("Contacts: the trunk must touch something; add 'trunk' to ground, wall, robot or object")
+def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: bool = False) -> None:
+    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines compute alike."""
+    force_bits, strongest = 1 << 1, 2
+    names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
     for number in range(num_robots):
-        for shape in _geom_names(robot, ("trunk", "foot") if feet else ("trunk",)):
+        for name in names:
             spec.add_sensor(
-                name=f"{prefix(number)}{shape}_force",
+                name=f"{prefix(number)}{name}_force",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=geom,
-                objname=prefix(number) + shape,
+                objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                objname=prefix(number) + name,
                 intprm=(force_bits, strongest, 1),
             )
-    for name, first, second in _touch_pairs(robot, num_robots, contacts):
-        spec.add_sensor(
-            name=name,
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=geom,
-            objname=first,
-            reftype=geom,
-            refname=second,
-            intprm=(found_bits, 0, 1),
-        )
-
-
-def _touch_pairs(robot: Robot, num_robots: int, contacts: Contacts) -> list[tuple[str, str, str]]:
-    """Returns (sensor, shape, shape) of every pair of shapes, one of them a trunk's, by which robots can touch."""
-    if not {"trunk"} <= {*contacts.robot} & {*contacts.robot_target}:
-        return []
-    trunk = _geom_names(robot, ("trunk",))
-    limbs = _geom_names(robot, tuple(part for part in contacts.robot if part != "trunk"))
-    shapes = [(a, b) for a in trunk for b in trunk]
-    shapes += [(a, b) for a in trunk for b in limbs] + [(a, b) for a in limbs for b in trunk]
-    return [
-        (f"touch/{i}/{j}/{a}/{b}", prefix(i) + a, prefix(j) + b)
-        for i in range(num_robots)
-        for j in range(i + 1, num_robots)
-        for a, b in shapes
-    ]
 
 
 def index_robots(
-    model: mujoco.MjModel, robot: Robot, num_robots: int, contacts: Contacts, *, feet: bool = False
+    model: mujoco.MjModel, robot: Robot, num_robots: int, *, contacts: str = "full", feet: bool = False
 ) -> RobotIndex:
     """Looks up by name, once, where every robot of a compiled model is."""
     numbers = range(num_robots)
     body_names = ["trunk", *JOINT_NAMES]
-    shapes = robot.shapes(contacts.parts())
-    geom_names = [name for shape in shapes for name in shape.geom_names]
-    foot_names = [name for shape in shapes if shape.part == "foot" for name in shape.geom_names]
+    geom_names = [name for shape in robot.shapes(contacts) for name in shape.geom_names]
+    foot_names = _geom_names(robot, "foot")
     bases = [model.joint(prefix(i) + "base") for i in numbers]
 
     def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
@@ -130,10 +93,6 @@ def index_robots(
     def force(names: Sequence[str]) -> np.ndarray:
         return table(lambda name: model.sensor(name + "_force").adr[0] + np.arange(3), names)
 
-    touch = [
-        (*map(int, sensor.split("/")[1:3]), model.sensor(sensor).adr[0])
-        for sensor, _, _ in _touch_pairs(robot, num_robots, contacts)
-    ]
     return RobotIndex(
         base_qpos=np.array([base.qposadr[0] + np.arange(7) for base in bases], np.int32),
         base_qvel=np.array([base.dofadr[0] + np.arange(6) for base in bases], np.int32),
@@ -144,9 +103,8 @@ def index_robots(
         bodies=table(lambda name: model.body(name).id, body_names),
         foot_geom=table(lambda name: model.geom(name).id, foot_names),
         geoms=table(lambda name: model.geom(name).id, geom_names),
-        trunk_force=force(_geom_names(robot, ("trunk",))),
+        trunk_force=force(_geom_names(robot, "trunk")),
         foot_force=force(foot_names) if feet else np.zeros((0, NUM_LEGS, 3), np.int32),
-        touch=np.array(touch, np.int32).reshape(-1, 3),
     )
 
 
@@ -163,7 +121,6 @@ class RobotState:
         joint_position: (R, 12), rad.
         joint_velocity: (R, 12), rad/s.
         trunk_force: strongest contact force on the trunk (R,), N.
-        touching: whether robots i and j touch, by the trunk of one of them (R, R) bool, symmetric.
     """
 
     position_w: jax.Array
@@ -173,7 +130,6 @@ class RobotState:
     joint_position: jax.Array
     joint_velocity: jax.Array
     trunk_force: jax.Array
-    touching: jax.Array
 
     @property
     def euler(self) -> jax.Array:
@@ -194,12 +150,6 @@ class RobotState:
 def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotState:
     """Reads all robots from the state vectors of one environment (nq,), (nv,), (nsensordata,)."""
     base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
-    count = index.num_robots
-    touching = jnp.zeros((count, count), bool)
-    if len(index.touch):
-        first, second, address = index.touch.T
-        found = sensordata[address] > 0
-        touching = touching.at[first, second].max(found).at[second, first].max(found)
     return RobotState(
         position_w=base[:, :3],
         quaternion=base[:, 3:],
@@ -208,5 +158,4 @@ def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata:
         joint_position=qpos[index.joint_qpos],
         joint_velocity=qvel[index.joint_qvel],
         trunk_force=jnp.max(jnp.linalg.norm(sensordata[index.trunk_force], axis=-1), axis=-1),
-        touching=touching,
     )

@@ -22,8 +22,11 @@ NUM_LEGS = len(LEGS)
 NUM_JOINTS = NUM_LEGS * len(JOINTS)
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
 LINKS = ("trunk", *JOINTS)
-# Contact groups of collision shapes; `Contacts` says which of them touch what.
+# Parts of the body that collision shapes belong to.
 PARTS = ("trunk", "hip", "thigh", "calf", "foot")
+
+# Sets of collision shapes: the whole body, or trunk and feet alone.
+CONTACTS: dict[str, tuple[str, ...]] = {"full": PARTS, "minimal": ("trunk", "foot")}
 
 Vector = tuple[float, float, float]
 Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
@@ -131,7 +134,7 @@ class CollisionShape:
     """A shape that touches other things; one of a leg's exists once on each leg.
 
     Attributes:
-        part: contact group, one of `PARTS`.
+        part: one of `PARTS`.
         primitive: its geometry, in the frame of `link`.
         name: unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so on.
     """
@@ -277,6 +280,12 @@ class Robot:
         if parts.count("foot") != 1 or "trunk" not in parts:
             raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")
 
-    def shapes(self, parts: Sequence[str]) -> tuple[CollisionShape, ...]:
-        """Returns the collision shapes of some contact groups."""
-        return tuple(shape for shape in self.collision if shape.part in parts)
+    def shapes(self, contacts: str = "full") -> tuple[CollisionShape, ...]:
+        """Returns the collision shapes of a set, one of `CONTACTS`.
+
+        Raises:
+            InputError: for an unknown set.
+        """
+        if contacts not in CONTACTS:
+            raise InputError(f"contacts: unknown set {contacts!r}; allowed: {', '.join(CONTACTS)}")
+        return tuple(shape for shape in self.collision if shape.part in CONTACTS[contacts])

@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
-from mqe_jax.train.types import Memory, VectorEnv, teams_of
+from mqe_jax.train.types import Memory, PyTree, Recorder, Trace, VectorEnv, join_traces, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable by JAX."""
@@ -62,6 +62,7 @@ def evaluate(
     memory: Memory = (),
     block: int = 50,
     max_steps: int = 1_000_000,
+    recorder: Recorder | None = None,
 ) -> EvalResult:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
@@ -76,6 +77,7 @@ def evaluate(
         memory: of `act` at an episode's start, leading axis N.
         block: steps per compiled call.
         max_steps: limit on the steps of an environment.
+        recorder: gets all steps, block by block.
 
     Raises:
         InputError: for `episodes` < 1, or where the environments do not finish within `max_steps`.
@@ -84,7 +86,7 @@ def evaluate(
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)
 
-    evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps)
+    evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps, recorder=recorder)
     return evaluator(None, episodes, key[None])[0]
 
 
@@ -103,17 +105,23 @@ class Evaluator:
         *,
         block: int = 50,
         max_steps: int = 1_000_000,
+        recorder: Recorder | None = None,
     ) -> None:
-        self._env, self._block, self._max_steps = env, block, max_steps
+        self._env, self._block, self._max_steps, self._recorder = env, block, max_steps, recorder
+        snapshot = None if recorder is None else recorder.snapshot
 
-        def run(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> _Progress:
+        def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
             def own_act(obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
                 return act(params, obs, memory, key)
 
-            return _run_block(env, own_act, progress, key, memory, quota, block)
+            return _run_block(env, own_act, progress, key, memory, quota, block, snapshot)
+
+        def run(progress: _Progress, params: Any, keys: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
+            progress, traces = jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
+            return progress, None if snapshot is None else join_traces(traces)
 
         self._begin = jax.jit(jax.vmap(lambda key: _begin(env, key, memory)))
-        self._run = jax.jit(jax.vmap(run, in_axes=(0, 0, 0, None)))
+        self._run = jax.jit(run)
 
     def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[EvalResult]:
         """Returns the results of B evaluations, for random keys (B, 2); errors as of `evaluate`."""
@@ -125,7 +133,9 @@ class Evaluator:
         progress = self._begin(split[:, 0])
         for done_steps in range(0, self._max_steps, self._block):
             step_keys = jax.vmap(lambda key: jax.random.fold_in(key, done_steps))(split[:, 1])  # noqa: B023
-            progress = self._run(progress, params, step_keys, jnp.asarray(quota))
+            progress, trace = self._run(progress, params, step_keys, jnp.asarray(quota))
+            if self._recorder is not None:
+                self._recorder.add(trace)
             if np.all(np.asarray(progress.finished) >= quota):
                 one = [jax.tree.map(lambda x: x[i], jax.device_get(progress)) for i in range(len(keys))]  # noqa: B023
                 return [_result(self._env.name, episodes, each) for each in one]
@@ -149,14 +159,16 @@ def _run_block(
     initial_memory: Memory,
     quota: jax.Array,
     block: int,
-) -> _Progress:
+    snapshot: Callable[[Any], PyTree] | None,
+) -> tuple[_Progress, Any]:
     own = np.array(teams_of(env)[0])
 
-    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
+    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, Any]:
         action, memory = act(p.env_state.obs, p.memory, step_key)
         state = env.step(p.env_state, action)
         done = state.terminated | state.truncated
         counted = p.finished < quota
+        trace = () if snapshot is None else Trace(snapshot(p.env_state), action, state.metrics["diverged"])
 
         def restart(now: jax.Array, at_start: jax.Array) -> jax.Array:
             return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), at_start, now)
@@ -173,11 +185,10 @@ def _run_block(
                 step_sums=step_sums,
                 end_sums=end_sums,
             ),
-            None,
+            trace,
         )
 
-    progress, _ = jax.lax.scan(one_step, progress, jax.random.split(key, block))
-    return progress
+    return jax.lax.scan(one_step, progress, jax.random.split(key, block))
 
 
 def _result(task: str, episodes: int, progress: _Progress) -> EvalResult:

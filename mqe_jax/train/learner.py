@@ -31,9 +31,9 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, Teams, Transition, VectorEnv, replace_fields, teams_of
+from mqe_jax.train.types import Batch, Params, PyTree, Teams, Transition, VectorEnv, replace_fields, teams_of
 
-Metrics = dict[str, jax.Array]
+Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]
 """Carry of a gradient step: parameters, optimiser state, learning rate () before the schedule."""
 
@@ -78,8 +78,10 @@ def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     )
 
 
-def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
+def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], PyTree] | None = None) -> Learner:
     """Returns the learner of an environment.
+
+    With `snapshot` (see `Recorder`), the metrics of an update also hold `trace`, a `Trace` of the rollout.
 
     Raises:
         InputError: where the settings do not fit the environment.
@@ -133,6 +135,7 @@ def make_learner(env: VectorEnv, config: TrainConfig) -> Learner:
             config.rollout_steps,
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
+            snapshot=snapshot,
         )
         batch, value_normalizer, batch_metrics = _prepare(network, config, dims.teams, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(

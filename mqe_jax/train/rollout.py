@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import NetworkMemory, Params, Transition, VectorEnv, is_outcome, teams_of
+from mqe_jax.train.types import NetworkMemory, Params, PyTree, Trace, Transition, VectorEnv, is_outcome, teams_of
 
 
 class RolloutState(NamedTuple):
@@ -50,23 +51,27 @@ def rollout(
     *,
     normalize: bool,
     action_scale: float,
-) -> tuple[RolloutState, Transition, dict[str, jax.Array]]:
+    snapshot: Callable[[Any], PyTree] | None = None,
+) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
     The environment gets `action_scale` times the sampled action. Metrics: those of the environment are means over steps
     and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
-    episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts.
+    episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `snapshot`, the metrics also
+    hold `trace`, a `Trace` of all steps.
     """
     own = np.array(teams_of(env)[0])
 
-    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, dict[str, jax.Array]]]:
+    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
         obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, normalize)
         action, log_prob, actor_memory = network.act(network.acting(params), memory.actor, obs, key)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None])
-        after = env.step(before, action_scale * action)
+        scaled = action_scale * action
+        after = env.step(before, scaled)
+        trace = () if snapshot is None else Trace(snapshot(before), scaled, after.metrics["diverged"])
         done = after.terminated | after.truncated
         transition = Transition(
             memory=memory,
@@ -92,10 +97,11 @@ def rollout(
             episode_steps=jnp.where(done, 0, episode_steps),
             episode_return=jnp.where(done, 0.0, episode_return),
         )
-        return state, (transition, sums)
+        return state, (transition, sums, trace)
 
-    state, (transitions, sums) = jax.lax.scan(one_step, state, jax.random.split(key, length))
-    return state, transitions, _means(sums, length * env.num_envs)
+    state, (transitions, sums, trace) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    metrics: dict[str, Any] = _means(sums, length * env.num_envs)
+    return state, transitions, metrics if snapshot is None else {**metrics, "trace": trace}
 
 
 def _per_episode(name: str) -> bool:

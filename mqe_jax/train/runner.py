@@ -33,7 +33,7 @@ from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, CsvLog, ProgressLog, TensorBoardLog
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
-from mqe_jax.train.types import VectorEnv
+from mqe_jax.train.types import Recorder, VectorEnv, join_traces
 
 CONFIG_FILE = "config.yaml"
 
@@ -50,6 +50,7 @@ def train(
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
+    recorder: Recorder | None = None,
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state.
 
@@ -61,6 +62,7 @@ def train(
         on_update: called after every update with the state and its row of metrics.csv.
         eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
             `config.evaluation.every` is set.
+        recorder: gets the steps of every rollout, but none of evaluations.
 
     Raises:
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
@@ -68,7 +70,7 @@ def train(
         NonFiniteError: after the first update that makes a loss or a weight NaN or infinite. Checkpoints and policy
             on disk are those from before.
     """
-    return train_seeds(env, [config], [run_dir], resume, on_update, eval_env)[0]
+    return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, recorder)[0]
 
 
 def train_seeds(
@@ -78,24 +80,26 @@ def train_seeds(
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
+    recorder: Recorder | None = None,
 ) -> list[TrainState]:
     """Trains several seeds at once in one program, each as alone and in a run folder of its own; see `train`.
 
     `configs` differ in their seed alone. Runs are resumed together, from the newest checkpoint that all of them have.
+    The recorder gets the environments of all seeds as one batch.
     """
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ in the seed alone")
     if configs[0].evaluation.every is not None and eval_env is None:
         fail("evaluation.every", configs[0].evaluation.every, "none where no environments are given to evaluate on")
     folders = [Path(run_dir) for run_dir in run_dirs]
-    learner = make_learner(env, configs[0])
+    learner = make_learner(env, configs[0], None if recorder is None else recorder.snapshot)
     left_by_a_run = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
     newest = [prepare_folder(folder, resume, left_by_a_run) for folder in folders]
     with contextlib.ExitStack() as locks:
         for folder in folders:
             locks.enter_context(locked(folder))
         checkpoints = newest if len(folders) == 1 else _common_checkpoints(folders)
-        return _Training(env, learner, configs, folders, checkpoints, eval_env).run(on_update)
+        return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update)
 
 
 def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
@@ -124,8 +128,9 @@ class _Training:
         folders: Sequence[Path],
         checkpoints: Sequence[Path | None],
         eval_env: VectorEnv | None,
+        recorder: Recorder | None,
     ) -> None:
-        self._env, self._configs, self._folders = env, configs, folders
+        self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
         self._config = configs[0]
         first = [_first_state(env, learner, c, path) for c, path in zip(configs, checkpoints, strict=True)]
         states = [state for state, _ in first]
@@ -157,8 +162,9 @@ class _Training:
                     while self._env_steps < total_steps:
                         rows = self._step(files)
                         progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
-                        for i, row in enumerate(rows if on_update is not None else ()):
-                            on_update(self._one(self._state, i), row)  # type: ignore[misc]
+                        if on_update is not None:
+                            for i, row in enumerate(rows):
+                                on_update(self._one(self._state, i), row)
                         updates = int(rows[0]["updates"])
                         evaluates = self._monitor is not None and updates % (config.evaluation.every or 1) == 0
                         if evaluates or self._env_steps >= total_steps:
@@ -180,6 +186,9 @@ class _Training:
         """Makes one update of every seed and logs it; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)
+        if self._recorder is not None:
+            trace = metrics.pop("trace")
+            self._recorder.add(trace if self._single else join_traces(trace))
         metrics = jax.device_get(metrics)
         rows = []
         for i, folder in enumerate(self._folders):

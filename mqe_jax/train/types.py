@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
 
@@ -71,6 +72,32 @@ class VectorEnv(Protocol):
     def action_size(self) -> int: ...
     def reset(self, key: jax.Array) -> Any: ...
     def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
+class Trace(NamedTuple):
+    """Consecutive steps of all environments, kept where divergences are recorded (T, N, ...)."""
+
+    snapshot: PyTree  # of the states before the actions
+    action: jax.Array  # (T, N, A, D), as the environment got it
+    diverged: jax.Array  # (T, N), the metric after the action
+
+
+class Recorder(Protocol):
+    """Records the steps that led to a divergence.
+
+    `snapshot(env_state)` returns what to keep of a state (N, ...), inside compiled code; `add(trace)` gets the steps
+    since the last call, and writes those of environments that diverged.
+    """
+
+    def snapshot(self, env_state: Any) -> PyTree: ...
+    def add(self, trace: Trace) -> None: ...
+
+
+def join_traces(traces: Trace) -> Trace:
+    """Returns the traces of B batches of environments (B, T, N, ...) as the trace of all of them (T, B * N, ...)."""
+    return jax.tree.map(
+        lambda x: jnp.swapaxes(x, 0, 1).reshape(x.shape[1], x.shape[0] * x.shape[2], *x.shape[3:]), traces
+    )
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:

@@ -1,4 +1,4 @@
-"""Cameras that hold the whole scene."""
+"""Cameras that frame the whole scene."""
 
 from dataclasses import dataclass, replace
 
@@ -11,16 +11,16 @@ from mqe_jax.viz.recording import Episode
 
 @dataclass(frozen=True)
 class Camera:
-    """A free camera: it looks at a point from a distance, angles in degrees as MuJoCo has them."""
+    """A free camera, in MuJoCo's convention; angles in degrees."""
 
-    lookat: tuple[float, float, float]  # metre
-    distance: float  # metre
+    lookat: tuple[float, float, float]  # m
+    distance: float  # m
     azimuth: float = 60.0  # 0 looks along +x, 90 along +y
     elevation: float = -46.0  # -90 looks straight down
 
 
 def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 / 9) -> Camera:
-    """A three-quarter view from behind and above that holds the whole track and every robot's way."""
+    """Returns a three-quarter view from behind and above that contains the track and all robot trajectories."""
     low, high = extent(model, episode)
     centre = (low + high) / 2
     camera = Camera((float(centre[0]), float(centre[1]), 0.2), 1.0)
@@ -31,9 +31,9 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
     up = np.cross(right, forward)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     lookat, distance = np.array(camera.lookat), 1.0
-    for _ in range(60):  # put the middle of what is seen into the middle of the picture, then step back or forth
+    for _ in range(60):  # centre the projection, then adjust the distance
         offset = corners - lookat
-        # A corner is in the picture when |offset right| <= depth tan aspect and |offset up| <= depth tan.
+        # A corner is in the image where |offset right| <= depth tan aspect and |offset up| <= depth tan.
         need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
         distance = need.max()
         depth = distance + offset @ forward

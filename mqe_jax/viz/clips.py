@@ -1,4 +1,4 @@
-"""Files of clips and pictures, written whole: .mp4, .gif and .png."""
+"""Clips and images, written atomically: .mp4, .gif and .png."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SUFFIXES = (".mp4", ".gif", ".png")
 
 
 def check_output(path: Path) -> Path:
-    """Refuse what cannot be written, before any work; the InputError names the path and what is allowed."""
+    """Returns the path if it can be written; otherwise the InputError names it and what is allowed."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
     if path.is_dir():
@@ -44,7 +44,7 @@ def check_output(path: Path) -> Path:
 
 
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    """Write frames (H, W, 3) uint8 as .mp4, .gif or .png (the last frame), whole or not at all."""
+    """Writes frames (H, W, 3) uint8 as .mp4, .gif or .png (the last frame), atomically."""
     path = check_output(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
@@ -65,8 +65,8 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    """H.264, yuv420p: what browsers and players take."""
-    # ffmpeg is started without a fork of this process, in which JAX's threads might hold locks.
+    """Writes H.264 in yuv420p, which browsers and players support."""
+    # A subprocess instead of a fork of this process, in which JAX's threads might hold locks.
     program = import_module("imageio_ffmpeg").get_ffmpeg_exe()
     first = next(frames)
     height, width = (n // 2 * 2 for n in first.shape[:2])
@@ -79,7 +79,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
             for frame in itertools.chain([first], frames):
                 process.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
         except BrokenPipeError:
-            pass  # ffmpeg says below what was wrong
+            pass  # reported below from ffmpeg's own message
         except BaseException:
             process.kill()
             raise
@@ -90,7 +90,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
 
 
 def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
-    """One palette for the whole clip and no dithering, which keeps a gif small and still."""
+    """Writes a GIF with one palette and no dithering, for small files without flicker."""
     from PIL import Image
 
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)][:8])

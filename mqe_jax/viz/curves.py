@@ -1,4 +1,4 @@
-"""Pictures of learning curves, beside what the paper reports."""
+"""Plots of learning curves with the paper's final values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _INK, _OURS, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:
-    """Columns of a metrics.csv; InputError in one line where it is missing or no such table."""
+    """Returns the columns of a metrics.csv; InputError where it is missing or not one."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
@@ -26,15 +26,15 @@ def read_metrics(path: Path) -> dict[str, list[float]]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; a run folder has one after its first update") from None
     except (TypeError, ValueError, UnicodeDecodeError):
-        raise InputError(f"{path}: is no table of numbers as a training writes it") from None
+        raise InputError(f"{path}: is not a metrics.csv") from None
     if "env_steps" not in columns:
         raise InputError(f"{path}: has no column env_steps")
     return columns
 
 
-def smooth(values: Sequence[float], share: float = 0.02) -> list[float]:
-    """Running mean over the last `share` of the rows, numbers that are not finite left out."""
-    width = max(1, round(len(values) * share))
+def smooth(values: Sequence[float], fraction: float = 0.02) -> list[float]:
+    """Returns the running mean over a window of `fraction` of the rows; non-finite values are skipped."""
+    width = max(1, round(len(values) * fraction))
     means = []
     for end in range(1, len(values) + 1):
         window = [v for v in values[max(0, end - width) : end] if math.isfinite(v)]
@@ -43,9 +43,9 @@ def smooth(values: Sequence[float], share: float = 0.02) -> list[float]:
 
 
 def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = None) -> None:
-    """Draw average step reward (and success) of runs against environment steps into an image, written whole.
+    """Plots average step reward (and success) of runs over environment steps, and writes the image atomically.
 
-    The paper's values after 40 M steps are dashed lines, where it has the task.
+    Dashed lines are the paper's values after 40 M steps, for the tasks that it reports.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

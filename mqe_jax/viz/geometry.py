@@ -1,4 +1,4 @@
-"""The scene as plain geometry: which bodies are robots, what is shown, and where its corners are."""
+"""Geometry of a scene: robot bodies, visible geoms, bounding boxes."""
 
 import copy
 
@@ -11,7 +11,7 @@ COLLISION_GROUP = 3
 
 
 def robot_bases(model: mujoco.MjModel) -> list[int]:
-    """Ids of the bodies that are robots' trunks: a free joint above at least twelve hinges."""
+    """Returns the ids of the robots' trunks: bodies with a free joint and at least twelve hinges below it."""
     bases = []
     hinges = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
     for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
@@ -23,14 +23,14 @@ def robot_bases(model: mujoco.MjModel) -> list[int]:
 
 
 def paint(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
-    """Colour (red, green, blue, alpha) of a robot: of the first shape on its trunk that is looked at."""
+    """Returns the colour (red, green, blue, alpha) of a robot: that of the first visible geom of its trunk."""
     geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])
     seen = [geom for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
     return tuple(map(float, model.geom_rgba[seen[0]]))
 
 
 def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: int) -> None:
-    """Put frame `index` of the episode into `data`."""
+    """Sets `data` to frame `index` of the episode."""
     data.qpos[:] = episode.qpos[index]
     if model.nmocap:
         data.mocap_pos[:] = episode.mocap_pos[index]
@@ -39,14 +39,14 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: in
 
 
 def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """World corners (8, 3) of the geom's bounding box."""
+    """Returns the corners (8, 3) of a geom's bounding box, world frame, m."""
     centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     return data.geom_xpos[geom] + (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
 
 
 def scenery_geoms(model: mujoco.MjModel) -> list[int]:
-    """Ids of the shown geoms that are neither ground nor part of a robot."""
+    """Returns the ids of the visible geoms that are neither ground nor part of a robot."""
     robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
     return [
         geom
@@ -58,7 +58,7 @@ def scenery_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner (3,) of what the clip should hold: the scene and every robot's way."""
+    """Returns the lowest and highest corner (3,), m, of the scene and all robot trajectories."""
     data = mujoco.MjData(model)
     points = []
     for index in np.unique(np.linspace(0, len(episode) - 1, 30).astype(int)):
@@ -73,10 +73,9 @@ def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndar
 
 
 def drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
-    """A copy to draw from, in which moving walls end at the track's side walls.
+    """Returns a rendering copy of the model, in which mocap walls end at the track's side walls.
 
-    A gate's walls are long enough for every place that its gap may take, so that they stand out behind the
-    side walls; what stands out is not drawn.
+    A gate's walls are long enough for every sampled gap position; the overhang beyond the side walls is hidden.
     """
     model = copy.deepcopy(model)
     box = int(mujoco.mjtGeom.mjGEOM_BOX)
@@ -94,6 +93,6 @@ def drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
         low, high = max(wall.min(), sides.min() + 0.005), min(wall.max(), sides.max() - 0.005)
         if low < high and (low, high) != (wall.min(), wall.max()):
             model.geom_pos[geom, 1] += (low + high) / 2 - data.geom_xpos[geom, 1]
-            model.geom_sameframe[geom] = 0  # or MuJoCo takes the body's pose for the geom's
+            model.geom_sameframe[geom] = 0  # otherwise MuJoCo takes the body's pose for the geom's
             model.geom_size[geom, 1] = model.geom_aabb[geom, 4] = (high - low) / 2
     return model

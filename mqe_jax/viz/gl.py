@@ -1,4 +1,4 @@
-"""Drawing by `mujoco.Renderer` on a GL library that works without a screen (EGL, then OSMesa)."""
+"""Offscreen rendering by `mujoco.Renderer` (EGL, then OSMesa)."""
 
 import os
 import subprocess
@@ -26,10 +26,10 @@ context.free()
 
 @cache
 def gl_backend() -> str | None:
-    """Name of the GL library that draws here (`egl` or `osmesa`); None where there is none.
+    """Returns the name of a working GL library (`egl` or `osmesa`), or None.
 
-    Each candidate is tried in a process of its own: a missing or broken library fails while MuJoCo is being
-    imported, or crashes. `MUJOCO_GL`, where set, is the only candidate.
+    Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
+    `MUJOCO_GL`, where set, is the only candidate.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
     for name in [chosen] if chosen else ["egl", "osmesa"]:
@@ -48,7 +48,7 @@ def gl_backend() -> str | None:
 
 
 def _renderer(model: mujoco.MjModel, width: int, height: int, backend: str) -> mujoco.Renderer:
-    """A `mujoco.Renderer` on `backend`, whatever MUJOCO_GL was when MuJoCo was imported."""
+    """Returns a `mujoco.Renderer` on `backend`, independent of MUJOCO_GL at the import of MuJoCo."""
     os.environ["MUJOCO_GL"] = backend
     if os.environ.get("PYOPENGL_PLATFORM", backend) != backend:
         del os.environ["PYOPENGL_PLATFORM"]
@@ -60,22 +60,22 @@ def _renderer(model: mujoco.MjModel, width: int, height: int, backend: str) -> m
 def draw_gl(
     model: mujoco.MjModel, episode: Episode, camera: Camera, size: tuple[int, int], backend: str
 ) -> Iterator[np.ndarray]:
-    """Frames (H, W, 3) uint8 of the episode, drawn by `mujoco.Renderer`."""
+    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer`."""
     width, height = size
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight = width, height
     vis.quality.shadowsize, vis.quality.offsamples = 2048, 4
-    # One sun and some light from the camera, together short of white on a pale floor.
+    # One directional light and a headlight, together below saturation on a pale floor.
     vis.headlight.ambient[:] = 0.38
     vis.headlight.diffuse[:] = 0.22
     vis.headlight.specular[:] = 0.0
-    # Shadows reach as far as the scene: MuJoCo casts them around the sun's place, up to `shadowclip` extents.
+    # Shadows cover the scene: MuJoCo casts them around the light's position, up to `shadowclip` extents.
     low, high = extent(model, episode)
     model.stat.extent = float(np.linalg.norm(high - low) / 2)
     model.vis.map.shadowclip = 1.0
-    model.vis.map.znear, model.vis.map.zfar = 0.1, 10.0  # extents; a wider range blurs depth into stripes
+    model.vis.map.znear, model.vis.map.zfar = 0.1, 10.0  # extents; a wider range causes z-fighting
     if model.nlight:
-        # Leaning along one axis only: otherwise the software renderer draws stripes on the floor.
+        # Tilted along one axis only: otherwise the software renderer draws stripes on the floor.
         model.light_dir[0] = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
         model.light_pos[0] = (low + high) / 2 - 2 * model.stat.extent * model.light_dir[0]
         model.light_diffuse[:] = 0.45

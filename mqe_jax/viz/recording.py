@@ -1,6 +1,5 @@
-"""Episodes recorded as numpy, frame by frame."""
+"""Recording of episodes as numpy arrays."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,26 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Act = Callable[[Any, Any, Any], tuple[Any, Any]]
-"""`act(obs (N, A, O), memory, key) -> (action (N, A, action_size), memory)`."""
+from mqe_jax.train.evaluate import Act
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One world's episode, frame by frame, with everything that drawing needs."""
+    """Frames of one episode with all that rendering needs."""
 
     qpos: np.ndarray  # (T, nq)
-    mocap_pos: np.ndarray  # (T, n_mocap, 3) metre, world frame
+    mocap_pos: np.ndarray  # (T, n_mocap, 3), m, world frame
     mocap_quat: np.ndarray  # (T, n_mocap, 4) wxyz
     dt: float  # s between frames
-    success: float = 0.0  # `success` on the last step, 0 where the episode was cut
+    success: float = 0.0  # `success` on the last step, 0 where the time limit of the recording came first
     reward: float = 0.0  # mean over steps of the sum of the reward terms
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def every(self, n: int) -> "Episode":
-        """Keep every n-th frame."""
+        """Returns every n-th frame."""
         kept = slice(None, None, n)
         return replace(
             self,
@@ -38,11 +36,18 @@ class Episode:
         )
 
 
-def record(env: Any, act: Act, memory: Any, key: jax.Array, *, worlds: int = 1, seconds: float = 20.0) -> list[Episode]:
-    """Play one episode in each of `worlds` fresh worlds, without auto-reset.
+def record(
+    env: Any, act: Act, memory: Any, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
+) -> list[Episode]:
+    """Records one episode in each of several environments, without automatic reset.
 
-    `act` and `memory` are batched over `worlds` as in `Act`. Every episode ends with the frame on which the
-    world terminated or was truncated, or after `seconds`.
+    Args:
+        env: the task.
+        act: the policy, batched over the episodes.
+        memory: of the policy at an episode's start, likewise.
+        key: random key.
+        episodes: number of environments.
+        seconds: time limit of an episode; otherwise its last frame is that of the termination or truncation.
     """
     reset_key, act_key = jax.random.split(key)
 
@@ -59,7 +64,7 @@ def record(env: Any, act: Act, memory: Any, key: jax.Array, *, worlds: int = 1, 
         return (state, memory), (*frame(state), done, reward, success)
 
     chunk = jax.jit(lambda carry, keys: jax.lax.scan(one_step, carry, keys))
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, worlds))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, episodes))
     first = [np.asarray(x)[None] for x in frame(state)]
     rows: list[list[np.ndarray]] = []
     steps, length = max(1, round(seconds / env.dt)), 50
@@ -72,16 +77,16 @@ def record(env: Any, act: Act, memory: Any, key: jax.Array, *, worlds: int = 1, 
             break
     columns = [np.concatenate([row[i] for row in rows])[:steps] for i in range(6)]
     done, reward, success = columns[3:]
-    episodes = []
-    for world in range(worlds):
-        last = int(done[:, world].argmax()) if done[:, world].any() else len(done) - 1
-        poses = [np.concatenate([f, c])[: last + 2, world] for f, c in zip(first, columns[:3], strict=True)]
-        won = float(success[last, world]) if done[last, world] else 0.0
-        mean = float(reward[: last + 1, world].mean())
-        episodes.append(Episode(poses[0], poses[1], poses[2], float(env.dt), won, mean))
-    return episodes
+    recorded = []
+    for i in range(episodes):
+        last = int(done[:, i].argmax()) if done[:, i].any() else len(done) - 1
+        poses = [np.concatenate([f, c])[: last + 2, i] for f, c in zip(first, columns[:3], strict=True)]
+        won = float(success[last, i]) if done[last, i] else 0.0
+        mean = float(reward[: last + 1, i].mean())
+        recorded.append(Episode(poses[0], poses[1], poses[2], float(env.dt), won, mean))
+    return recorded
 
 
 def best(episodes: list[Episode]) -> Episode:
-    """The episode that shows most: success first, then average step reward."""
+    """Returns the best episode: by success, then by average step reward."""
     return max(episodes, key=lambda episode: (episode.success, episode.reward))

@@ -1,4 +1,4 @@
-"""An episode's frames, and clips and pictures of it."""
+"""Frames, clips and images of an episode."""
 
 import sys
 from collections.abc import Iterator
@@ -25,9 +25,9 @@ def render_frames(
     size: tuple[int, int] = (960, 540),
     backend: str | None = "auto",
 ) -> Iterator[np.ndarray]:
-    """Yield the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
+    """Yields the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
-    `backend` is `auto` (what `gl_backend` finds), `egl`, `osmesa`, or None for matplotlib's view from above.
+    `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
     model = drawn_model(env.mj_model, episode)
     if backend == "auto":
@@ -47,10 +47,10 @@ def render_episode(
     fps: float | None = None,
     backend: str | None = "auto",
 ) -> str:
-    """Draw an episode into a file chosen by suffix; returns what drew it (`egl`, `osmesa`, `matplotlib`).
+    """Renders an episode to a file by suffix; returns the renderer (`egl`, `osmesa`, `matplotlib`).
 
     Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720, middle frame.
-    Where GL is missing, one line on standard error names the packages that give the real picture.
+    Without GL, one line on standard error names the packages for 3-D images.
     """
     check_output(path)
     suffix = path.suffix.lower()
@@ -60,7 +60,7 @@ def render_episode(
         backend = gl_backend()
     if backend is None:
         print(
-            f"mqe: no GL library, drawn from above instead; for the 3-D picture install {GL_PACKAGES}",
+            f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}",
             file=sys.stderr,
         )
     if suffix == ".png":

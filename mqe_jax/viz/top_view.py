@@ -1,4 +1,4 @@
-"""Drawing from above by matplotlib, where there is no GL library."""
+"""Top view by matplotlib, for machines without a GL library."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from mqe_jax.viz.recording import Episode
 
 
 def _outline(points: np.ndarray) -> np.ndarray:
-    """Convex hull (K, 2) of points (N, 2), counter-clockwise."""
+    """Returns the convex hull (K, 2) of points (N, 2), counter-clockwise."""
     ordered = sorted(map(tuple, np.round(points, 6)))
 
     def half(points: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
@@ -28,7 +28,7 @@ def _outline(points: np.ndarray) -> np.ndarray:
 
 
 def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Frames (H, W, 3) uint8 of the episode from above: walls, objects, robots with their trails."""
+    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots with their trajectories."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon

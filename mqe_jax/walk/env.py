@@ -14,13 +14,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
-from mqe_jax.robots.build import Contacts
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
@@ -30,13 +28,6 @@ from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_term
 from mqe_jax.walk_policy import WalkMemory
 
 GRAVITY = 9.81  # m/s^2
-# Maximum contacts of a shape with a plane.
-_GROUND_CONTACTS = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): 4,
-    int(mujoco.mjtGeom.mjGEOM_BOX): 4,
-}
 DT = walk_policy.STEP
 
 
@@ -165,21 +156,12 @@ class WalkEnv:
             Track(blocks=(Plane(4.0),), walled=False, num_robots=1),
             num_robots=1,
             robot=robot,
-            contacts=dataclasses.replace(Contacts(), wall=(), robot=(), object=()),
             foot_sensors=True,
             solver_iterations=self.task.solver_iterations,
         )
         self.compiled = compile_scene(scene)
-        # Every shape flat on the ground; four constraints per contact (pyramidal cones), one per joint limit.
-        contacts = sum(
-            _GROUND_CONTACTS[int(kind)] for kind in self.compiled.model.geom_type[self.compiled.index.geoms[0]]
-        )
         self.physics = Physics(
-            self.compiled.model,
-            impl=impl,
-            num_envs=num_envs,
-            contacts_per_env=contacts + 2,
-            max_constraints_per_env=NUM_JOINTS + 4 * (contacts + 2),
+            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=16, max_constraints_per_env=80
         )
         self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)

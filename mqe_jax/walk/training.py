@@ -117,11 +117,13 @@ def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index:
     return (history * alive[..., None]).reshape(len(time_index), -1)
 
 
-def init_learner(key: jax.Array, config: WalkConfig, privileged_size: int) -> WalkLearner:
-    """Samples the initial weights."""
+def init_learner(
+    key: jax.Array, config: WalkConfig, privileged_size: int, policy: walk_policy.Params | None = None
+) -> WalkLearner:
+    """Samples the initial weights; those of the policy are `policy` where given, for fine-tuning."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     params = {
-        "policy": walk_policy.init_params(policy_key),
+        "policy": walk_policy.init_params(policy_key) if policy is None else policy,
         "log_std": jnp.full(NUM_JOINTS, jnp.log(config.initial_std)),
         "critic": nn.mlp_init(critic_key, (privileged_size, 512, 256, 128, 1), final_scale=1.0),
     }
@@ -309,6 +311,7 @@ def train_walk(
     run_dir: Path,
     *,
     resume: bool = False,
+    policy: walk_policy.Params | None = None,
     max_seconds: float | None = None,
     save_every: int = 100,
     report: Callable[[int, dict[str, float]], None] | None = None,
@@ -320,6 +323,7 @@ def train_walk(
         config: settings.
         run_dir: folder of the run.
         resume: continue from the folder's newest checkpoint; the environments are reset.
+        policy: weights to fine-tune; sampled if None.
         max_seconds: stop after this time, compilation included, with everything saved, s.
         save_every: iterations between checkpoints.
         report: called with the iteration and its metrics every 10 iterations.
@@ -331,7 +335,7 @@ def train_walk(
     run_dir.mkdir(parents=True, exist_ok=True)
     key = jax.random.PRNGKey(config.seed)
     learner_key, state_key, stagger_key = jax.random.split(key, 3)
-    learner = init_learner(learner_key, config, env.privileged_size)
+    learner = init_learner(learner_key, config, env.privileged_size, policy)
     if resume:
         learner = restore(run_dir, learner, env.robot)
         state_key = jax.random.fold_in(state_key, learner.iteration)

@@ -1,0 +1,66 @@
+"""A network of your own: every agent sees its observation beside the mean of all agents' encoded observations.
+
+`python examples/custom_network.py` trains it for a minute on a CPU, on the environment of foreign_env.py. Once
+registered, it is chosen by `network: {name: mean_field}` in YAML like those of the package.
+"""
+
+from __future__ import annotations
+
+import foreign_env
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.settings import PositiveInt
+from mqe_jax.train import nn
+from mqe_jax.train.loss import entropy, log_prob
+from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
+from mqe_jax.train.types import NetworkMemory
+
+
+@register_network("mean_field")
+class MeanField(NetworkSettings):
+    """Settings of the network."""
+
+    width: PositiveInt = 32
+    """Width of the hidden layers."""
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network for an environment."""
+
+        def init(key):
+            sizes = {
+                "encoder": (dims.observation, self.width),
+                "actor": (2 * self.width, self.width, dims.action),
+                "critic": (2 * self.width, self.width, 1),
+            }
+            keys = jax.random.split(key, 3)
+            params = {name: nn.mlp_init(k, sizes[name], final_scale=0.1) for k, name in zip(keys, sizes, strict=True)}
+            return {**params, "log_std": jnp.full(dims.action, -0.5)}
+
+        def encode(params, obs):
+            own = nn.mlp(params["encoder"], obs, activate_last=True)
+            return jnp.concatenate([own, jnp.broadcast_to(own.mean(-2, keepdims=True), own.shape)], axis=-1)
+
+        def act(params, memory, obs, key):
+            mean = nn.mlp(params["actor"], encode(params, obs))
+            noise = 0.0 if key is None else jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
+            return mean + noise, log_prob(mean + noise, mean, params["log_std"]), memory
+
+        def value(params, memory, is_first, obs, privileged):
+            return nn.mlp(params["critic"], encode(params, obs))[..., 0], memory
+
+        def evaluate(params, memory, is_first, obs, privileged, action):
+            mean = nn.mlp(params["actor"], encode(params, obs))
+            spread = jnp.broadcast_to(params["log_std"], mean.shape)
+            values, _ = value(params, (), is_first, obs, privileged)
+            return Evaluation(log_prob(action, mean, spread), entropy(spread), values)
+
+        def acting(params):
+            return {name: params[name] for name in ("encoder", "actor", "log_std")}
+
+        return Network(init, acting, lambda num_envs: NetworkMemory((), ()), act, value, evaluate)
+
+
+if __name__ == "__main__":
+    history = foreign_env.main(network={"name": "mean_field", "width": 64})
+    print(f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after")

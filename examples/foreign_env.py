@@ -1,0 +1,120 @@
+"""Trains an environment written by hand: two points on a plane that must meet. No robots, no physics engine.
+
+`python examples/foreign_env.py` prints the distance at the end of episodes before and after; a minute on a CPU.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.settings import build
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.runner import train
+
+
+class State(NamedTuple):
+    """N environments of two agents; see `mqe_jax.train.types.EnvState`."""
+
+    position: jax.Array  # (N, 2, 2), m
+    step: jax.Array  # (N,) int32
+    key: jax.Array
+    obs: jax.Array  # (N, 2, 6)
+    privileged_obs: jax.Array  # (N, 4)
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array  # (N, 2)
+    terminated: jax.Array  # (N,)
+    truncated: jax.Array  # (N,)
+    metrics: dict[str, jax.Array]  # (N,) each
+
+
+def distance(position: jax.Array) -> jax.Array:
+    """Returns the distance between the agents (N,), m."""
+    return jnp.linalg.norm(position[:, 0] - position[:, 1], axis=-1)
+
+
+class Meeting:
+    """Agents start within 1 m of the origin and move by at most 0.1 m a step; the episode is truncated after 20 steps.
+
+    Observation: one-hot agent 2, own position 2, offset to the other agent 2. Reward, shared: minus the distance.
+    """
+
+    name, num_agents, action_size, max_episode_steps = "meeting", 2, 2, 20
+    observation_size, privileged_observation_size = 6, 4
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs = num_envs
+
+    def observe(self, position: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns all agents' observations and the privileged one."""
+        agent = jnp.broadcast_to(jnp.eye(2), (self.num_envs, 2, 2))
+        obs = jnp.concatenate([agent, position, position[:, ::-1] - position], axis=-1)
+        return obs, position.reshape(self.num_envs, 4)
+
+    def reset(self, key: jax.Array) -> State:
+        """Returns N new episodes."""
+        key, draw = jax.random.split(key)
+        position = jax.random.uniform(draw, (self.num_envs, 2, 2), minval=-1.0)
+        obs, privileged = self.observe(position)
+        zero = jnp.zeros(self.num_envs)
+        metrics = {"average_step_reward": zero, "success": zero, "success/distance": zero}
+        done, step = zero > 0, zero.astype(jnp.int32)
+        return State(
+            position, step, key, obs, privileged, obs, privileged, jnp.zeros((self.num_envs, 2)), done, done, metrics
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Moves the agents, and starts new episodes where one has ended."""
+        position = state.position + 0.1 * jnp.clip(action, -1.0, 1.0)
+        apart = distance(position)
+        truncated = state.step + 1 >= self.max_episode_steps
+        final_obs, final_privileged = self.observe(position)
+        fresh = self.reset(state.key)
+        position = jnp.where(truncated[:, None, None], fresh.position, position)
+        obs, privileged = self.observe(position)
+        return State(
+            position=position,
+            step=jnp.where(truncated, 0, state.step + 1),
+            key=fresh.key,
+            obs=obs,
+            privileged_obs=privileged,
+            final_obs=final_obs,
+            final_privileged_obs=final_privileged,
+            reward=-jnp.stack([apart, apart], axis=-1),
+            terminated=jnp.zeros_like(truncated),
+            truncated=truncated,
+            metrics={
+                "average_step_reward": -apart,
+                "success": (apart < 0.1).astype(jnp.float32),
+                "success/distance": apart,
+            },
+        )
+
+
+def main(num_envs: int = 64, updates: int = 100, **settings: object) -> list[float]:
+    """Trains, and returns the distance at the end of episodes after every update, m."""
+    config = build(
+        TrainConfig,
+        {
+            "num_envs": num_envs,
+            "rollout_steps": 20,
+            "total_steps": updates * num_envs * 20,
+            "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
+            "optimizer": {"learning_rate": 3e-3},
+            "network": {"recurrent": False, "log_std_init": -0.5},
+            **settings,
+        },
+    )
+    distances: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        train(Meeting(num_envs), config, folder, on_update=lambda _, row: distances.append(row["success/distance"]))
+    return distances
+
+
+if __name__ == "__main__":
+    history = main()
+    print(f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after")

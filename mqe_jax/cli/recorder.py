@@ -1,0 +1,58 @@
+"""Recordings of environments that diverge during training or evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+
+from mqe_jax.envs.replay import content, save_recording
+from mqe_jax.files import check_folder
+from mqe_jax.train.types import Trace
+
+STEPS = 64
+"""Number of steps up to a divergence that a recording holds at most."""
+LIMIT = 100
+"""Number of recordings that one command writes at most."""
+
+
+class DivergenceRecorder:
+    """Writes the last steps of environments that diverge to `FOLDER/diverged_0000.npz`, ...
+
+    Attributes:
+        written: the files written.
+    """
+
+    def __init__(self, env: Any, folder: Path) -> None:
+        check_folder(folder)
+        self.written: list[Path] = []
+        self._env, self._folder = env, folder
+        self._previous: Trace | None = None
+
+    def snapshot(self, env_state: Any) -> Any:
+        """Returns the fields on which a step depends, of all environments (N, ...)."""
+        return content(env_state)
+
+    def add(self, trace: Trace) -> None:
+        """Writes the environments that diverged in a trace, with steps of the one before where needed."""
+        for step, index in np.argwhere(np.asarray(trace.diverged) > 0.0)[: LIMIT - len(self.written)]:
+            parts = [trace] if self._previous is None else [self._previous, trace]
+            steps, actions = jax.tree.map(
+                lambda *leaves, i=index: np.concatenate([np.asarray(leaf[:, i]) for leaf in leaves]),
+                *[(part.snapshot, part.action) for part in parts],
+            )
+            end = len(actions) - len(trace.diverged) + step + 1
+            last = slice(max(0, end - STEPS), end)
+            steps: Any = jax.tree.map(lambda leaf, last=last: leaf[last], steps)
+            states: Any = SimpleNamespace(data=SimpleNamespace(**steps.pop("data")), **steps)
+            save_recording(self._next_file(), self._env, states, actions[last])
+        self._previous = trace
+
+    def _next_file(self) -> Path:
+        taken = {file.name for file in self._folder.glob("diverged_*.npz")}
+        name = next(name for i in range(len(taken) + 1) if (name := f"diverged_{i:04d}.npz") not in taken)
+        self.written.append(self._folder / name)
+        return self.written[-1]

@@ -1,0 +1,178 @@
+"""Compares the throughput of checkouts in turn on one machine: medians and ratios of the pairs.
+
+`python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE` starts
+one process per checkout and case, lets each compile, and then times them in turn: a machine whose speed drifts slows
+all alike. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few calls of 50
+environment steps, whole step and bare physics. `--pause FILE` stops the process whose id is in FILE while it times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from statistics import median
+from typing import IO, Any
+
+RATES = ("env_steps_per_s", "bare_env_steps_per_s")
+
+
+def work(case: str, steps: int, repeats: int) -> None:
+    """Process of one checkout and case: compiles, then answers each line on standard input with one timing."""
+    import jax
+    import jax.numpy as jnp
+
+    import mqe_jax
+
+    task, impl, count = case.split(":")
+    env = mqe_jax.make(task, impl=impl, num_envs=int(count))
+    vector: Any = mqe_jax.VectorEnv(env, int(count))
+    shape = (int(count), env.num_agents, env.action_size)
+
+    def step(carry: Any, _: None) -> Any:
+        state, key = carry
+        key, action_key = jax.random.split(key)
+        action = jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)
+        return (vector.step(state, action), key), None
+
+    whole = jax.jit(lambda carry: jax.lax.scan(step, carry, None, steps)[0])
+    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl))
+    bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
+
+    def rate(run: Any, start: Any) -> float:
+        seconds = []
+        for _ in range(repeats):
+            began = time.perf_counter()
+            start = jax.block_until_ready(run(start))
+            seconds.append(time.perf_counter() - began)
+        return int(count) * steps / median(seconds)
+
+    carry = (jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1))
+    data = jax.tree.map(jnp.copy, carry[0].data)
+    jax.block_until_ready((whole(carry), bare(data)))
+    answer: IO[str] = (
+        os.fdopen(os.dup(1), "w")
+        if "MQE_BENCH_FD" not in os.environ
+        else os.fdopen(int(os.environ["MQE_BENCH_FD"]), "w")
+    )
+    device = jax.devices()[0].device_kind
+    print(json.dumps({"ready": mqe_jax.__file__}), file=answer, flush=True)
+    for _ in sys.stdin:
+        figures = {RATES[0]: round(rate(whole, carry), 1), RATES[1]: round(rate(bare, data), 1)}
+        print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=answer, flush=True)
+
+
+class Worker:
+    """A process that times one case in one checkout."""
+
+    def __init__(self, tree: Path, case: str, steps: int, repeats: int) -> None:
+        read, write = os.pipe()
+        path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+        command = [sys.executable, str(Path(__file__).resolve()), "--work", case, str(steps), str(repeats)]
+        self._process = subprocess.Popen(
+            command,
+            cwd=tree,
+            env=os.environ | {"PYTHONPATH": path, "MQE_BENCH_FD": str(write)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            pass_fds=(write,),
+            text=True,
+        )
+        os.close(write)
+        self._answers = os.fdopen(read)
+        self._tree = tree
+
+    def read(self) -> dict[str, Any]:
+        """Waits for the next answer; exits where the process died."""
+        line = self._answers.readline()
+        if not line:
+            raise SystemExit(f"{self._tree}: the benchmark process ended")
+        return json.loads(line)
+
+    def time(self) -> dict[str, Any]:
+        """Times once."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        return self.read()
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._process.kill()
+
+
+@contextlib.contextmanager
+def paused(file: Path | None) -> Any:
+    """Stops the process whose id is in the file while the block runs."""
+    ids = [int(line) for line in file.read_text().split()] if file is not None and file.is_file() else []
+    for process in ids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGSTOP)
+    if ids:
+        time.sleep(2.0)  # until its last kernels are done
+    try:
+        yield
+    finally:
+        for process in ids:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGCONT)
+
+
+def main() -> int:
+    """Runs the pairs and prints one JSON object per case."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--trees", nargs="+", metavar="NAME=PATH", help="checkouts; ratios are to the first one")
+    parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS", help="with @NAME,NAME: only in those trees")
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--csv", type=Path)
+    parser.add_argument("--pause", type=Path, metavar="FILE")
+    parser.add_argument("--work", nargs=3, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.work:
+        work(arguments.work[0], int(arguments.work[1]), int(arguments.work[2]))
+        return 0
+    trees = dict(pair.split("=", 1) for pair in arguments.trees)
+    workers: dict[tuple[str, str], Worker] = {}
+    for case in arguments.cases:
+        name, _, only = case.partition("@")
+        for tree in only.split(",") if only else trees:
+            workers[name, tree] = Worker(Path(trees[tree]), name, arguments.steps, arguments.repeats)
+    for worker in workers.values():
+        worker.read()
+    rows: list[dict[str, Any]] = []
+    with paused(arguments.pause):
+        for pair in range(arguments.pairs):
+            for (case, tree), worker in workers.items():
+                rows.append({"case": case, "tree": tree, "pair": pair, **worker.time()})
+    for worker in workers.values():
+        worker.close()
+    if arguments.csv is not None:
+        with arguments.csv.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    for case in dict.fromkeys(row["case"] for row in rows):
+        result: dict[str, Any] = {"case": case}
+        names = [tree for name, tree in workers if name == case]
+        for rate in RATES:
+            values = {name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)] for name in names}
+            result[rate] = {name: median(found) for name, found in values.items()}
+            result[f"{rate}/ratio"] = {
+                name: round(median(a / b for b, a in zip(values[names[0]], found, strict=True)), 4)
+                for name, found in values.items()
+            }
+        print(json.dumps(result), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
