@@ -31,10 +31,10 @@ class ProbeState:
 class Probe:
     """N environments with one random sign `hidden` per episode.
 
-    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id; `pay(hidden, action (N, A, D)) -> (N,)`
-    is the reward of the first team, and its negative that of a second one. Episodes of even environments end after
-    `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates` says whether that is a
-    termination (with `even_truncate` only in odd environments). The shorter kind is a success.
+    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id; `pay(hidden, action (N, A, D))` is the
+    reward of the first team (N,), and its negative that of a second one, or each agent's own (N, A). Episodes of even
+    environments end after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates`
+    says whether that is a termination (with `even_truncate` only in odd environments). The shorter kind is a success.
     """
 
     show: Callable[[jax.Array, jax.Array], jax.Array]
@@ -94,6 +94,10 @@ class Probe:
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
         key, draw = jax.random.split(state.key)
         pay = self.pay(state.hidden, action)
+        if pay.ndim == 2:
+            reward, pay = pay, jnp.mean(pay, axis=-1)
+        else:
+            reward = pay[:, None] * jnp.array([1.0 if agent in self.teams[0] else -1.0 for agent in range(2)])
         step = state.step + 1
         odd = self.odd_episode_steps or self.max_episode_steps
         limit = jnp.where(jnp.arange(self.num_envs) % 2, odd, self.max_episode_steps)
@@ -112,7 +116,7 @@ class Probe:
             privileged_obs=privileged,
             final_obs=final_obs,
             final_privileged_obs=final_privileged,
-            reward=pay[:, None] * jnp.array([1.0 if agent in self.teams[0] else -1.0 for agent in range(2)]),
+            reward=reward,
             terminated=done & terminates,
             truncated=done & ~terminates,
             metrics={
@@ -157,3 +161,18 @@ def pay_sum_and_difference(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Pays most where agent 0 does half the sign and agent 1 the opposite: no agent's best act is its own."""
     first, second = action[:, 0, 0], action[:, 1, 0]
     return -jnp.square(first + second) - 0.25 * jnp.square(first - second - hidden)
+
+
+def pay_public_good(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays each agent 0.75 times the sum of all contributions in [-1, 1] less its own.
+
+    What an agent gives costs it a quarter and gains two of them a half: +0.5 each where both give all, -0.5 each where
+    each does what is best for itself.
+    """
+    given = jnp.clip(action[..., 0], -1.0, 1.0)
+    return 0.75 * jnp.sum(given, axis=-1, keepdims=True) - given
+
+
+def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays most where both agents do the same: -2 variances where they draw independently, -1 where one sees."""
+    return -jnp.square(action[:, 0, 0] - action[:, 1, 0])

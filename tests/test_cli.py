@@ -8,10 +8,16 @@ import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import cli
-from mqe_jax.cli import arguments, commands
+from mqe_jax.cli import arguments, commands, setup
 from mqe_jax.envs import QuadrupedEnv
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
+
+
+def replace_make_env(patch: pytest.MonkeyPatch, make_env: Any) -> None:
+    """Replaces the function that makes environments, for training and for the other commands."""
+    for module in (setup, commands):
+        patch.setattr(module, "make_env", make_env)
 
 
 @pytest.fixture(autouse=True)
@@ -20,13 +26,13 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     real = commands.make_env
 
-    def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int) -> Any:
+    def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
         if task != "fake":
-            return real(task, impl, overrides, num_envs)
+            return real(task, impl, overrides, num_envs, copies)
         env = FakeEnv()
         return env, FakeVectorEnv(env, num_envs)
 
-    monkeypatch.setattr(commands, "make_env", make_env)
+    replace_make_env(monkeypatch, make_env)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +41,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "fake"
     patch = pytest.MonkeyPatch()
     env = FakeEnv()
-    patch.setattr(commands, "make_env", lambda task, impl, overrides, n: (env, FakeVectorEnv(env, n)))
+    replace_make_env(patch, lambda task, impl, overrides, n, copies=1: (env, FakeVectorEnv(env, n)))
     assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     patch.undo()
     return folder

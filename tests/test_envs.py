@@ -212,7 +212,8 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     assert gate_step(placed(gate, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]], state=state), still).terminated
     fallen = gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
     assert fallen.tolist() == [True, False]
-    bumped = gate_step(placed(gate, [[0.16, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state), still)
+    turned = [[0.0, 0.0, np.pi], [0.0, 0.0, 0.0]]  # the head against the back wall
+    bumped = gate_step(placed(gate, [[0.305, -0.75, 0.31], [1.0, 0.75, 0.31]], turned, state=state), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
 
 

@@ -147,7 +147,8 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
     assert not step(placed(env, high, angles(pitch=(1.2, 0.0)), state=fresh), still).terminated
     rolled = step(placed(env, high, angles(roll=(0.9, 0.0)), state=fresh), still)
     assert rolled.terminated and float(rolled.metrics["reward/fall"]) == -2
-    bumped = step(placed(env, [[0.16, -0.75, 0.31], SPAWN[1]], state=fresh), still)  # into the back wall
+    turned = [[0.0, 0.0, np.pi], [0.0, 0.0, 0.0]]  # the head against the back wall
+    bumped = step(placed(env, [[0.305, -0.75, 0.31], SPAWN[1]], turned, state=fresh), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
     low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)

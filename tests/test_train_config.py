@@ -17,14 +17,10 @@ RESULTS = Path(__file__).parent.parent / "results"
 
 
 @pytest.mark.parametrize(
-    "path", [*sorted(CONFIGS.glob("*.yaml")), *sorted(RESULTS.glob("gate/*/config.yaml"))], ids=str
+    "path", [*sorted(CONFIGS.rglob("*.yaml")), *sorted(RESULTS.glob("gate/*/config.yaml"))], ids=str
 )
 def test_every_file_loads(path: Path) -> None:
     assert load_config(path).num_updates > 0
-
-
-def test_the_papers_file_is_the_default() -> None:
-    assert load_config(CONFIGS / "paper_mappo.yaml") == TrainConfig()
 
 
 def test_there_and_back() -> None:

@@ -32,7 +32,7 @@ First steps:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "replay", "bench", "demo", "walk")
+COMMANDS = ("tasks", "train", "eval", "render", "replay", "bench", "demo", "walk", "sweep", "report")
 Repeated = tyro.conf.UseAppendAction
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
@@ -109,12 +109,17 @@ class Train:
     task: tyro.conf.Positional[str]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings, or the name of a shipped one: demo, go1gate, paper_mappo. Default: the shipped
-    file named after the task, else the paper's settings."""
+    """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
+    settings of the algorithm given, else the task's tuned ones, else the paper's MAPPO."""
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings in which they differ."""
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder of the run. Default: runs/TASK."""
     resume: bool = False
     """Continue exactly from the newest checkpoint in the run folder."""
+    num_seeds: int = 1
+    """Train this many seeds at once, the given one and those after it, into run folders seed0, seed1, ... of the
+    folder of the run."""
     impl: Impl = "auto"
     control: Control = None
     robot: TaskRobot = None
@@ -250,6 +255,35 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Sweep:
+    """Train tasks x algorithms x settings x seeds into one folder, and report; continues what is missing."""
+
+    file: tyro.conf.Positional[Path]
+    """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""
+    json: Json = False
+    folder: Path | None = None
+    """Folder of the sweep. Default: runs/NAME of the file."""
+    dry_run: bool = False
+    """Print what is left to train and how long it would take, and train nothing."""
+    impl: Impl = "auto"
+
+    def run(self) -> dict[str, Any] | None:
+        return _commands("study_commands").sweep(self)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write figures and tables of a sweep from its raw data, beside the paper's values."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder of the sweep, with its raw data in raw/; the report goes into report/."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any] | None:
+        return _commands("study_commands").report(self)
+
+
+@dataclass(frozen=True)
 class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
@@ -344,6 +378,8 @@ def _parser(wanted: Sequence[str]) -> Any:
         Annotated[Bench, subcommand("bench")],
         Annotated[Demo, subcommand("demo")],
         Annotated[Walk, subcommand("walk")],
+        Annotated[Sweep, subcommand("sweep")],
+        Annotated[Report, subcommand("report")],
     ]
     return functools.reduce(operator.or_, records)
 

@@ -15,12 +15,12 @@ from mqe_jax.cli.flags import given
 from mqe_jax.cli.output import print_table, say
 from mqe_jax.cli.players import PLANNER_NAMES, Player
 from mqe_jax.cli.recorder import DivergenceRecorder
-from mqe_jax.cli.setup import make_env, parse_overrides, train_config
+from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.envs import replay as recordings
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import PLANNERS
-from mqe_jax.settings import fail
+from mqe_jax.settings import fail, override
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import runner
 from mqe_jax.train.policy import load_policy
@@ -113,19 +113,27 @@ def tasks(arguments: Tasks) -> dict[str, Any] | None:
 
 def train(arguments: Train) -> None:
     """Trains into the run folder."""
-    config = train_config(arguments.task, arguments.config, given(arguments.settings), _overrides(arguments))
+    config = train_config(
+        arguments.task, arguments.config, given(arguments.settings), _overrides(arguments), arguments.algorithm
+    )
+    if arguments.num_seeds < 1:
+        fail("num_seeds", arguments.num_seeds, "at least 1")
     run_dir = arguments.run_dir or Path("runs") / arguments.task
-    env, vector_env = make_env(arguments.task, arguments.impl, config.training_env, config.num_envs)
-    recorder = _recorder(env, arguments.dump_diverged)
+    configs, folders = [config], [run_dir]
+    if arguments.num_seeds > 1:
+        configs = [override(config, {"seed": config.seed + i}) for i in range(arguments.num_seeds)]
+        folders = [run_dir / f"seed{each.seed}" for each in configs]
+    vector_env, eval_env = environments(arguments.impl, config, len(configs))
+    recorder = _recorder(vector_env.env, arguments.dump_diverged)
     try:
-        runner.train(vector_env, config, run_dir, resume=arguments.resume, recorder=recorder)
+        runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
     except KeyboardInterrupt:
-        say(f"mqe: stopped; resume with: mqe train {arguments.task} --run-dir {run_dir} --resume")
+        say(f"mqe: stopped; resume with the same command and --resume; the run is in {run_dir}")
         raise
     finally:
         _say_recorded(recorder)
-    curves.draw_curve([run_dir], run_dir / "curve.png", arguments.task)
-    say(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {run_dir}")
+    curves.draw_curve(folders, run_dir / "curve.png", arguments.task)
+    say(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 
 
 def evaluate(arguments: Eval) -> dict[str, Any]:

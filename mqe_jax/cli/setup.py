@@ -11,8 +11,9 @@ import jax
 import yaml
 
 from mqe_jax.envs import VectorEnv, make
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import override
+from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig, load_config
 
 CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
@@ -32,8 +33,10 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def make_env(task: str, impl: str, overrides: Mapping[str, Any], num_envs: int) -> tuple[Any, VectorEnv]:
-    """Returns a task and its vectorised environment with automatic reset."""
+def make_env(
+    task: str, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
+) -> tuple[Any, VectorEnv]:
+    """Returns a task and its vectorised environment with automatic reset; `copies` as of `VectorEnv`."""
     for name in ("impl", "num_envs"):
         if name in overrides:
             flag = name.replace("_", "-")
@@ -41,8 +44,17 @@ def make_env(task: str, impl: str, overrides: Mapping[str, Any], num_envs: int) 
     device = platform()
     if impl == "warp" and device != "gpu":
         raise InputError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax")
-    env = make(task, impl=impl, num_envs=num_envs, **overrides)
-    return env, VectorEnv(env, num_envs)
+    env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
+    return env, VectorEnv(env, num_envs, copies)
+
+
+def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[VectorEnv, VectorEnv | None]:
+    """Returns training and evaluation environments (None without evaluation) of seeds trained together."""
+    task = config.task or ""
+    _, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    if config.evaluation.every is None:
+        return env, None
+    return env, make_env(task, impl, config.env, config.evaluation.episodes, 2 * seeds)[1]
 
 
 def platform() -> str:
@@ -58,22 +70,37 @@ def platform() -> str:
 def find_config(name: str) -> Path:
     """Returns the settings file of a path or a shipped name; the InputError lists the shipped ones."""
     path = Path(name)
-    shipped = {file.stem: file for file in sorted(CONFIG_FOLDER.glob("*.yaml"))}
+    files = [file.relative_to(CONFIG_FOLDER) for file in sorted(CONFIG_FOLDER.rglob("*.yaml"))]
+    shipped = {file.with_suffix("").as_posix(): CONFIG_FOLDER / file for file in files}
     allowed = f"a YAML file, or one of {', '.join(shipped)}"
+    if name in shipped:
+        return shipped[name]
     if path.suffix in (".yaml", ".yml") or path.parent != Path("."):
         if path.is_file():
             return path
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
-    if name not in shipped:
-        raise InputError(f"config: unknown name {name!r}; allowed: a YAML file, or one of {', '.join(shipped)}")
-    return shipped[name]
+    raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
 
 
 def train_config(
-    task: str, name: str | None, settings: Mapping[str, Any] | None = None, env: Mapping[str, Any] | None = None
+    task: str,
+    name: str | None,
+    settings: Mapping[str, Any] | None = None,
+    env: Mapping[str, Any] | None = None,
+    algorithm: str | None = None,
 ) -> TrainConfig:
-    """Returns the settings of a training: a shipped or given file, overridden by `settings` and task parameters."""
-    if name is None and (CONFIG_FOLDER / f"{task}.yaml").is_file():
-        name = task
+    """Returns the settings of a training: a file, the algorithm's preset, then `settings` and task parameters.
+
+    Without a file an algorithm starts from its paper's settings (paper/ALGORITHM), and a task without an algorithm
+    from its tuned ones (tuned/TASK), else from the paper's MAPPO.
+
+    Raises:
+        InputError: for a file, an algorithm or a setting that is not allowed.
+    """
+    changes = {} if algorithm is None else preset(algorithm)
     overrides = {**(settings or {}), "task": task, "env": dict(env or {})}
-    return override(TrainConfig(), overrides) if name is None else load_config(find_config(name), overrides)
+    if name is None and algorithm is not None:
+        return load_config(find_config(f"paper/{algorithm}"), overrides)
+    if name is None:
+        name = f"tuned/{task}" if (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file() else "paper/mappo"
+    return override(override(load_config(find_config(name)), changes), overrides)

@@ -44,10 +44,11 @@ class VectorEnv:
         max_episode_steps: environment steps until the time limit.
     """
 
-    def __init__(self, env: QuadrupedEnv, num_envs: int) -> None:
+    def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
+        """Makes the batch; `copies` such batches may be stepped together by a further `vmap`, as seeds are."""
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs} must be at least 1")
-        self.env = env.with_num_envs(num_envs)
+        self.env = env.with_num_envs(num_envs * copies)
         self.num_envs = num_envs
         self.name = env.name
         self.max_episode_steps = env.max_steps

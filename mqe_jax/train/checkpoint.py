@@ -125,6 +125,13 @@ def list_checkpoints(run_dir: str | Path) -> list[Path]:
     return sorted(p for p in folder.glob("step_*.safetensors") if _NAME.fullmatch(p.name))
 
 
+def checkpoint_step(path: Path) -> int:
+    """Returns the environment steps in a checkpoint's name."""
+    match = _NAME.fullmatch(path.name)
+    assert match is not None, path
+    return int(match[1])
+
+
 def latest(run_dir: str | Path) -> Path | None:
     """Returns a run's newest checkpoint, or None."""
     return next(reversed(list_checkpoints(run_dir)), None)

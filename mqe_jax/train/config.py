@@ -24,6 +24,7 @@ from mqe_jax.settings import (
     record,
 )
 from mqe_jax.train.actor_critic import ActorCritic
+from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
 
 
@@ -117,6 +118,23 @@ class Checkpointing:
     """Updates between two checkpoints."""
     kept: PositiveInt = 2
     """Number of the newest checkpoints to keep."""
+    environments: bool = True
+    """Keep the environments' states, so that a resumed training continues exactly. Without them a checkpoint holds
+    weights, optimiser, statistics and keys alone (under 1 MB), and environments are reset when a training resumes."""
+
+
+@record
+class EvaluationSettings:
+    """Evaluation during training, on separate environments of the unmodified task (Gorsane et al., arXiv 2209.10485).
+
+    Actions are drawn in half of the environments and means in the others. The policy of the best evaluation is kept,
+    and the training ends with its absolute metric, over ten times as many episodes.
+    """
+
+    every: PositiveInt | None = None
+    """Updates between two evaluations; none evaluates never."""
+    episodes: PositiveInt = 32
+    """Episodes of each evaluation under drawn actions, and as many under mean actions; one in each environment."""
 
 
 @record
@@ -149,6 +167,7 @@ class TrainConfig:
     curriculum: Curriculum = Curriculum()
     normalization: Normalization = Normalization()
     checkpoint: Checkpointing = Checkpointing()
+    evaluation: EvaluationSettings = EvaluationSettings()
 
     def __post_init__(self) -> None:
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":

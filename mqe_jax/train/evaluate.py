@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
-from mqe_jax.train.types import Memory, PyTree, Recorder, Trace, VectorEnv, teams_of
+from mqe_jax.train.types import Memory, PyTree, Recorder, Trace, VectorEnv, join_traces, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable by JAX."""
@@ -82,21 +82,66 @@ def evaluate(
     Raises:
         InputError: for `episodes` < 1, or where the environments do not finish within `max_steps`.
     """
-    if episodes < 1:
-        fail("episodes", episodes, "at least 1")
-    count = env.num_envs
-    quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
-    reset_key, key = jax.random.split(key)
-    progress = jax.jit(lambda k: _begin(env, k, memory))(reset_key)
-    snapshot = None if recorder is None else recorder.snapshot
-    run = jax.jit(lambda p, k: _run_block(env, act, p, k, memory, jnp.asarray(quota), block, snapshot))
-    for done_steps in range(0, max_steps, block):
-        progress, trace = run(progress, jax.random.fold_in(key, done_steps))
-        if recorder is not None:
-            recorder.add(trace)
-        if np.all(np.asarray(progress.finished) >= quota):
-            return _result(env.name, episodes, progress)
-    raise InputError(f"episodes: {episodes} episodes of {env.name} are not finished after {max_steps} steps")
+
+    def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        return act(obs, memory, key)
+
+    evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps, recorder=recorder)
+    return evaluator(None, episodes, key[None])[0]
+
+
+class Evaluator:
+    """Evaluations of many policies by one compiled program, B at a time; see `evaluate`.
+
+    `act(params, obs (N, A, O), memory, key) -> (action, memory)` is the policy of parameters, of which each of the B
+    evaluations has its own (leading axis B), or all the same (None).
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        act: Callable[[Any, jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]],
+        memory: Memory = (),
+        *,
+        block: int = 50,
+        max_steps: int = 1_000_000,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self._env, self._block, self._max_steps, self._recorder = env, block, max_steps, recorder
+        snapshot = None if recorder is None else recorder.snapshot
+
+        def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
+            def own_act(obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+                return act(params, obs, memory, key)
+
+            return _run_block(env, own_act, progress, key, memory, quota, block, snapshot)
+
+        def run(progress: _Progress, params: Any, keys: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
+            progress, traces = jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
+            return progress, None if snapshot is None else join_traces(traces)
+
+        self._begin = jax.jit(jax.vmap(lambda key: _begin(env, key, memory)))
+        self._run = jax.jit(run)
+
+    def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[EvalResult]:
+        """Returns the results of B evaluations, for random keys (B, 2); errors as of `evaluate`."""
+        if episodes < 1:
+            fail("episodes", episodes, "at least 1")
+        count = self._env.num_envs
+        quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
+        split = jax.vmap(jax.random.split)(keys)
+        progress = self._begin(split[:, 0])
+        for done_steps in range(0, self._max_steps, self._block):
+            step_keys = jax.vmap(lambda key: jax.random.fold_in(key, done_steps))(split[:, 1])  # noqa: B023
+            progress, trace = self._run(progress, params, step_keys, jnp.asarray(quota))
+            if self._recorder is not None:
+                self._recorder.add(trace)
+            if np.all(np.asarray(progress.finished) >= quota):
+                one = [jax.tree.map(lambda x: x[i], jax.device_get(progress)) for i in range(len(keys))]  # noqa: B023
+                return [_result(self._env.name, episodes, each) for each in one]
+        raise InputError(
+            f"episodes: {episodes} episodes of {self._env.name} are not finished after {self._max_steps} steps"
+        )
 
 
 def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:

@@ -81,13 +81,13 @@ def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata:
     return Policy(acting, state.obs_normalizer.obs, dims, config, metadata)
 
 
-def save_policy(run_dir: str | Path, policy: Policy) -> Path:
-    """Writes `policy.safetensors` into a run's folder atomically.
+def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE) -> Path:
+    """Writes a policy into a run's folder atomically.
 
     Raises:
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
-    path = Path(run_dir) / POLICY_FILE
+    path = Path(run_dir) / name
     if wrong := nonfinite({"params": policy.params, "normalizer": policy.normalizer}):
         raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     metadata = {**policy.metadata, "dims": policy.dims._asdict(), "config": to_mapping(policy.config)}

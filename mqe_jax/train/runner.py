@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,11 @@ import yaml
 
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import locked, write_atomically
-from mqe_jax.settings import to_mapping
+from mqe_jax.settings import fail, to_mapping
 from mqe_jax.train.checkpoint import (
+    checkpoint_step,
     latest,
+    list_checkpoints,
     load_checkpoint,
     nonfinite,
     prepare_folder,
@@ -27,15 +31,16 @@ from mqe_jax.train.checkpoint import (
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, CsvLog, ProgressLog, TensorBoardLog
-from mqe_jax.train.policy import POLICY_FILE, policy_of, save_policy
-from mqe_jax.train.types import Recorder, VectorEnv
+from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
+from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
+from mqe_jax.train.types import Recorder, VectorEnv, join_traces
 
 CONFIG_FILE = "config.yaml"
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
 _FINITE_METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
-_MAY_CHANGE = ("total_steps", "checkpoint")
+_MAY_CHANGE = ("total_steps", "checkpoint", "evaluation")
 
 
 def train(
@@ -44,6 +49,7 @@ def train(
     run_dir: str | Path,
     resume: bool = False,
     on_update: OnUpdate | None = None,
+    eval_env: VectorEnv | None = None,
     recorder: Recorder | None = None,
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state.
@@ -54,7 +60,9 @@ def train(
         run_dir: folder for config.yaml, metrics.csv, tensorboard/, checkpoints/ and policy.safetensors.
         resume: continues a run in the folder exactly from its newest checkpoint; an empty folder starts a new run.
         on_update: called after every update with the state and its row of metrics.csv.
-        recorder: gets the steps of every rollout in which an environment diverged, and of the one before.
+        eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
+            `config.evaluation.every` is set.
+        recorder: gets the steps of every rollout, but none of evaluations.
 
     Raises:
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
@@ -62,67 +70,187 @@ def train(
         NonFiniteError: after the first update that makes a loss or a weight NaN or infinite. Checkpoints and policy
             on disk are those from before.
     """
-    run_dir = Path(run_dir)
-    learner = make_learner(env, config, None if recorder is None else recorder.snapshot)
-    checkpoint = prepare_folder(run_dir, resume, (CONFIG_FILE, CSV_FILE, POLICY_FILE))
-    with locked(run_dir):
-        return _train(env, learner, config, run_dir, checkpoint, on_update, recorder)
+    return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, recorder)[0]
 
 
-def _train(
+def train_seeds(
     env: VectorEnv,
-    learner: Learner,
-    config: TrainConfig,
-    run_dir: Path,
-    checkpoint: Path | None,
-    on_update: OnUpdate | None,
-    recorder: Recorder | None,
-) -> TrainState:
-    """Runs the updates that are left; the folder has been checked and locked."""
-    state, seconds = _first_state(env, learner, config, checkpoint)
-    update = jax.jit(learner.update)
-    start_time = time.perf_counter() - seconds
-    env_steps = int(state.updates) * config.steps_per_update
-    saved = -1 if checkpoint is None else env_steps
+    configs: Sequence[TrainConfig],
+    run_dirs: Sequence[str | Path],
+    resume: bool = False,
+    on_update: OnUpdate | None = None,
+    eval_env: VectorEnv | None = None,
+    recorder: Recorder | None = None,
+) -> list[TrainState]:
+    """Trains several seeds at once in one program, each as alone and in a run folder of its own; see `train`.
 
-    def save() -> None:
-        nonlocal saved
-        if saved != env_steps:
-            seconds = time.perf_counter() - start_time
-            metadata = {"task": env.name, "config": to_mapping(config), "seconds": seconds}
-            save_checkpoint(run_dir, state, env_steps, metadata, config.checkpoint.kept)
-            save_policy(run_dir, policy_of(state, env_dims(env, config), config, task=env.name, env_steps=env_steps))
-            saved = env_steps
+    `configs` differ in their seed alone. Runs are resumed together, from the newest checkpoint that all of them have.
+    The recorder gets the environments of all seeds as one batch.
+    """
+    if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
+        raise InputError("seeds: the settings of seeds trained together may differ in the seed alone")
+    if configs[0].evaluation.every is not None and eval_env is None:
+        fail("evaluation.every", configs[0].evaluation.every, "none where no environments are given to evaluate on")
+    folders = [Path(run_dir) for run_dir in run_dirs]
+    learner = make_learner(env, configs[0], None if recorder is None else recorder.snapshot)
+    left_by_a_run = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
+    newest = [prepare_folder(folder, resume, left_by_a_run) for folder in folders]
+    with contextlib.ExitStack() as locks:
+        for folder in folders:
+            locks.enter_context(locked(folder))
+        checkpoints = newest if len(folders) == 1 else _common_checkpoints(folders)
+        return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update)
 
-    save()  # so that a training killed before its first regular checkpoint can be resumed too
-    write_atomically(run_dir / CONFIG_FILE, yaml.safe_dump(to_mapping(config), sort_keys=False).encode())
-    csv_log, tensorboard_log = CsvLog(run_dir, env_steps), TensorBoardLog(run_dir, env_steps)
-    total_steps = config.num_updates * config.steps_per_update
-    try:
-        with ProgressLog(config.task or env.name, env_steps, total_steps) as progress_log:
-            while env_steps < total_steps:
-                update_start = time.perf_counter()
-                after, metrics = update(state)
-                if recorder is not None:
-                    recorder.add(metrics.pop("trace"))
-                row = _row(after, jax.device_get(metrics), config, start_time, update_start)
-                _check_finite(after, row, run_dir)
-                for log in (csv_log, tensorboard_log, progress_log):
-                    log.write(row)
-                # Assigned after logging, so that an interrupted training saves no more updates than its logs show.
-                state, env_steps = after, int(row["env_steps"])
-                if on_update is not None:
-                    on_update(state, row)
-                if int(row["updates"]) % config.checkpoint.every == 0:
-                    save()
-        save()
-    except KeyboardInterrupt:
-        save()
-        raise
-    finally:
-        csv_log.close()
-        tensorboard_log.close()
-    return state
+
+def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
+    """Returns each folder's checkpoint of the newest step that all have; none where some have none yet, at step 0.
+
+    Raises:
+        InputError: where the folders have no step in common.
+    """
+    by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
+    common = set.intersection(*map(set, by_step))
+    if common:
+        return [steps[max(common)] for steps in by_step]
+    if all(not steps or 0 in steps for steps in by_step):
+        return [None] * len(folders)
+    raise InputError(f"run_dir: {folders[0].parent}: its seeds have no checkpoint of the same step; resume each alone")
+
+
+class _Training:
+    """A training of S seeds; folders have been checked and locked. The states of several seeds are stacked."""
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        learner: Learner,
+        configs: Sequence[TrainConfig],
+        folders: Sequence[Path],
+        checkpoints: Sequence[Path | None],
+        eval_env: VectorEnv | None,
+        recorder: Recorder | None,
+    ) -> None:
+        self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
+        self._config = configs[0]
+        first = [_first_state(env, learner, c, path) for c, path in zip(configs, checkpoints, strict=True)]
+        states = [state for state, _ in first]
+        self._single = len(configs) == 1
+        self._state = states[0] if self._single else jax.tree.map(lambda *x: jnp.stack(x), *states)
+        self._update = jax.jit(learner.update if self._single else jax.vmap(learner.update))
+        self._env_steps = int(states[0].updates) * self._config.steps_per_update
+        self._saved = -1 if checkpoints[0] is None else self._env_steps
+        self._start_time = time.perf_counter() - first[0][1]
+        self._monitor = None
+        if self._config.evaluation.every is not None and eval_env is not None:
+            self._monitor = Monitor(eval_env, self._config)
+        self._evaluations: list[EvaluationLog] = []
+
+    def run(self, on_update: OnUpdate | None) -> list[TrainState]:
+        """Runs the updates that are left and returns the last states."""
+        config = self._config
+        self._save()  # so that a training killed before its first regular checkpoint can be resumed too
+        for own, folder in zip(self._configs, self._folders, strict=True):
+            write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
+        self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
+        total_steps = config.num_updates * config.steps_per_update
+        with contextlib.ExitStack() as logs:
+            files = [[log(folder, self._env_steps) for log in (CsvLog, TensorBoardLog)] for folder in self._folders]
+            for log in (log for pair in files for log in pair):
+                logs.callback(log.close)
+            try:
+                with ProgressLog(config.task or self._env.name, self._env_steps, total_steps) as progress_log:
+                    while self._env_steps < total_steps:
+                        rows = self._step(files)
+                        progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                        if on_update is not None:
+                            for i, row in enumerate(rows):
+                                on_update(self._one(self._state, i), row)
+                        updates = int(rows[0]["updates"])
+                        evaluates = self._monitor is not None and updates % (config.evaluation.every or 1) == 0
+                        if evaluates or self._env_steps >= total_steps:
+                            self._evaluate()
+                        if evaluates or updates % config.checkpoint.every == 0:
+                            self._save()
+                self._save()
+                self._measure_best()
+            except KeyboardInterrupt:
+                self._save()
+                raise
+        return [self._one(self._state, i) for i in range(len(self._configs))]
+
+    def _one(self, tree: Any, seed: int) -> Any:
+        """Returns one seed's part of a stacked tree."""
+        return tree if self._single else jax.tree.map(lambda x: x[seed], tree)
+
+    def _step(self, files: Sequence[Sequence[Any]]) -> list[dict[str, float]]:
+        """Makes one update of every seed and logs it; returns the rows of metrics.csv."""
+        began = time.perf_counter()
+        after, metrics = self._update(self._state)
+        if self._recorder is not None:
+            trace = metrics.pop("trace")
+            self._recorder.add(trace if self._single else join_traces(trace))
+        metrics = jax.device_get(metrics)
+        rows = []
+        for i, folder in enumerate(self._folders):
+            row = _row(self._one(after, i), self._one(metrics, i), self._config, self._start_time, began)
+            row["fps"] *= len(self._folders)
+            _check_finite(self._one(after, i), row, folder)
+            rows.append(row)
+        for logs, row in zip(files, rows, strict=True):
+            for log in logs:
+                log.write(row)
+        # Assigned after logging, so that an interrupted training saves no more updates than its logs show.
+        self._state, self._env_steps = after, int(rows[0]["env_steps"])
+        return rows
+
+    def _policies(self) -> list[Policy]:
+        dims = env_dims(self._env, self._config)
+        return [
+            policy_of(self._one(self._state, i), dims, config, task=self._env.name, env_steps=self._env_steps)
+            for i, config in enumerate(self._configs)
+        ]
+
+    def _save(self) -> None:
+        """Writes checkpoint and policy of every seed, once per update."""
+        if self._saved == self._env_steps:
+            return
+        seconds = time.perf_counter() - self._start_time
+        kept = self._config.checkpoint.kept if self._single else max(self._config.checkpoint.kept, 2)
+        for i, (config, folder, policy) in enumerate(zip(self._configs, self._folders, self._policies(), strict=True)):
+            metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
+            metadata["environments"] = config.checkpoint.environments
+            state = self._one(self._state, i)
+            tree = state if config.checkpoint.environments else _without_environments(state)
+            save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+            save_policy(folder, policy)
+        self._saved = self._env_steps
+        for log in self._evaluations:
+            log.prune()
+
+    def _evaluate(self) -> None:
+        """Evaluates every seed's policy, once per update."""
+        if self._monitor is None or self._evaluations[0].last_steps() == self._env_steps:
+            return
+        policies = self._policies()
+        steps = [self._env_steps] * len(policies)
+        results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
+        for log, result, policy in zip(self._evaluations, results, policies, strict=True):
+            log.add(result, policy)
+
+    def _measure_best(self) -> None:
+        """Measures the absolute metric of every seed's best policy, once."""
+        if self._monitor is None or all(log.absolute is not None for log in self._evaluations):
+            return
+        self._evaluate()
+        policies, steps = zip(*(log.best_policy() for log in self._evaluations), strict=True)
+        results = self._monitor.evaluate(policies, steps, ABSOLUTE_FACTOR * self._config.evaluation.episodes)
+        for log, result in zip(self._evaluations, results, strict=True):
+            log.end(result, self._env_steps)
+
+
+def _without_environments(state: TrainState) -> dict[str, Any]:
+    """Returns what a checkpoint without environments holds."""
+    return {**_learned(state), "key": state.key, "updates": state.updates}
 
 
 def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) -> None:
@@ -203,8 +331,12 @@ def _first_state(
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
     _check_same(checkpoint.parent.parent, metadata.get("config", {}), config)
+    whole = metadata.get("environments", True)
     template = jax.eval_shape(learner.init, initial_key(config))
-    restored = load_checkpoint(checkpoint, template)
-    if wrong := nonfinite(_learned(restored.tree)):
+    tree = load_checkpoint(checkpoint, template if whole else _without_environments(template)).tree
+    if wrong := nonfinite(_learned(tree) if whole else {name: tree[name] for name in _learned(template)}):
         raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
-    return jax.tree.map(jnp.asarray, restored.tree), float(metadata.get("seconds", 0.0))
+    if not whole:
+        fresh = jax.jit(learner.init)(jax.random.fold_in(tree["key"], tree["updates"]))
+        tree = dataclasses.replace(fresh, **tree)
+    return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))

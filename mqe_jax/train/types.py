@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
 
@@ -90,6 +91,13 @@ class Recorder(Protocol):
 
     def snapshot(self, env_state: Any) -> PyTree: ...
     def add(self, trace: Trace) -> None: ...
+
+
+def join_traces(traces: Trace) -> Trace:
+    """Returns the traces of B batches of environments (B, T, N, ...) as the trace of all of them (T, B * N, ...)."""
+    return jax.tree.map(
+        lambda x: jnp.swapaxes(x, 0, 1).reshape(x.shape[1], x.shape[0] * x.shape[2], *x.shape[3:]), traces
+    )
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:

@@ -9,16 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mqe_jax.errors import InputError
+from mqe_jax.study import paper
 
-# Average step reward after 40 M steps, read off the figures of arXiv 2403.16015, with the walk policy.
-PAPER = {
-    "go1gate": {"MAPPO": 2.75, "JRPO": 3.1, "MAT": 2.1},
-    "go1seesaw": {"MAPPO": 0.73, "JRPO": 0.73, "MAT": 0.62},
-    "go1sheep-easy": {"MAPPO": 0.28, "JRPO": 0.40, "MAT": 0.58},
-    "go1sheep-hard": {"MAPPO": 1.75, "JRPO": 1.75, "MAT": 3.3},
-    "go1pushbox": {"MAPPO": 0.0009, "JRPO": 0.001, "MAT": 0.0012},
-    "go1football-defender": {"MAPPO": 0.55, "JRPO": 0.33, "MAT": 0.30},
-}
 _INK, _OURS, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
 
 
@@ -68,8 +60,12 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
         axes.plot(steps, reward, color=_OURS, lw=0.6, alpha=0.3)
         axes.plot(steps, smooth(reward), color=_OURS, lw=1.8, label="ours" if table is tables[0] else None)
     last = max((t["env_steps"][-1] for t in tables if t["env_steps"]), default=0.0) / 1e6
-    for (name, value), style in zip(PAPER.get(task, {}).items(), ("--", "-.", ":"), strict=False):
-        axes.axhline(value, color=_PALE, lw=1.0, ls=style, label=f"paper, {name}, after 40 M steps: {value:g}")
+    for (name, value), style in zip(
+        paper.VALUES[paper.HIERARCHICAL].get(task, {}).items(), ("--", "-.", ":"), strict=False
+    ):
+        axes.axhline(
+            value, color=_PALE, lw=1.0, ls=style, label=f"paper, {paper.ALGORITHMS[name]}, after 40 M steps: {value:g}"
+        )
     axes.set(xlabel="environment steps (millions)", ylabel="average step reward", xlim=(0, max(last, 1e-6)))
     axes.set_title(title or task, color=_INK, loc="left")
     axes.grid(alpha=0.25)

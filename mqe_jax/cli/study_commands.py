@@ -1,0 +1,79 @@
+"""Implementations of `mqe sweep` and `mqe report`."""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path
+from typing import Any
+
+from mqe_jax.cli.arguments import Report, Sweep
+from mqe_jax.cli.output import say
+from mqe_jax.cli.setup import environments, train_config
+from mqe_jax.envs import ALIASES, TASKS
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.study import report as reports
+from mqe_jax.study import sweep as sweeps
+from mqe_jax.train.config import TrainConfig
+
+
+def sweep(arguments: Sweep) -> dict[str, Any]:
+    """Trains what is missing of a sweep and writes its report, or says what it would take."""
+    settings = sweeps.load_sweep(arguments.file)
+    for task in settings.tasks:
+        if task not in TASKS and task not in ALIASES:
+            raise InputError(f"tasks: unknown {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
+    folder = arguments.folder or Path("runs") / arguments.file.stem
+
+    def config_of(task: str, algorithm: str) -> TrainConfig:
+        return train_config(task, settings.config, algorithm=algorithm)
+
+    jobs = sweeps.plan(settings, folder, config_of)
+    result = _estimate(folder, jobs)
+    if arguments.dry_run:
+        if not arguments.json:
+            _print(result)
+        return result
+    sweeps.prepare(settings, folder)
+    try:
+        sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
+    except KeyboardInterrupt:
+        say(f"mqe: stopped; continue with: mqe sweep {arguments.file} --folder {folder}")
+        raise
+    files = reports.report(folder)
+    say(f"mqe: {files[-1]} and {len(files) - 1} more files beside it")
+    return {"left": _estimate(folder, sweeps.plan(settings, folder, config_of)), "report": [str(f) for f in files]}
+
+
+def report(arguments: Report) -> dict[str, Any]:
+    """Writes the report of a study's folder from its raw data."""
+    files = reports.report(arguments.folder)
+    say(f"mqe: {files[-1]} and {len(files) - 1} more files beside it")
+    return {"report": [str(file) for file in files]}
+
+
+def _estimate(folder: Path, jobs: list[sweeps.Job]) -> dict[str, Any]:
+    """Returns what is left of a sweep: a row for each job, and sums."""
+    seconds = sweeps.estimate(folder, jobs)
+    rows = [
+        {
+            "task": job.cell.task,
+            "algorithm": job.cell.algorithm,
+            "setting": job.cell.setting,
+            "seeds": [config.seed for config in job.configs],
+            "steps_left": job.steps_left,
+            "seconds": None if math.isnan(s) else round(s),
+        }
+        for job, s in zip(jobs, seconds, strict=True)
+    ]
+    total = sum(seconds) if seconds else 0.0
+    steps = sum(job.steps_left for job in jobs)
+    return {"jobs": rows, "steps_left": steps, "seconds": None if math.isnan(total) else round(total)}
+
+
+def _print(result: dict[str, Any]) -> None:
+    for row in [*result["jobs"], {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]}]:
+        name = " ".join(str(row[key]) for key in ("task", "algorithm", "setting") if key in row)
+        seeds = " ".join(map(str, row.get("seeds", [])))
+        time = "time unknown" if row["seconds"] is None else f"{row['seconds'] / 3600:.2f} h"
+        print(f"{name:<45} {f'seeds {seeds}' if seeds else '':<20} {row['steps_left'] / 1e6:>9.3g} M steps  {time}")

@@ -1,0 +1,32 @@
+"""Results as the nested JSON that the package `marl-eval` reads (Gorsane et al. 2022, arXiv 2209.10485)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+ENVIRONMENT = "mqe"
+METRICS = ("average_step_reward", "success_rate")
+
+
+def to_marl_eval(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns environment -> task -> algorithm -> run -> step_k -> {step_count, metric: [value]}, absolute_metrics.
+
+    `runs` are evaluation records (`mqe_jax.study.records`) of trainings that have ended. Each list holds one value,
+    the mean over the evaluation's episodes under drawn actions: the format allows one value in place of one for each
+    episode.
+    """
+    tree: dict[str, Any] = {}
+    for run in runs:
+        steps: dict[str, Any] = {
+            f"step_{i}": {"step_count": point["env_steps"], **_metrics(point)}
+            for i, point in enumerate(run["evaluations"], start=1)
+        }
+        steps["absolute_metrics"] = _metrics(run["absolute"])
+        algorithm = tree.setdefault(run["task"], {}).setdefault(run["algorithm"], {})
+        algorithm[f"seed_{run['seed']}"] = steps
+    return {ENVIRONMENT: tree}
+
+
+def _metrics(point: Mapping[str, Any]) -> dict[str, list[float]]:
+    return {name: [point["sampled"][name]] for name in METRICS if name in point["sampled"]}

@@ -1,0 +1,56 @@
+"""What the paper reports (arXiv 2403.16015): average step reward after 40 M environment steps, read off its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+TITLES: Mapping[str, str] = {
+    "go1gate": "Narrow Gate",
+    "go1seesaw": "Climb on Seesaw",
+    "go1sheep-easy": "Sheep Dog (Easy)",
+    "go1sheep-hard": "Sheep Dog (Hard)",
+    "go1pushbox": "Push Box",
+    "go1football-defender": "Football (2 vs 1)",
+}
+"""Tasks of the paper's figure, in its order: rows from top to bottom, two to a row."""
+
+ALGORITHMS: Mapping[str, str] = {"jrpo": "JRPO", "mat": "MAT", "mappo": "MAPPO"}
+"""Algorithms of the paper's figure by id, in the order of its legend."""
+
+STEPS = 40_000_000
+"""Environment steps of each training in the paper."""
+
+HIERARCHICAL, SCRATCH = "hierarchical", "scratch"
+"""The paper's two settings: commands for the walk policy, or joint targets."""
+
+VALUES: Mapping[str, Mapping[str, Mapping[str, float]]] = {
+    HIERARCHICAL: {
+        "go1gate": {"mappo": 2.75, "jrpo": 3.1, "mat": 2.1},
+        "go1seesaw": {"mappo": 0.73, "jrpo": 0.73, "mat": 0.62},
+        "go1sheep-easy": {"mappo": 0.28, "jrpo": 0.40, "mat": 0.58},
+        "go1sheep-hard": {"mappo": 1.75, "jrpo": 1.75, "mat": 3.3},
+        "go1pushbox": {"mappo": 0.0009, "jrpo": 0.001, "mat": 0.0012},
+        "go1football-defender": {"mappo": 0.55, "jrpo": 0.33, "mat": 0.30},
+    },
+    SCRATCH: {
+        "go1gate": {"best": 0.0},
+        "go1seesaw": {"best": 0.15},
+        "go1sheep-easy": {"best": 0.001},
+        "go1sheep-hard": {"best": 1.73},
+        "go1pushbox": {"best": 0.001},
+        "go1football-defender": {"best": 0.252},
+    },
+}
+"""Setting -> task -> algorithm -> average step reward. From scratch only the best algorithm's value is legible."""
+
+GATE_TERMS: Mapping[str, str] = {"reward/approach": "Distance to Target Reward", "reward/success": "Success Reward"}
+"""Reward terms of go1gate in the appendix figure (MAPPO, first 20 M steps, mean of 5 seeds), by column name."""
+
+GATE_STEPS = 20_000_000
+"""Environment steps of the appendix figure."""
+
+
+def value(setting: str, task: str, algorithm: str) -> float | None:
+    """Returns the paper's value of a cell, the best algorithm's where only that is known, or None."""
+    cell = VALUES.get(setting, {}).get(task, {})
+    return cell.get(algorithm, cell.get("best"))

@@ -1,0 +1,99 @@
+"""Statistics over few runs: interquartile mean, stratified bootstrap intervals, probability of improvement, profiles.
+
+Scores are float arrays (runs, tasks); a statistic maps scores with any leading axes (..., runs, tasks) to (...).
+Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 2022, arXiv 2209.10485 (their use for
+teams of agents). Numbers equal those of the `rliable` package (tests/data/rliable.json).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mqe_jax.errors import InputError
+
+Array = NDArray[np.float64]
+Statistic = Callable[[Array], Array]
+
+
+class Random(Protocol):
+    """Source of bootstrap indices: a `numpy.random.Generator`, or anything with its `integers`."""
+
+    def integers(self, low: int, high: int, size: tuple[int, ...]) -> NDArray[np.int64]: ...
+
+
+def interquartile_mean(scores: ArrayLike) -> Array:
+    """Returns the mean of the middle half of all scores: (..., runs, tasks) -> (...).
+
+    The lowest and the highest quarter, rounded down to whole scores, are left out.
+    """
+    flat = _flat(np.asarray(scores, np.float64))
+    cut = flat.shape[-1] // 4
+    return np.sort(flat, axis=-1)[..., cut : flat.shape[-1] - cut].mean(axis=-1)
+
+
+def mean(scores: ArrayLike) -> Array:
+    """Returns the mean of all scores: (..., runs, tasks) -> (...)."""
+    return _flat(np.asarray(scores, np.float64)).mean(axis=-1)
+
+
+def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
+    """Returns the fraction of scores above each threshold: (..., runs, tasks), (K,) -> (..., K)."""
+    flat = _flat(np.asarray(scores, np.float64))
+    return np.mean(flat[..., None, :] > np.asarray(thresholds, np.float64)[:, None], axis=-1)
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
+    """Returns P(a run of x beats a run of y), mean over tasks; ties count half.
+
+    Shapes: x (..., runs of x, tasks), y (..., runs of y, tasks) -> (...). Per task it is the Mann-Whitney U statistic
+    over the number of pairs.
+    """
+    pairs = np.asarray(x, np.float64)[..., :, None, :] - np.asarray(y, np.float64)[..., None, :, :]
+    return np.mean((pairs > 0) + 0.5 * (pairs == 0), axis=(-3, -2, -1))
+
+
+def bootstrap_interval(
+    scores: Array | Sequence[Array],
+    statistic: Callable[..., Array],
+    random: Random,
+    *,
+    samples: int = 2000,
+    confidence: float = 0.95,
+) -> tuple[Array, Array]:
+    """Returns lower and upper end of a percentile bootstrap interval; runs are drawn anew within each task.
+
+    Several score arrays (of one statistic, such as `probability_of_improvement`) are resampled independently.
+    Tasks are the strata: they stay fixed. With a single run both ends are the statistic itself.
+
+    Raises:
+        InputError: where scores are not (runs, tasks), or not finite.
+    """
+    groups = [np.asarray(group, np.float64) for group in ([scores] if isinstance(scores, np.ndarray) else scores)]
+    for group in groups:
+        if group.ndim != 2 or not group.size:
+            raise InputError(f"scores: shape {group.shape} is not allowed; it must be (runs, tasks), both at least 1")
+        if not np.isfinite(group).all():
+            raise InputError("scores: not all finite; leave out runs without a value")
+    resampled = []
+    for group in groups:
+        runs, tasks = group.shape
+        index = random.integers(0, runs, size=(samples, runs, tasks))
+        resampled.append(group[index, np.arange(tasks)])
+    values = statistic(*resampled)
+    tail = 50.0 * (1.0 - confidence)
+    low, high = np.percentile(values, [tail, 100.0 - tail], axis=0)
+    return low, high
+
+
+def normalized(scores: Mapping[str, Array], low: Array, high: Array) -> dict[str, Array]:
+    """Returns scores of each algorithm, (runs, tasks), as fractions of the range low (tasks,) to high (tasks,)."""
+    width = np.where(high > low, high - low, 1.0)
+    return {name: (values - low) / width for name, values in scores.items()}
+
+
+def _flat(scores: Array) -> Array:
+    return scores.reshape(*scores.shape[:-2], -1)

@@ -1,0 +1,190 @@
+"""Sweeps: tasks x algorithms x settings x seeds in one folder, resumed after any interruption.
+
+FOLDER/sweep.yaml    what the folder holds
+FOLDER/runs/...      run folders, with checkpoints
+FOLDER/raw/...       raw data of the runs that have ended (`mqe_jax.study.records`)
+FOLDER/report/...    the report, remade when the sweep ends (`mqe_jax.study.report`)
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from annotated_types import MinLen
+
+from mqe_jax.errors import InputError
+from mqe_jax.files import check_folder, locked, write_atomically
+from mqe_jax.settings import NonNegativeInt, PositiveInt, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.study.paper import HIERARCHICAL
+from mqe_jax.study.records import Cell, Record, read_curve, write_record
+from mqe_jax.train.checkpoint import list_checkpoints
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.monitor import read_evaluations
+from mqe_jax.train.runner import OnUpdate, train_seeds
+from mqe_jax.train.types import VectorEnv
+
+SWEEP_FILE = "sweep.yaml"
+
+Environments = Callable[[TrainConfig, int], tuple[VectorEnv, VectorEnv | None]]
+"""Makes training and evaluation environments of a number of seeds trained together."""
+
+
+@record
+class Sweep:
+    """What a sweep trains: every combination of tasks, algorithms, variants and seeds."""
+
+    tasks: Annotated[tuple[str, ...], MinLen(1)]
+    """Ids of the tasks."""
+    algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
+    """Names of the algorithms, as of `mqe train --algorithm`."""
+    seeds: Annotated[tuple[NonNegativeInt, ...], MinLen(1)] = (0, 1, 2, 3, 4)
+    """Random seeds."""
+    seeds_together: PositiveInt | None = None
+    """Seeds trained in one program; none trains all of them at once."""
+    config: str | None = None
+    """Settings file or shipped name; none uses the paper's settings of each algorithm."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings that override the file's in every run."""
+    variants: Mapping[str, Any] = field(default_factory=lambda: {HIERARCHICAL: {}})
+    """Named further settings, each a setting of the study, such as scratch: {env: {control: position}}."""
+
+    def __post_init__(self) -> None:
+        for name in ("tasks", "algorithms", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) < len(values):
+                fail(name, values, "a list without repetitions")
+        for name, values in self.variants.items():
+            if not isinstance(values, Mapping) or not name.replace("-", "").replace("_", "").isalnum():
+                fail(f"variants.{name}", values, "a mapping of settings, under a name of letters and digits")
+
+
+@dataclass(frozen=True)
+class Job:
+    """Seeds of one cell that are trained together, with the settings of each."""
+
+    cell: Cell
+    configs: tuple[TrainConfig, ...]
+    folders: tuple[Path, ...]
+    steps_done: int  # environment steps of the slowest seed's newest checkpoint
+
+    @property
+    def steps_left(self) -> int:
+        """Environment steps that are left, summed over seeds."""
+        config = self.configs[0]
+        return len(self.configs) * (config.num_updates * config.steps_per_update - self.steps_done)
+
+
+def load_sweep(path: Path) -> Sweep:
+    """Reads a sweep's YAML file.
+
+    Raises:
+        InputError: naming the file, for anything that is wrong in it.
+    """
+    try:
+        return build(Sweep, load_yaml(path))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def plan(sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig]) -> list[Job]:
+    """Returns what is left to train, in the order in which it will be.
+
+    `config_of(task, algorithm)` gives the settings before those of the sweep. Runs whose raw data are there are done.
+    Of the others, those with checkpoints and those without are trained apart, so that all seeds of a job start from
+    the same step.
+
+    Raises:
+        InputError: for a task, an algorithm or a setting that is not allowed.
+    """
+    jobs = []
+    for task, algorithm, variant in itertools.product(sweep.tasks, sweep.algorithms, sweep.variants):
+        config = override(override(config_of(task, algorithm), sweep.settings), sweep.variants[variant])
+        cell = Cell(task, algorithm, variant)
+        left = [seed for seed in sweep.seeds if not _raw(folder, cell, seed).is_file()]
+        started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
+        fresh = [seed for seed in left if seed not in started]
+        size = sweep.seeds_together or len(sweep.seeds)
+        for group in (started, fresh):
+            for i in range(0, len(group), size):
+                jobs.append(_job(folder, cell, config, group[i : i + size]))
+    return jobs
+
+
+def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) -> Job:
+    folders = tuple(_run(folder, cell, seed) for seed in seeds)
+    steps = [[int(path.stem.removeprefix("step_")) for path in list_checkpoints(run)] for run in folders]
+    return Job(
+        cell, tuple(override(config, {"seed": seed}) for seed in seeds), folders, min(max(s, default=0) for s in steps)
+    )
+
+
+def _run(folder: Path, cell: Cell, seed: int) -> Path:
+    return folder / "runs" / cell.path / f"seed{seed}"
+
+
+def _raw(folder: Path, cell: Cell, seed: int) -> Path:
+    return folder / "raw" / cell.path / f"seed{seed}.json"
+
+
+def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
+    """Returns for each job the seconds that it will take, from the speed of runs in the folder; NaN if there are none.
+
+    The speed is that of runs of the same task and algorithm, or else of all.
+    """
+    speeds: dict[tuple[str, ...], list[float]] = {}
+    for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
+        try:
+            curve = read_curve(path)
+        except InputError:
+            continue  # a run that was stopped before its first update
+        if "fps" in curve:
+            fps = float(curve["fps"][len(curve["fps"]) // 2])
+            for key in ((), path.parts[-4:-2]):
+                speeds.setdefault(key, []).append(fps)
+    seconds = []
+    for job in jobs:
+        known = speeds.get(job.cell.path.parts) or speeds.get(())
+        seconds.append(job.steps_left * len(known) / sum(known) if known else math.nan)
+    return seconds
+
+
+def prepare(sweep: Sweep, folder: Path) -> None:
+    """Creates the folder and writes sweep.yaml into it; tasks, algorithms, variants and seeds may be added later.
+
+    Raises:
+        InputError: where the folder holds a sweep of other settings.
+    """
+    check_folder(folder)
+    path = folder / SWEEP_FILE
+    if path.is_file():
+        before = load_sweep(path)
+        for name in ("config", "settings"):
+            old, new = getattr(before, name), getattr(sweep, name)
+            if old != new:
+                raise InputError(f"{name}: {new!r} differs from {path}, which has {old!r}; name another folder")
+        for name, values in before.variants.items():
+            if sweep.variants.get(name, values) != values:
+                raise InputError(f"variants.{name}: differs from {path}, which has {values!r}; name another folder")
+    write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
+
+
+def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> None:
+    """Trains the jobs one after the other; each continues from its checkpoints and leaves raw data when it ends.
+
+    Raises:
+        InputError: where another process works in the folder, or a run cannot be continued.
+    """
+    with locked(folder):
+        for job in jobs:
+            env, eval_env = environments(job.configs[0], len(job.configs))
+            train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
+            for config, run_dir in zip(job.configs, job.folders, strict=True):
+                evaluation = read_evaluations(run_dir)
+                kept = {name: evaluation[name] for name in ("evaluations", "absolute")}
+                write_record(folder, Record(job.cell, config.seed, read_curve(run_dir / "metrics.csv"), kept))

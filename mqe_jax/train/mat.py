@@ -1,0 +1,249 @@
+"""The network `mat`: a transformer over agents that act one after the other, each knowing its predecessors' actions.
+
+An encoder attends over the observations of a team and gives each agent's value; a decoder attends over the actions of
+the agents before. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
+log-probabilities. In a match each team is a sequence of its own, of the same weights.
+
+Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as OpenRL has them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.settings import Positive, PositiveInt, fail
+from mqe_jax.train import nn
+from mqe_jax.train.loss import entropy, log_prob
+from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
+from mqe_jax.train.types import Memory, NetworkMemory, Params
+
+
+@register_network("mat")
+class Mat(NetworkSettings):
+    """Settings of the multi-agent transformer."""
+
+    blocks: PositiveInt = 1
+    """Blocks of the encoder and of the decoder."""
+    heads: PositiveInt = 1
+    """Attention heads; a divisor of `width`."""
+    width: PositiveInt = 64
+    """Width of every layer."""
+    gain: Positive = 0.01
+    """Orthogonal gain of attention, of residual branches' last layers, and of the output layers."""
+    deviation: Literal["sigmoid", "free"] = "sigmoid"
+    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 at first (OpenRL), or a free logarithm."""
+    log_std_init: float = 0.0
+    """Initial log standard deviation, with deviation `free`."""
+    log_std_max: float | None = None
+    """Upper bound on the log standard deviation, with deviation `free`; none sets no bound."""
+    log_std_min: float | None = None
+    """Lower bound on the log standard deviation, with deviation `free`; none sets no bound."""
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            fail("heads", self.heads, f"a divisor of width ({self.width})")
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network; see `Network`."""
+        return _build(self, dims)
+
+
+class Order(NamedTuple):
+    """Who sees whom, from the teams; agents act in the order in which their team lists them."""
+
+    team: np.ndarray  # (A, A) bool, both are of one team: what the encoder attends to
+    causal: np.ndarray  # (A, A) bool, of one team and not after: what the decoder attends to
+    rank: np.ndarray  # (A,) place in the team's sequence
+    previous: np.ndarray  # (A,) the agent before, itself where there is none
+
+
+def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:
+    """Returns the order of acting within teams."""
+    agents = sum(len(team) for team in teams)
+    team, rank, previous = np.zeros(agents, int), np.zeros(agents, int), np.arange(agents)
+    for number, members in enumerate(teams):
+        for place, agent in enumerate(members):
+            team[agent], rank[agent] = number, place
+            previous[agent] = members[max(place - 1, 0)]
+    same = team[:, None] == team
+    return Order(same, same & (rank <= rank[:, None]), rank, previous)
+
+
+# -- layers ----------------------------------------------------------------------------------------------------------
+
+
+def layer_norm(params: Params, x: jax.Array) -> jax.Array:
+    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) -> (..., W).
+
+    Source: Ba et al., arXiv 1607.06450.
+    """
+    x = x - jnp.mean(x, axis=-1, keepdims=True)
+    x = x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
+    return x * params["scale"] + params["shift"]
+
+
+def _layer_norm_init(width: int) -> Params:
+    return {"scale": jnp.ones((width,)), "shift": jnp.zeros((width,))}
+
+
+def attention(params: Params, query: jax.Array, memory: jax.Array, mask: np.ndarray, heads: int) -> jax.Array:
+    """Attends from `query` to `memory` where `mask` (A, A) allows: (..., A, W), (..., A, W) -> (..., A, W).
+
+    Source: Vaswani et al., arXiv 1706.03762, equation 1.
+    """
+
+    def split(name: str, x: jax.Array) -> jax.Array:
+        x = nn.dense(params[name], x)
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], heads, -1), -2, -3)  # (..., heads, A, W / heads)
+
+    q, k, v = split("query", query), split("key", memory), split("value", memory)
+    weight = jnp.matmul(q, jnp.swapaxes(k, -1, -2), precision=nn.PRECISION) / math.sqrt(q.shape[-1])
+    weight = jax.nn.softmax(jnp.where(mask, weight, -jnp.inf), axis=-1)
+    mixed = jnp.moveaxis(jnp.matmul(weight, v, precision=nn.PRECISION), -3, -2)
+    return nn.dense(params["projection"], mixed.reshape(*mixed.shape[:-2], -1))
+
+
+def _gelu(x: jax.Array) -> jax.Array:
+    return jax.nn.gelu(x, approximate=False)
+
+
+def _head(params: Params, x: jax.Array) -> jax.Array:
+    return nn.dense(params["out"], layer_norm(params["norm"], _gelu(nn.dense(params["hidden"], x))))
+
+
+# -- encoder and decoder ---------------------------------------------------------------------------------------------
+
+
+def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
+    """Initialises encoder, value head, decoder and the parameter of the deviation."""
+    width, small, large = settings.width, settings.gain, math.sqrt(2.0)
+    square_key, *keys = jax.random.split(key, 5)
+    # All square matrices in one program, which compiles in a fraction of the time of one for each.
+    count = 2 + settings.blocks * (6 + 10)
+    squares = iter(jax.vmap(lambda k: nn.orthogonal(k, (width, width), 1.0))(jax.random.split(square_key, count)))
+
+    def square(gain: float) -> Params:
+        return {"weight": gain * next(squares), "bias": jnp.zeros((width,), jnp.float32)}
+
+    def block(attentions: int) -> Params:
+        layers: Params = {
+            f"attention{i}": {name: square(small) for name in ("query", "key", "value", "projection")}
+            for i in range(attentions)
+        }
+        layers |= {f"norm{i}": _layer_norm_init(width) for i in range(attentions + 1)}
+        return {**layers, "mlp": {"0": square(large), "1": square(small)}}
+
+    def head(k: jax.Array, n_out: int) -> Params:
+        return {
+            "hidden": square(large),
+            "norm": _layer_norm_init(width),
+            "out": nn.dense_init(k, width, n_out, small),
+        }
+
+    start = 1.0 if settings.deviation == "sigmoid" else settings.log_std_init
+    return {
+        "encoder": {
+            "norm_in": _layer_norm_init(dims.observation),
+            "embed": nn.dense_init(keys[0], dims.observation, width),
+            "norm": _layer_norm_init(width),
+            "blocks": [block(1) for _ in range(settings.blocks)],
+        },
+        "value_head": head(keys[1], 1),
+        "decoder": {
+            "embed": nn.dense_init(keys[2], dims.action, width),
+            "norm": _layer_norm_init(width),
+            "blocks": [block(2) for _ in range(settings.blocks)],
+            "head": head(keys[3], dims.action),
+        },
+        "deviation": jnp.full((dims.action,), start, jnp.float32),
+    }
+
+
+def encode(params: Params, obs: jax.Array, order: Order, heads: int) -> jax.Array:
+    """Returns features of every agent from the observations of its team: (..., A, O) -> (..., A, W)."""
+    x = layer_norm(params["norm"], _gelu(nn.dense(params["embed"], layer_norm(params["norm_in"], obs))))
+    for block in params["blocks"]:
+        x = layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.team, heads))
+        x = layer_norm(block["norm1"], x + nn.mlp(block["mlp"], x, _gelu))
+    return x
+
+
+def decode(params: Params, features: jax.Array, action: jax.Array, order: Order, heads: int) -> jax.Array:
+    """Returns mean actions given the actions of the agents before: (..., A, W), (..., A, D) -> (..., A, D).
+
+    An agent's own and later actions have no effect on its mean; the first agent's token is zero.
+    """
+    token = jnp.where((order.rank > 0)[:, None], action[..., order.previous, :], 0.0)
+    x = layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
+    for block in params["blocks"]:
+        x = layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.causal, heads))
+        x = layer_norm(block["norm1"], features + attention(block["attention1"], features, x, order.causal, heads))
+        x = layer_norm(block["norm2"], x + nn.mlp(block["mlp"], x, _gelu))
+    return _head(params["head"], x)
+
+
+def log_std_of(params: Params, settings: Mat) -> jax.Array:
+    """Returns the log standard deviation of the actions (D,)."""
+    parameter = params["deviation"]
+    if settings.deviation == "sigmoid":
+        return math.log(0.5) + jax.nn.log_sigmoid(parameter)
+    low = -jnp.inf if settings.log_std_min is None else settings.log_std_min
+    high = jnp.inf if settings.log_std_max is None else settings.log_std_max
+    return jnp.clip(parameter, low, high)
+
+
+def _build(settings: Mat, dims: EnvDims) -> Network:
+    if dims.values != dims.agents:
+        fail("ppo.value", "joint", "'agent' with the network 'mat', whose encoder gives each agent's value")
+    order, heads = order_of(dims.teams), settings.heads
+
+    def act(
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, Memory]:
+        features = encode(params["encoder"], obs, order, heads)
+        shape = (*obs.shape[:-1], dims.action)
+        log_std = jnp.broadcast_to(log_std_of(params, settings), shape)
+        noise = 0.0 if key is None else jnp.exp(log_std) * jax.random.normal(key, shape, obs.dtype)
+
+        def act_at(rank: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            action, mean = carry
+            now = (order.rank == rank)[:, None]
+            mean = jnp.where(now, decode(params["decoder"], features, action, order, heads), mean)
+            return jnp.where(now, mean + noise, action), mean
+
+        zero = jnp.zeros(shape, obs.dtype)
+        action, mean = jax.lax.fori_loop(0, int(order.rank.max()) + 1, act_at, (zero, zero))
+        return action, log_prob(action, mean, log_std), memory
+
+    def value(
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
+    ) -> tuple[jax.Array, Memory]:
+        return _head(params["value_head"], encode(params["encoder"], obs, order, heads))[..., 0], memory
+
+    def evaluate(
+        params: Params,
+        memory: NetworkMemory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        action: jax.Array,
+    ) -> Evaluation:
+        features = encode(params["encoder"], obs, order, heads)
+        mean = decode(params["decoder"], features, action, order, heads)
+        log_std = jnp.broadcast_to(log_std_of(params, settings), mean.shape)
+        values = _head(params["value_head"], features)[..., 0]
+        return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)
+
+    return Network(
+        init=lambda key: init_params(key, dims, settings),
+        acting=lambda params: {name: params[name] for name in ("encoder", "decoder", "deviation")},
+        initial_memory=lambda num_envs: NetworkMemory((), ()),
+        act=act,
+        value=value,
+        evaluate=evaluate,
+    )

@@ -1,0 +1,157 @@
+"""Evaluation during training: the record of a run's evaluations, its best policy, and the absolute metric.
+
+    RUN/evaluations.json          {"evaluations": [...], "absolute": {...} or null}
+    RUN/best/step_*.safetensors   the policy of the best evaluation so far
+
+Source: Gorsane et al. 2022, arXiv 2209.10485, section 4.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.errors import InputError
+from mqe_jax.files import write_atomically
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import EvalResult, Evaluator
+from mqe_jax.train.learner import env_dims
+from mqe_jax.train.normalize import running_normalize
+from mqe_jax.train.policy import Policy, load_policy, save_policy
+from mqe_jax.train.types import Memory, VectorEnv
+
+EVALUATIONS_FILE = "evaluations.json"
+ABSOLUTE_FACTOR = 10
+"""Episodes of the absolute metric, in episodes of an evaluation."""
+
+_SAMPLED, _DETERMINISTIC = 0, 1
+
+
+class Monitor:
+    """Evaluates the policies of a training's seeds, all by one program: drawn and mean actions of each."""
+
+    def __init__(self, env: VectorEnv, config: TrainConfig) -> None:
+        if env.num_envs != config.evaluation.episodes:
+            raise InputError(f"evaluation.episodes: {config.evaluation.episodes}; the environments are {env.num_envs}")
+        network = config.network.build(env_dims(env, config))
+
+        def act(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+            policy, mode = params
+            if config.normalization.observations:
+                obs = running_normalize(policy["normalizer"], obs)
+            drawn = network.act(policy["params"], memory, obs, key)
+            mean = network.act(policy["params"], memory, obs, None)
+            action, _, memory = jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), drawn, mean)
+            return jnp.clip(config.action_scale * action, -1.0, 1.0), memory
+
+        self._config = config
+        self._evaluator = Evaluator(env, act, network.initial_memory(env.num_envs).actor)
+
+    def evaluate(self, policies: Sequence[Policy], env_steps: Sequence[int], episodes: int) -> list[dict[str, Any]]:
+        """Returns for each policy its evaluation: env_steps, episodes, and results under both kinds of action."""
+        trees = [{"params": policy.params, "normalizer": policy.normalizer} for policy in policies]
+        stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *trees)
+        modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
+        # The same episodes for every policy and step of a training, apart from what the actions change.
+        keys = jnp.tile(jax.random.PRNGKey(self._config.seed), (2 * len(policies), 1))
+        results = self._evaluator((stacked, modes), episodes, keys)
+        return [
+            {
+                "env_steps": steps,
+                "episodes": episodes,
+                "sampled": _plain(results[2 * i]),
+                "deterministic": _plain(results[2 * i + 1]),
+            }
+            for i, steps in enumerate(env_steps)
+        ]
+
+
+def _plain(result: EvalResult) -> dict[str, Any]:
+    """Returns a result as JSON values; numbers that are not finite become null."""
+    values = {k: v for k, v in result.to_dict().items() if k not in ("task", "episodes", "terms")}
+    values |= {f"reward/{name}": value for name, value in result.terms.items()}
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+
+
+def score(evaluation: dict[str, Any]) -> float:
+    """Returns what makes an evaluation the best: the average step reward under drawn actions."""
+    value = evaluation["sampled"]["average_step_reward"]
+    return -math.inf if value is None else float(value)
+
+
+class EvaluationLog:
+    """One run's evaluations on disk; those past `env_steps` are dropped when a run is resumed."""
+
+    def __init__(self, run_dir: Path, env_steps: int) -> None:
+        self._run_dir = run_dir
+        self._path = run_dir / EVALUATIONS_FILE
+        before = read_evaluations(run_dir)
+        self.evaluations = [e for e in before["evaluations"] if e["env_steps"] <= env_steps]
+        self.absolute = before["absolute"] if before["absolute"] and before.get("ended_at") == env_steps else None
+
+    def add(self, evaluation: dict[str, Any], policy: Policy) -> None:
+        """Appends an evaluation; its policy is saved where it is the best of those whose policy is on disk."""
+        best = self.best()
+        if best is None or score(evaluation) > score(best):
+            path = _best_path(self._run_dir, evaluation)
+            path.parent.mkdir(exist_ok=True)
+            save_policy(path.parent, policy, path.name)
+        self.evaluations.append(evaluation)
+        self.absolute = None
+        self._write({})
+
+    def last_steps(self) -> int | None:
+        """Returns the environment steps of the last evaluation, or None."""
+        return self.evaluations[-1]["env_steps"] if self.evaluations else None
+
+    def best(self) -> dict[str, Any] | None:
+        """Returns the best evaluation whose policy is on disk."""
+        there = [e for e in self.evaluations if _best_path(self._run_dir, e).is_file()]
+        return max(there, key=score, default=None)
+
+    def best_policy(self) -> tuple[Policy, int]:
+        """Returns the policy of the best evaluation and its environment steps."""
+        best = self.best()
+        assert best is not None
+        return load_policy(_best_path(self._run_dir, best)), best["env_steps"]
+
+    def end(self, absolute: dict[str, Any], env_steps: int) -> None:
+        """Writes the absolute metric of a training that ended after `env_steps`."""
+        self.absolute = absolute
+        self._write({"ended_at": env_steps})
+
+    def prune(self) -> None:
+        """Removes all policies but the best; called once the checkpoint that includes it is on disk."""
+        best = self.best()
+        for path in (self._run_dir / "best").glob("*.safetensors"):
+            if best is None or path != _best_path(self._run_dir, best):
+                path.unlink(missing_ok=True)
+
+    def _write(self, more: dict[str, Any]) -> None:
+        text = json.dumps({"evaluations": self.evaluations, "absolute": self.absolute, **more}, indent=1) + "\n"
+        write_atomically(self._path, text.encode())
+
+
+def read_evaluations(run_dir: Path) -> dict[str, Any]:
+    """Reads a run's evaluations; without the file there are none.
+
+    Raises:
+        InputError: where the file is damaged.
+    """
+    path = run_dir / EVALUATIONS_FILE
+    if not path.is_file():
+        return {"evaluations": [], "absolute": None}
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+
+
+def _best_path(run_dir: Path, evaluation: dict[str, Any]) -> Path:
+    return run_dir / "best" / f"step_{evaluation['env_steps']:012d}.safetensors"

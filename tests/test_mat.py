@@ -1,0 +1,114 @@
+"""The multi-agent transformer: sequential acting, parallel evaluation, teams, deviation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.errors import InputError
+from mqe_jax.train.mat import Mat, order_of
+from mqe_jax.train.networks import EnvDims, Network
+from mqe_jax.train.types import NetworkMemory, Params
+
+KEY = jax.random.PRNGKey(0)
+NO_MEMORY = NetworkMemory((), ())
+ONE_TEAM = ((0, 1, 2),)
+
+
+def dims(teams: tuple[tuple[int, ...], ...]) -> EnvDims:
+    """Sizes with 5 observations and 2 actions per agent."""
+    agents = sum(map(len, teams))
+    return EnvDims(agents=agents, observation=5, privileged=1, action=2, teams=teams, values=agents)
+
+
+def made(teams: tuple[tuple[int, ...], ...], **settings: Any) -> tuple[Network, Params, jax.Array]:
+    """A network with strong weights, so that every path counts, and observations (4, A, 5)."""
+    network = Mat(gain=1.0, width=8, **settings).build(dims(teams))
+    network = network._replace(init=jax.jit(network.init), act=jax.jit(network.act), evaluate=jax.jit(network.evaluate))
+    return network, network.init(KEY), jax.random.normal(KEY, (4, sum(map(len, teams)), 5))
+
+
+def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Array) -> np.ndarray:
+    """Parallel log-probabilities (N, A, D)."""
+    first = jnp.zeros(obs.shape[:1], bool)
+    return np.asarray(network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], action).log_prob)
+
+
+@pytest.mark.parametrize(
+    ("teams", "settings"),
+    [(ONE_TEAM, {}), (((0, 1), (2, 3)), {"blocks": 2, "heads": 4, "deviation": "free"}), (((2,), (1, 0)), {})],
+)
+def test_parallel_log_probabilities_equal_sequential_ones(teams: tuple, settings: dict) -> None:
+    network, params, obs = made(teams, **settings)
+    action, sequential, _ = network.act(network.acting(params), (), obs, KEY)
+    np.testing.assert_allclose(log_probs(network, params, obs, action), sequential, atol=1e-5)
+    assert float(jnp.std(action)) > 0.1
+    mean, density, _ = network.act(network.acting(params), (), obs, None)
+    np.testing.assert_allclose(log_probs(network, params, obs, mean), density, atol=1e-5)
+
+
+def test_later_actions_change_no_earlier_log_probability() -> None:
+    network, params, obs = made(ONE_TEAM)
+    action = jax.random.normal(KEY, (4, 3, 2))
+    before = log_probs(network, params, obs, action)
+    later = log_probs(network, params, obs, action.at[:, 2].set(action[::-1, 2]))
+    np.testing.assert_allclose(later[:, :2], before[:, :2], atol=1e-6)
+    earlier = log_probs(network, params, obs, action.at[:, 0].set(action[::-1, 0]))
+    assert np.abs(earlier[:, 1:] - before[:, 1:]).max() > 1e-3
+
+
+def test_actions_and_observations_of_the_other_team_have_no_effect() -> None:
+    network, params, obs = made(((0, 1), (2, 3)))
+    action = jax.random.normal(KEY, (4, 4, 2))
+    before = log_probs(network, params, obs, action)
+    other = log_probs(network, params, obs.at[:, 2:].add(1.0), action.at[:, 2:].add(1.0))
+    np.testing.assert_allclose(other[:, :2], before[:, :2], atol=1e-6)
+    mates = log_probs(network, params, obs.at[:, 1].set(obs[::-1, 1]), action)
+    assert np.abs(mates[:, 0] - before[:, 0]).max() > 1e-3
+
+
+def test_both_teams_have_the_same_weights() -> None:
+    network, params, obs = made(((0, 1), (2, 3)))
+    obs = obs.at[:, 2:].set(obs[:, :2])
+    action, _, _ = network.act(network.acting(params), (), obs, None)
+    np.testing.assert_allclose(action[:, :2], action[:, 2:], atol=1e-6)
+    values, _ = network.value(params, (), jnp.zeros((4,), bool), obs, obs[..., 0, :1])
+    assert values.shape == (4, 4)
+    np.testing.assert_allclose(values[:, :2], values[:, 2:], atol=1e-6)
+
+
+def test_the_order_of_uneven_teams() -> None:
+    order = order_of(((2,), (1, 0)))
+    np.testing.assert_array_equal(order.rank, [1, 0, 0])
+    np.testing.assert_array_equal(order.previous, [1, 1, 2])
+    np.testing.assert_array_equal(order.causal, [[1, 1, 0], [0, 1, 0], [0, 0, 1]])
+
+
+def test_the_deviation_starts_as_openrl_has_it_or_free() -> None:
+    for settings, deviation in (
+        ({}, 0.5 / (1 + np.exp(-1))),
+        ({"deviation": "free", "log_std_init": -1.0}, np.exp(-1)),
+    ):
+        network, params, obs = made(ONE_TEAM, **settings)
+        mean, density, _ = network.act(network.acting(params), (), obs, None)
+        np.testing.assert_allclose(density, -np.log(deviation * np.sqrt(2 * np.pi)), rtol=1e-5)
+        assert mean.shape == (4, 3, 2)
+
+
+def test_actions_start_small_and_acting_needs_no_value_head() -> None:
+    network = Mat().build(dims(ONE_TEAM))
+    params = jax.jit(network.init)(KEY)
+    mean, _, _ = jax.jit(network.act)(network.acting(params), (), jax.random.normal(KEY, (4, 3, 5)), None)
+    assert float(jnp.abs(mean).max()) < 0.1
+    assert "value_head" not in network.acting(params)
+
+
+def test_settings_that_do_not_fit_are_named() -> None:
+    with pytest.raises(InputError, match="heads: 3"):
+        Mat(heads=3)
+    with pytest.raises(InputError, match=r"ppo\.value"):
+        Mat().build(dims(ONE_TEAM)._replace(values=1))

@@ -1,0 +1,106 @@
+"""Algorithms by name: their settings, and games that tell them apart."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import probes
+import pytest
+from probes import Probe
+
+from mqe_jax.cli.setup import train_config
+from mqe_jax.errors import InputError
+from mqe_jax.settings import override
+from mqe_jax.train.actor_critic import ActorCritic
+from mqe_jax.train.algorithms import ALGORITHMS, preset
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import make_learner
+from mqe_jax.train.mat import Mat
+from mqe_jax.train.types import VectorEnv
+
+SMALL = {
+    "num_envs": 32,
+    "total_steps": 100_000,
+    "rollout_steps": 8,
+    "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
+    "optimizer": {"learning_rate": 1e-2},
+}
+PLAIN = {"network": {"recurrent": False, "hidden_sizes": [16], "log_std_init": -1.0}}
+
+
+def settings(algorithm: str, *changes: dict[str, Any]) -> TrainConfig:
+    """An algorithm's preset with settings that learn a probe in seconds."""
+    config = override(override(TrainConfig(), SMALL), preset(algorithm))
+    for change in changes:
+        config = override(config, change)
+    return config
+
+
+def learn(env: VectorEnv, config: TrainConfig, updates: int, last: int) -> float:
+    """Trains and returns the mean reward per step over the last updates."""
+    learner = make_learner(env, config)
+    state = jax.jit(learner.init)(jax.random.PRNGKey(1))
+    update = jax.jit(learner.update)
+    rewards = []
+    for _ in range(updates):
+        state, metrics = update(state)
+        rewards.append(float(metrics["average_step_reward"]))
+    return float(np.mean(rewards[-last:]))
+
+
+@pytest.mark.parametrize(("algorithm", "cooperates"), [("jrpo", True), ("ippo", False)])
+def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, cooperates: bool) -> None:
+    """What is best for each is worst for all: -0.5 each; the joint ratio gives all, +0.5 each."""
+    env = Probe(probes.show_hidden, probes.pay_public_good, num_envs=32)
+    reward = learn(env, settings(algorithm, PLAIN), 50, 5)
+    assert reward >= 0.45 if cooperates else reward <= -0.45
+
+
+def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
+    """The loss is two variances where agents draw independently, and one where the second sees the first."""
+    log_std = -1.2
+    fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
+    env = Probe(probes.show_hidden, probes.pay_meeting, num_envs=32)
+    small = {"network": {"width": 16, "deviation": "free"}, "optimizer": {"learning_rate": 3e-3}}
+    variance = math.exp(2 * log_std)
+    assert -learn(env, settings("mat", small, fixed), 100, 20) / variance <= 1.2
+    assert -learn(env, settings("mappo", PLAIN, fixed), 30, 10) / variance >= 1.8
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
+    """The preset changes nothing in the paper's file but MAPPO's ratio, which OpenRL takes per dimension."""
+    config = train_config("go1gate", None, algorithm=algorithm)
+    again = override(override(config, preset(algorithm)), {"ppo.ratio": config.ppo.ratio})
+    assert again == config, algorithm
+    assert config.action_scale == 0.5 and config.num_envs == 500 and config.total_steps == 40_000_000
+    assert isinstance(config.network, Mat if algorithm == "mat" else ActorCritic)
+
+
+def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
+    demo = train_config("go1gate", "demo")
+    joint = train_config("go1gate", "demo", {"seed": 3}, {"gate_width": 1.0}, "jrpo")
+    assert (joint.ppo.ratio, joint.ppo.value, joint.seed) == ("joint", "joint", 3)
+    assert joint.network == demo.network and joint.env == {"gate_width": 1.0}
+    assert train_config("go1gate", "demo", algorithm="mat").network == Mat()
+
+
+def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
+    assert train_config("go1gate", None) == train_config("go1gate", "tuned/go1gate")
+    assert train_config("go1plane", None) == train_config("go1plane", "paper/mappo")
+
+
+def test_unknown_names_get_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"algorithm: 'mapo'.*did you mean 'mappo'"):
+        train_config("go1gate", "demo", algorithm="mapo")
+    with pytest.raises(InputError, match=r"config: unknown name 'deno' \(did you mean 'demo'"):
+        train_config("go1gate", "deno")
+
+
+def test_every_algorithm_has_the_papers_settings() -> None:
+    folder = Path(__file__).parent.parent / "configs"
+    assert {path.stem for path in (folder / "paper").glob("*.yaml")} == set(ALGORITHMS)

@@ -1,0 +1,162 @@
+"""Sweeps on a probe: what is left, stops at any moment, raw data and report at the end."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import probes
+import pytest
+from probes import Probe
+
+from mqe_jax import cli
+from mqe_jax.cli import study_commands
+from mqe_jax.errors import InputError
+from mqe_jax.settings import build, override
+from mqe_jax.study import sweep as sweeps
+from mqe_jax.study.sweep import Sweep
+from mqe_jax.train import runner
+from mqe_jax.train.algorithms import preset
+from mqe_jax.train.config import TrainConfig
+
+PROBE = Probe(probes.show_hidden, probes.pay_near_hidden, num_envs=4)
+FILE = """
+tasks: [go1gate]
+algorithms: [mappo, jrpo]
+seeds: [0, 1]
+settings:
+  num_envs: 4
+  total_steps: 48
+  rollout_steps: 4
+  ppo: {epochs: 1}
+  network: {hidden_sizes: [4], gru_size: 4}
+  checkpoint: {every: 1, environments: false}
+  evaluation: {every: 2, episodes: 4}
+"""
+
+
+class Stop(Exception):
+    """A sweep stopped from outside."""
+
+
+def config_of(task: str, algorithm: str) -> TrainConfig:
+    return override(TrainConfig(task=task), preset(algorithm))
+
+
+def load(tmp_path: Path, text: str = FILE) -> Sweep:
+    path = tmp_path / "small.yaml"
+    path.write_text(text)
+    return sweeps.load_sweep(path)
+
+
+def run_until(folder: Path, sweep: Sweep, updates: int) -> bool:
+    """Runs a sweep and stops it at a number of seeds' updates; returns whether it ended before."""
+    seen = 0
+
+    def on_update(state: Any, row: dict[str, float]) -> None:
+        nonlocal seen
+        seen += 1
+        if seen > updates:
+            raise Stop
+
+    try:
+        sweeps.run(folder, sweeps.plan(sweep, folder, config_of), lambda config, seeds: (PROBE, PROBE), on_update)
+    except Stop:
+        return False
+    return True
+
+
+def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) -> None:
+    sweep, folder = load(tmp_path), tmp_path / "study"
+    sweeps.prepare(sweep, folder)
+    assert [job.steps_left for job in sweeps.plan(sweep, folder, config_of)] == [96, 96]
+    assert not run_until(folder, sweep, 5)
+    left = sweeps.plan(sweep, folder, config_of)
+    assert [job.steps_left for job in left] == [32, 96]
+    assert not run_until(folder, sweep, 5)
+    assert [job.cell.algorithm for job in sweeps.plan(sweep, folder, config_of)] == ["jrpo"]
+    assert sweeps.estimate(folder, left)[0] > 0
+    (folder / "raw" / "go1gate" / "mappo" / "seed1.json").unlink()  # killed before the last record was written
+    assert run_until(folder, sweep, 100)
+    assert sweeps.plan(sweep, folder, config_of) == []
+    for algorithm in ("mappo", "jrpo"):
+        for seed in (0, 1):
+            path = folder / "raw" / "go1gate" / algorithm / f"seed{seed}"
+            record = json.loads(path.with_suffix(".json").read_text())
+            assert [e["env_steps"] for e in record["evaluations"]] == [32, 48]
+            assert record["absolute"]["episodes"] == 40
+            steps = [row["env_steps"] for row in csv.DictReader(path.with_suffix(".csv").open())]
+            assert steps == ["16", "32", "48"]
+
+
+def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:
+    sweep, folder = load(tmp_path), tmp_path / "study"
+    sweeps.prepare(sweep, folder)
+    checkpoint = folder / "runs" / "go1gate" / "mappo" / "seed0" / "checkpoints" / "step_000000000032.safetensors"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.touch()
+    more = override(sweep, {"seeds": (0, 1, 2), "algorithms": ("mappo",)})
+    sweeps.prepare(more, folder)
+    jobs = sweeps.plan(more, folder, config_of)
+    assert [[config.seed for config in job.configs] for job in jobs] == [[0], [1, 2]]
+    assert [job.steps_left for job in jobs] == [16, 96]
+
+
+def test_variants_are_settings_of_the_study(tmp_path: Path) -> None:
+    text = FILE + "variants: {hierarchical: {}, scratch: {env: {control: position}}}\nseeds_together: 1\n"
+    jobs = sweeps.plan(load(tmp_path, text), tmp_path, config_of)
+    assert len(jobs) == 8
+    scratch = [job for job in jobs if job.cell.setting == "scratch"]
+    assert scratch[0].configs[0].env == {"control": "position"}
+    assert scratch[0].folders[0] == tmp_path / "runs" / "go1gate" / "mappo+scratch" / "seed0"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seeds": [0, 0]}, "seeds: .*without repetitions"),
+        ({"task": ["go1gate"]}, "task: unknown name .*'tasks'"),
+        ({"variants": {"a b": {}}}, r"variants\.a b"),
+    ],
+)
+def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        build(Sweep, {"tasks": ["go1gate"], **change})
+
+
+def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
+    sweep = load(tmp_path)
+    sweeps.prepare(sweep, tmp_path / "study")
+    sweeps.prepare(override(sweep, {"tasks": ("go1gate", "go1plane")}), tmp_path / "study")
+    with pytest.raises(InputError, match=r"settings: .* name another folder"):
+        sweeps.prepare(override(sweep, {"settings": {"total_steps": 9}}), tmp_path / "study")
+
+
+def test_the_commands_say_what_is_left_and_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    load(tmp_path)
+    monkeypatch.setattr(study_commands, "environments", lambda impl, config, seeds: (PROBE, PROBE))
+    trained = []
+    monkeypatch.setattr(sweeps, "train_seeds", lambda env, configs, *rest: trained.append(configs) or _pretend(*rest))
+    arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]
+    assert cli.main([*arguments, "--dry-run"]) == 0
+    out = capfd.readouterr().out
+    assert "go1gate jrpo hierarchical" in out and "time unknown" in out and not (tmp_path / "study").exists()
+    assert cli.main([*arguments, "--json"]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["left"]["jobs"] == [] and len(trained) == 2
+    assert "| go1gate | mappo |" in (tmp_path / "study" / "report" / "report.md").read_text()
+    assert cli.main(["report", str(tmp_path / "study")]) == 0
+    (tmp_path / "small.yaml").write_text("tasks: [go1gat]")
+    assert cli.main(arguments) == 2
+    assert "did you mean 'go1gate'" in capfd.readouterr().err
+
+
+def _pretend(folders: tuple[Path, ...], *rest: Any) -> None:
+    """Leaves what a training leaves."""
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / runner.CSV_FILE).write_text("env_steps,average_step_reward\n16,0.5\n32,0.75\n")
