@@ -56,6 +56,12 @@ def placed(
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
 
 
+def moving(env: Any, state: State, velocity: Sequence[float]) -> State:
+    """The state with the first robot's trunk moving at a velocity (3,), m/s, world frame."""
+    qvel = state.data.qvel.at[env.index.base_qvel[0, :3]].set(jnp.asarray(velocity))
+    return dataclasses.replace(state, data=state.data.replace(qvel=qvel))
+
+
 def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0)) -> jax.Array:
     """Roll, pitch, yaw (R, 3), rad, from one row each."""
     return jnp.stack([jnp.asarray(angle, jnp.float32) for angle in (roll, pitch, yaw)], axis=-1)

@@ -18,7 +18,7 @@ from mqe_jax.envs import TASKS, QuadrupedEnv, Randomization, State, VectorEnv, m
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
-from tests.states import initial, made, placed, robot_state
+from tests.states import initial, made, moving, placed, robot_state
 
 Array = jax.Array
 
@@ -213,7 +213,8 @@ def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     fallen = gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
     assert fallen.tolist() == [True, False]
     turned = [[0.0, 0.0, np.pi], [0.0, 0.0, 0.0]]  # the head against the back wall
-    bumped = gate_step(placed(gate, [[0.305, -0.75, 0.31], [1.0, 0.75, 0.31]], turned, state=state), still)
+    at_wall = placed(gate, [[0.33, -0.75, 0.31], [1.0, 0.75, 0.31]], turned, state=state)
+    bumped = gate_step(moving(gate, at_wall, [-1.5, 0.0, 0.0]), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
 
 

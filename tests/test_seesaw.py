@@ -19,7 +19,7 @@ from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import angles, initial, made, placed, robot_state, stepper
+from tests.states import angles, initial, made, moving, placed, robot_state, stepper
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
@@ -148,7 +148,8 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
     rolled = step(placed(env, high, angles(roll=(0.9, 0.0)), state=fresh), still)
     assert rolled.terminated and float(rolled.metrics["reward/fall"]) == -2
     turned = [[0.0, 0.0, np.pi], [0.0, 0.0, 0.0]]  # the head against the back wall
-    bumped = step(placed(env, [[0.305, -0.75, 0.31], SPAWN[1]], turned, state=fresh), still)
+    at_wall = placed(env, [[0.33, -0.75, 0.31], SPAWN[1]], turned, state=fresh)
+    bumped = step(moving(env, at_wall, [-1.5, 0.0, 0.0]), still)
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
     low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
