@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from mqe_jax.train.types import Trace
 
 
 @jax.tree_util.register_dataclass
@@ -176,3 +179,16 @@ def pay_public_good(hidden: jax.Array, action: jax.Array) -> jax.Array:
 def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Pays most where both agents do the same: -2 variances where they draw independently, -1 where one sees."""
     return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
+
+
+class Traces:
+    """A recorder that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.all: list[Trace] = []
+
+    def snapshot(self, env_state: Any) -> Any:
+        return env_state.hidden
+
+    def add(self, trace: Trace) -> None:
+        self.all.append(trace)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
 import numpy as np
 import probes
 import pytest
-from probes import Probe
+from probes import Probe, Traces
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
@@ -20,7 +19,6 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import load_policy
 from mqe_jax.train.runner import train, train_seeds
-from mqe_jax.train.types import Trace
 
 PROBE = Probe(probes.show_hidden, probes.pay_near_hidden, num_envs=4)
 
@@ -123,13 +121,12 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
 
 
 def test_a_recorder_gets_the_environments_of_all_seeds(tmp_path: Path) -> None:
-    traces: list[Trace] = []
-    recorder = SimpleNamespace(snapshot=lambda env_state: env_state.hidden, add=traces.append)
+    recorder = Traces()
     folders = [tmp_path / "0", tmp_path / "1"]
     train_seeds(PROBE, [settings(0), settings(1)], folders, recorder=recorder)
     train_seeds(PROBE, [settings(1)], [tmp_path / "alone"], recorder=recorder)
-    together, alone = traces[0], traces[4]
-    assert len(traces) == 8 and together.snapshot.shape == together.diverged.shape == (4, 8)
+    together, alone = recorder.all[0], recorder.all[4]
+    assert len(recorder.all) == 8 and together.snapshot.shape == together.diverged.shape == (4, 8)
     np.testing.assert_array_equal(together.snapshot[:, 4:], alone.snapshot)
     np.testing.assert_allclose(together.action[:, 4:], alone.action, atol=1e-5)
     assert "trace" not in (folders[0] / "metrics.csv").read_text()

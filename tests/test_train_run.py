@@ -16,7 +16,7 @@ import numpy as np
 import probes
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from probes import Probe
+from probes import Probe, Traces
 from safetensors.numpy import save_file
 
 from mqe_jax.errors import InputError, NonFiniteError
@@ -28,7 +28,6 @@ from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.policy import load_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
-from mqe_jax.train.types import Trace
 
 KEY = jax.random.PRNGKey(0)
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -241,19 +240,6 @@ def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, Train
     assert newest is not None
     with pytest.raises(ValueError, match="holds a checkpoint; a policy is needed"):
         load_policy(newest)
-
-
-class Traces:
-    """A recorder that keeps what it gets."""
-
-    def __init__(self) -> None:
-        self.all: list[Trace] = []
-
-    def snapshot(self, env_state: Any) -> Any:
-        return env_state.hidden
-
-    def add(self, trace: Trace) -> None:
-        self.all.append(trace)
 
 
 def test_a_recorder_gets_every_step(tmp_path: Path) -> None:

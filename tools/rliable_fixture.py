@@ -14,7 +14,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from rliable import library, metrics
+from rliable import library, metrics  # pyright: ignore[reportMissingImports]
 
 SEED, SAMPLES = 7, 500
 THRESHOLDS = [-1.0, -0.25, 0.0, 0.5, 1.5]
