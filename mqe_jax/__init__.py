@@ -21,7 +21,7 @@ __all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy",
 
 
 def __getattr__(name: str) -> Any:
-    # Imported when first used, so that `mqe --help` does not wait for JAX and MuJoCo.
+    # Heavy imports (JAX, MuJoCo) are deferred to keep `mqe --help` fast.
     if name not in __all__:
         raise AttributeError(f"module 'mqe_jax' has no attribute {name!r}")
     home = "mqe_jax.train.policy" if name == "load_policy" else "mqe_jax.envs"

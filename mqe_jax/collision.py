@@ -1,4 +1,4 @@
-"""Collision bits: two shapes touch where the contype of one has a bit of the other's conaffinity."""
+"""Collision bits: two shapes collide where the contype of one has a bit of the other's conaffinity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def robot_bits(number: int) -> tuple[int, int]:
     """Returns (contype, conaffinity) of all shapes of robot `number`.
 
     Its contype is a bit of its own; its conaffinity has the bits of ground, walls, objects and every other robot. So
-    robots collide with each other with all of their body and never with themselves.
+    all collision shapes of different robots collide; a robot never collides with itself.
     """
     first = 2 * OBJECT_BIT
     own, robots = first << number, (first << MAX_ROBOTS) - first

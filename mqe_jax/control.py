@@ -2,7 +2,7 @@
 
 | mode | per robot | meaning |
 |---|---|---|
-| `command` | one number per opened command (3) | velocity (and gait) commands for the walk policy |
+| `command` | one number per command exposed to the action (3) | velocity (and gait) commands for the walk policy |
 | `position` | 12 | joint target = default + scale x action, then PD at every physics step |
 | `torque` | 12 | joint torque = action x torque limit |
 
@@ -54,7 +54,7 @@ def check_mode(mode: str) -> str:
 
 
 def check_commands(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the opened commands, or raises an InputError that names the allowed ones."""
+    """Returns the commands exposed to the action, or raises an InputError that names the allowed ones."""
     for name in names:
         if name not in COMMAND_RANGES:
             allowed = ", ".join(COMMAND_RANGES)
@@ -141,13 +141,13 @@ class Controller:
 
     Attributes:
         mode: one of `MODES`.
-        robot: all of them.
+        robot: robot type shared by all R robots.
         physics: of the environment.
         index: of the robots.
         num_agents: A, the first A robots.
         walk_params: weights of the walk policy, or None where it is not used.
         actuator_params: weights of the actuator network, or None for PD.
-        commands: the opened commands.
+        commands: commands exposed to the action.
         default_commands: of the walk policy (15,).
         lag: maximum action lag, environment steps.
     """

@@ -26,7 +26,7 @@ class Scene:
     Attributes:
         track: ground, walls and spawn poses.
         num_robots: R.
-        robot: all R of them.
+        robot: robot type shared by all R robots.
         contacts: set of the robots' collision shapes, one of `mqe_jax.robots.CONTACTS`.
         objects: movable and fixed objects, added after the robots.
         colors: of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty.
@@ -68,10 +68,10 @@ class CompiledScene:
     """A compiled scene.
 
     Attributes:
-        scene: what it was built from.
+        scene: source scene.
         model: for the physics, without visual geoms.
         index: tables of the robots.
-        objects: where each object is, by name.
+        objects: index tables of the objects, by name.
         layout: the track's walls, anchors and spawn poses.
         mocap_offset: of each moving wall from its anchor (W, 3), m; the anchor's z is 0.
         mocap_anchor: the anchor of each moving wall (W,).
@@ -96,7 +96,7 @@ class CompiledScene:
         return np.array([anchor.spread for anchor in self.layout.anchors]).reshape(-1, 2)
 
     def wall_positions(self, anchors: jax.Array) -> jax.Array:
-        """Places the moving walls (W, 3) around anchors (G, 2), m: what goes into `mocap_pos`."""
+        """Places the moving walls (W, 3) around anchors (G, 2), m: values for `mocap_pos`."""
         if not len(self.mocap_anchor):
             return jnp.zeros((0, 3))
         return jnp.pad(anchors, ((0, 0), (0, 1)))[self.mocap_anchor] + self.mocap_offset

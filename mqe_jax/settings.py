@@ -40,7 +40,7 @@ _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_typ
 
 @dataclasses.dataclass(frozen=True)
 class Allowed:
-    """Annotation that says in words what a field allows, where its type and bounds alone do not."""
+    """Human-readable description of a field's allowed values, where type and bounds alone do not give one."""
 
     text: str
 
@@ -160,7 +160,7 @@ def hints_of(kind: Any) -> dict[str, Any]:
 
 
 def describe(hint: Any) -> str:
-    """Returns in words what a field of this annotated type allows, such as 'a number greater than 0'."""
+    """Returns a human-readable description of a field's allowed values, such as 'a number greater than 0'."""
     metadata: tuple[Any, ...] = ()
     if typing.get_origin(hint) is Annotated:
         hint, *rest = typing.get_args(hint)

@@ -1,6 +1,6 @@
 """The walk policy: velocity and gait commands to joint targets, for one robot (walk-these-ways, arXiv 2212.03238).
 
-A recurrence-free network sees the last 30 observations of 70 numbers:
+A feed-forward network takes as input the last 30 observations of 70 numbers:
 
 | block | size | content |
 |---|---|---|
@@ -147,7 +147,7 @@ def observe(
     """Builds one observation (70,).
 
     Args:
-        robot: which one.
+        robot: robot type.
         memory: its walk policy's.
         commands: unscaled (15,).
         gravity_b: unit gravity vector in the trunk frame (3,).

@@ -1,6 +1,6 @@
 """Arguments of `mqe`; the commands are implemented in `mqe_jax.cli.commands`.
 
-Nothing heavy is imported before a command runs, so that `mqe --help` answers at once.
+Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ class Render:
 
 @dataclass(frozen=True)
 class Replay:
-    """Step a recording of a divergence again, and render it on request."""
+    """Replay a recording of a divergence, and render it on request."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Recording that `--dump-diverged` wrote (.npz)."""
@@ -264,7 +264,7 @@ class Sweep:
     folder: Path | None = None
     """Folder of the sweep. Default: runs/NAME of the file."""
     dry_run: bool = False
-    """Print what is left to train and how long it would take, and train nothing."""
+    """Print the remaining training runs and their estimated time, without training."""
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
@@ -296,7 +296,7 @@ class WalkTrain:
     iterations: int = 1200
     """PPO updates of 24 steps."""
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Time limit, after which the training stops with everything saved, s."""
+    """Time limit, s; training stops there after saving a checkpoint."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Weights to fine-tune, also of another robot. Default: from scratch."""
     initial_std: float = 1.0

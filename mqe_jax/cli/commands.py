@@ -82,7 +82,7 @@ def _recorder(env: Any, folder: Path | None) -> DivergenceRecorder | None:
 def _say_recorded(recorder: DivergenceRecorder | None) -> None:
     if recorder is not None and recorder.written:
         first = recorder.written[0]
-        say(f"mqe: recorded {len(recorder.written)} divergences; step the first again with: mqe replay {first}")
+        say(f"mqe: recorded {len(recorder.written)} divergences; replay the first with: mqe replay {first}")
 
 
 def tasks(arguments: Tasks) -> dict[str, Any] | None:
@@ -164,7 +164,7 @@ def evaluate(arguments: Eval) -> dict[str, Any]:
 
 
 def replay(arguments: Replay) -> dict[str, Any]:
-    """Steps a recording again; prints a table, or returns the object for `--json`."""
+    """Replays a recording; prints a table, or returns the object for `--json`."""
     if arguments.output is not None:
         check_output(arguments.output)
     recorded = recordings.load_recording(arguments.file)

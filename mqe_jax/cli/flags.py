@@ -32,7 +32,7 @@ def given(flags: Any) -> dict[str, Any]:
 def _flags(kinds: Collection[type[Any]], hidden: Collection[str] = ()) -> Any:
     """Returns a dataclass of optional flags for the fields of records; docstrings are those of the records.
 
-    Of several records (the registered networks), every field is a flag; the chosen one refuses those of the others.
+    Of several records (the registered networks), every field is a flag; flags of those not chosen fail validation.
     """
     fields = {}
     for kind in kinds:

@@ -44,7 +44,7 @@ def _run(command: Command) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `mqe` and returns the exit code.
 
-    0; 1 for a training that became non-finite and 2 for bad input (InputError, OSError), with one line on standard
+    0; 1 for a training run that became non-finite and 2 for bad input (InputError, OSError), with one line on standard
     error; 130 for Ctrl-C. Any other exception is a defect and keeps its traceback.
     """
     as_program = arguments is None

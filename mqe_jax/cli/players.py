@@ -20,7 +20,7 @@ PLANNER_NAMES = ("scripted", "random", "idle", "forward")
 
 @dataclasses.dataclass(frozen=True)
 class Player:
-    """A task with its parameters, and the policy that plays it.
+    """A task with its parameters, and the policy to run.
 
     Attributes:
         task: id of the task.

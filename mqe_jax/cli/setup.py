@@ -89,7 +89,7 @@ def train_config(
     env: Mapping[str, Any] | None = None,
     algorithm: str | None = None,
 ) -> TrainConfig:
-    """Returns the settings of a training: a file, the algorithm's preset, then `settings` and task parameters.
+    """Returns the settings of a training run: a file, the algorithm's preset, then `settings` and task parameters.
 
     Without a file an algorithm starts from its paper's settings (paper/ALGORITHM), and a task without an algorithm
     from its tuned ones (tuned/TASK), else from the paper's MAPPO.

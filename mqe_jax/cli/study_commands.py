@@ -18,7 +18,7 @@ from mqe_jax.train.config import TrainConfig
 
 
 def sweep(arguments: Sweep) -> dict[str, Any]:
-    """Trains what is missing of a sweep and writes its report, or says what it would take."""
+    """Trains the remaining runs of a sweep and writes its report, or prints their estimated time."""
     settings = sweeps.load_sweep(arguments.file)
     for task in settings.tasks:
         if task not in TASKS and task not in ALIASES:
@@ -53,7 +53,7 @@ def report(arguments: Report) -> dict[str, Any]:
 
 
 def _estimate(folder: Path, jobs: list[sweeps.Job]) -> dict[str, Any]:
-    """Returns what is left of a sweep: a row for each job, and sums."""
+    """Returns the remaining jobs of a sweep, a row for each, and sums."""
     seconds = sweeps.estimate(folder, jobs)
     rows = [
         {

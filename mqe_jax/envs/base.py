@@ -228,7 +228,7 @@ class QuadrupedEnv:
         Args:
             state: the state before the step, with the physics state after it.
             robot_state: after the step.
-            collision: whether any agent's trunk touches anything () bool.
+            collision: whether there is any trunk contact of an agent () bool.
         """
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
 

@@ -1,4 +1,4 @@
-"""go1revolvingdoor, the paper's Revolving Door: two robots race through a door that lets one pass at a time."""
+"""go1revolvingdoor, the paper's Revolving Door: two robots race through a door that one robot can pass at a time."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class GateRewards:
         success: per robot past the gate.
         approach: per m of decrease of a robot's distance to its target.
         crowding: per robot and 1 / d^2 while the distance d between the robots is below 0.5 m.
-        collision: in steps in which any trunk touches anything.
+        collision: in steps with any trunk contact.
     """
 
     success: float = 5.0

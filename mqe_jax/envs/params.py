@@ -37,7 +37,7 @@ class TaskParams:
         friction: sliding friction of robots and ground.
         solver_iterations: maximum solver iterations per physics step.
         contacts: set of the robots' collision shapes: full, or minimal (trunk and feet), which is several times faster
-            on MJX-JAX and lets limbs pass through everything.
+            on MJX-JAX and disables limb collisions.
         contacts_per_robot: contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest
             contacts, and on average over all environments on Warp.
         constraints_per_robot: constraint buffer size per robot on Warp, per environment.
@@ -45,7 +45,7 @@ class TaskParams:
             their sensors cost about 8% of the throughput.
         randomization: domain randomisation.
         frozen_time: curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s,
-            so that agents first learn one at a time what they must do in turn. Off unless a trainer sets assistance.
+            so that agents first learn sequential subtasks one at a time. Off unless a trainer sets assistance.
     """
 
     num_agents: PositiveInt = 2

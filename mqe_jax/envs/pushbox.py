@@ -1,4 +1,7 @@
-"""go1pushbox, the paper's Push Box: two robots push a box, which is hard to push for one, through a gate."""
+"""go1pushbox, the paper's Push Box: two robots push a box through a gate.
+
+The box is too heavy for one robot to push effectively.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings of one environment: saved where the physics diverged, and stepped again for analysis."""
+"""Recordings of one environment: saved where the physics diverged, and replayed for analysis."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FIELDS = ("step", "anchors", "control", "randomized", "task", "assistance", "fr
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Consecutive states of one environment within an episode, and the actions taken in them.
+    """Consecutive states of one environment within an episode, and the actions per state.
 
     Attributes:
         task: id of the task.
@@ -61,7 +61,7 @@ def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:
 
 
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
-    """Writes the last episode of a sequence of states to an .npz file, complete or not at all.
+    """Writes the last episode of a sequence of states to an .npz file, atomically.
 
     Args:
         file: to write.
@@ -95,7 +95,7 @@ def load_recording(file: str | pathlib.Path) -> Recording:
 
 
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
-    """Steps a recording again from its first state; returns the states after each action (T, ...).
+    """Replays a recording from its first state; returns the states after each action (T, ...).
 
     Args:
         recording: see `load_recording`.

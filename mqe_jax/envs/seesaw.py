@@ -29,7 +29,7 @@ class SeesawRewards:
         height: per m of the robots' summed heights above `height_base`.
         progress: per m of the robots' summed displacement along x.
         aside: per m^2 of the robots' summed squared distances from the centre line above `aside_base`.
-        collision: in steps in which any trunk touches anything.
+        collision: in steps with any trunk contact.
         fall: in steps in which any robot exceeds the roll or pitch limit.
         crowding: per 1 / d^2 while the distance d between the robots is below 0.5 m, once for the pair.
     """

@@ -26,7 +26,7 @@ _GEOM_TYPES = {
 }
 
 
-# Contact settings of all collision shapes of robots, which take precedence over those of what they touch.
+# Contact settings of all collision shapes of robots, which take precedence over those of the other geom.
 # The time constant (s) is the shortest that is stable at a physics step of 0.005 s; the second number is the damping
 # ratio. Contacts begin MARGIN before the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
 SOLREF = (0.01, 1.0)
@@ -64,8 +64,8 @@ def build_robot(
     """Builds one robot with a free base as an `MjSpec`, to be attached to a scene under a prefix.
 
     Args:
-        robot: which one.
-        number: its place among the robots of the scene, for its collision bits.
+        robot: robot type.
+        number: robot index in the scene, for its collision bits.
         contacts: set of its collision shapes, one of `CONTACTS`.
         visual: whether to add the visual geoms.
         friction: sliding friction of its shapes, which takes precedence over the other shape's.

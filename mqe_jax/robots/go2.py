@@ -1,11 +1,11 @@
 """The Unitree Go2 as data.
 
-Source: MuJoCo Menagerie's figures of the Go2 (masses, inertias, limits) and Unitree's description (motor speeds);
+Source: MuJoCo Menagerie's inertial parameters and limits of the Go2 and Unitree's description (motor speeds);
 collision shapes are spheres and capsules, which all three engines support.
 
 Choices for position control and the walk policy: default angles as on the Go1, whose legs have the same lengths; gains
-grow with the mass (15.2 kg against 11.3 kg), kp 30 for 20 and kd 0.75 for 0.5, so that the robot sags and is damped
-alike; action scale as on the Go1; torques up to the motors' limits.
+grow with the mass (15.2 kg against 11.3 kg), kp 30 (Go1: 20) and kd 0.75 (Go1: 0.5), so that sag and damping
+are alike; action scale as on the Go1; torques up to the motors' limits.
 """
 
 from __future__ import annotations

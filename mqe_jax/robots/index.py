@@ -17,7 +17,7 @@ from mqe_jax.rotation import quaternion_to_euler, rotate_inverse
 
 @dataclasses.dataclass(frozen=True)
 class RobotIndex:
-    """Where the R robots of a compiled model are; all tables are host integers.
+    """Index tables of the R robots of a compiled model, as host integers.
 
     Attributes:
         base_qpos: addresses of (position 3, quaternion wxyz 4) in qpos (R, 7).
@@ -80,7 +80,7 @@ def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: boo
 def index_robots(
     model: mujoco.MjModel, robot: Robot, num_robots: int, *, contacts: str = "full", feet: bool = False
 ) -> RobotIndex:
-    """Looks up by name, once, where every robot of a compiled model is."""
+    """Builds the index tables of a compiled model's robots by looking up names."""
     numbers = range(num_robots)
     body_names = ["trunk", *JOINT_NAMES]
     geom_names = [name for shape in robot.shapes(contacts) for name in shape.geom_names]

@@ -1,6 +1,6 @@
 """The type of a robot: a quadruped with twelve joints as one immutable value.
 
-All figures are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y left and z up at
+All values are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y left and z up at
 zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf everywhere in this package. Legs are
 described once, for the left front one; the others are its mirror images.
 """
@@ -34,7 +34,7 @@ Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """Inertial figures of one rigid link.
+    """Inertial parameters of one rigid link.
 
     Attributes:
         mass: kg.
@@ -131,7 +131,7 @@ def ellipsoid(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitiv
 
 @dataclasses.dataclass(frozen=True)
 class CollisionShape:
-    """A shape that touches other things; one of a leg's exists once on each leg.
+    """Collision geometry; a leg's shape exists once on each leg.
 
     Attributes:
         part: one of `PARTS`.
@@ -162,7 +162,7 @@ class CollisionShape:
 
 @dataclasses.dataclass(frozen=True)
 class VisualShape:
-    """A massless shape without contacts, for pictures only.
+    """A massless shape without contacts, for rendering only.
 
     Attributes:
         link: trunk, hip, thigh or calf.
@@ -216,7 +216,7 @@ class Robot:
     Attributes:
         name: short name, as in the registry.
         title: full name.
-        trunk: inertial figures of the trunk.
+        trunk: inertial parameters of the trunk.
         hip: of the left front hip; y is mirrored for the right legs, x for the rear ones.
         thigh: of the left front thigh; y is mirrored for the right legs.
         calf: of the left front calf with its foot; y is mirrored for the right legs.
@@ -235,9 +235,9 @@ class Robot:
         action_scale: joint target = default + scale x action (12,), rad.
         stand_height: trunk origin above the ground when standing at the default angles, m: the walk policy's
             height at a zero height command.
-        collision: shapes that touch other things.
-        visuals: shapes for pictures.
-        walk: what the walk policy takes from it.
+        collision: collision geometry.
+        visuals: shapes for rendering.
+        walk: walk-policy settings.
     """
 
     name: str

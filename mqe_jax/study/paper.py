@@ -18,7 +18,7 @@ ALGORITHMS: Mapping[str, str] = {"jrpo": "JRPO", "mat": "MAT", "mappo": "MAPPO"}
 """Algorithms of the paper's figure by id, in the order of its legend."""
 
 STEPS = 40_000_000
-"""Environment steps of each training in the paper."""
+"""Environment steps of each training run in the paper."""
 
 HIERARCHICAL, SCRATCH = "hierarchical", "scratch"
 """The paper's two settings: commands for the walk policy, or joint targets."""

@@ -122,7 +122,7 @@ def table(columns: Mapping[str, Any]) -> str:
 
 
 def write_record(folder: Path, record: Record) -> None:
-    """Writes a run's CSV and, last, its JSON below FOLDER/raw; a run counts as there once its JSON is."""
+    """Writes a run's CSV and, last, its JSON below FOLDER/raw; a run is complete once its JSON exists."""
     cell = record.cell
     path = folder / "raw" / cell.path / f"seed{record.seed}"
     path.parent.mkdir(parents=True, exist_ok=True)

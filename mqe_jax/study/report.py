@@ -1,4 +1,4 @@
-"""The report of a study: figures, tables and aggregates beside the paper's values, remade from raw data alone.
+"""The report of a study: figures, tables and aggregates beside the paper's values, generated from raw data alone.
 
 The same raw data give the same files: intervals are drawn from a fixed seed, and pictures carry no date.
 """
@@ -124,7 +124,7 @@ def band(records: Sequence[Record], column: str = _REWARD) -> tuple[Array, Array
 
 
 def final_reward(record: Record) -> float:
-    """Returns the average step reward at the end of a training: the mean over the last rows of its curve."""
+    """Returns the average step reward at the end of a training run: the mean over the last rows of its curve."""
     values = record.curve[_REWARD]
     return float(values[-max(1, round(_LAST * len(values))) :].mean())
 

@@ -64,7 +64,7 @@ def bootstrap_interval(
     samples: int = 2000,
     confidence: float = 0.95,
 ) -> tuple[Array, Array]:
-    """Returns lower and upper end of a percentile bootstrap interval; runs are drawn anew within each task.
+    """Returns lower and upper end of a percentile bootstrap interval; runs are resampled within each task.
 
     Several score arrays (of one statistic, such as `probability_of_improvement`) are resampled independently.
     Tasks are the strata: they stay fixed. With a single run both ends are the statistic itself.

@@ -75,7 +75,7 @@ class Job:
 
     @property
     def steps_left(self) -> int:
-        """Environment steps that are left, summed over seeds."""
+        """Remaining environment steps, summed over seeds."""
         config = self.configs[0]
         return len(self.configs) * (config.num_updates * config.steps_per_update - self.steps_done)
 
@@ -93,10 +93,10 @@ def load_sweep(path: Path) -> Sweep:
 
 
 def plan(sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig]) -> list[Job]:
-    """Returns what is left to train, in the order in which it will be.
+    """Returns the remaining jobs in the order of training.
 
-    `config_of(task, algorithm)` gives the settings before those of the sweep. Runs whose raw data are there are done.
-    Of the others, those with checkpoints and those without are trained apart, so that all seeds of a job start from
+    `config_of(task, algorithm)` gives the settings before those of the sweep. Runs with raw data are complete.
+    The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 
     Raises:
@@ -133,7 +133,7 @@ def _raw(folder: Path, cell: Cell, seed: int) -> Path:
 
 
 def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
-    """Returns for each job the seconds that it will take, from the speed of runs in the folder; NaN if there are none.
+    """Returns the estimated duration of each job, s, from the speed of runs in the folder; NaN if there are none.
 
     The speed is that of runs of the same task and algorithm, or else of all.
     """
@@ -175,7 +175,7 @@ def prepare(sweep: Sweep, folder: Path) -> None:
 
 
 def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> None:
-    """Trains the jobs one after the other; each continues from its checkpoints and leaves raw data when it ends.
+    """Trains the jobs sequentially; each continues from its checkpoints and leaves raw data when it ends.
 
     Raises:
         InputError: where another process works in the folder, or a run cannot be continued.

@@ -1,1 +1,1 @@
-"""The learner: pure JAX, no knowledge of any task."""
+"""The learner: pure JAX, independent of tasks, robots and physics."""

@@ -30,7 +30,7 @@ class ActorCritic(NetworkSettings):
     critic_input: Literal["privileged", "observations", "own"] = "privileged"
     """Critic input: the privileged observation, all agents' observations, or each agent's own."""
     share_policy: bool = True
-    """One actor for all agents (their id is in the observation), or one for each."""
+    """One actor for all agents (told apart only where the observation has the agent's id), or one for each."""
     hidden_sizes: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64,)
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"

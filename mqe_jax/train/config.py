@@ -1,4 +1,4 @@
-"""Settings of a training: typed, validated, nested records that YAML files and flags mirror."""
+"""Settings of a training run: typed, validated, nested records that YAML files and flags mirror."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class OptimizerSettings:
 
 @record
 class Curriculum:
-    """Changes of the task that fade out during training; evaluations are on the unmodified task."""
+    """Curriculum: task modifications annealed to zero during training; not applied in evaluation."""
 
     assistance: Fraction = 0.0
     """Initial assistance of the environment (its state's `assistance`), annealed linearly to 0."""
@@ -120,14 +120,14 @@ class Checkpointing:
     """Number of the newest checkpoints to keep."""
     environments: bool = True
     """Keep the environments' states, so that a resumed training continues exactly. Without them a checkpoint holds
-    weights, optimiser, statistics and keys alone (under 1 MB), and environments are reset when a training resumes."""
+    weights, optimiser, statistics and keys alone (under 1 MB), and environments are reset when a run resumes."""
 
 
 @record
 class EvaluationSettings:
     """Evaluation during training, on separate environments of the unmodified task (Gorsane et al., arXiv 2209.10485).
 
-    Actions are drawn in half of the environments and means in the others. The policy of the best evaluation is kept,
+    Actions are sampled in half of the environments and means in the others. The policy of the best evaluation is kept,
     and the training ends with its absolute metric, over ten times as many episodes.
     """
 
@@ -139,7 +139,7 @@ class EvaluationSettings:
 
 @record
 class TrainConfig:
-    """Settings of a training; the defaults are the paper's MAPPO (arXiv 2403.16015, through OpenRL)."""
+    """Settings of a training run; the defaults are the paper's MAPPO (arXiv 2403.16015, through OpenRL)."""
 
     task: str | None = None
     """Id of the task."""

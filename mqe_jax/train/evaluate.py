@@ -67,7 +67,7 @@ def evaluate(
     """Runs `episodes` episodes from fresh resets and returns their means.
 
     Environment i counts its first `episodes // N` episodes (one more where i < `episodes % N`) and none after, so
-    that which episodes count does not depend on their length.
+    selection is independent of episode length.
 
     Args:
         env: the environments.
@@ -77,7 +77,7 @@ def evaluate(
         memory: of `act` at an episode's start, leading axis N.
         block: steps per compiled call.
         max_steps: limit on the steps of an environment.
-        recorder: gets all steps, block by block.
+        recorder: receives all steps, block by block.
 
     Raises:
         InputError: for `episodes` < 1, or where the environments do not finish within `max_steps`.

@@ -166,7 +166,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], 
 def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
     """Checks the shapes of the environment's state, and that it has what the settings need."""
     if env.num_envs != config.num_envs:
-        fail("num_envs", config.num_envs, f"{env.num_envs}, as the environment given has")
+        fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
     expected = {
@@ -207,7 +207,7 @@ def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
 
 
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
-    """Sets every environment's clock to a random step, so that the first episodes end at different steps."""
+    """Sets every environment's step counter to a random value, so that the first episodes end at different steps."""
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
     step = jax.random.randint(key, env_state.step.shape, 0, limit, env_state.step.dtype)
     return replace_fields(env_state, step=step)
@@ -223,8 +223,8 @@ def _prepare(
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and cuts it into chunks (L, C, ...).
 
-    The critic takes each step's observation and that of the state reached as a chunk of two, all steps at once: its
-    memory after the first serves the second, whether or not the episode ended there.
+    The critic takes each step's observation and that of the state reached as a chunk of two, all steps at once: the
+    next value uses the recurrent state after the step's observation, whether or not the episode ended there.
     """
     obs, privileged = normalize_obs(
         state.obs_normalizer, transitions.obs, transitions.privileged_obs, config.normalization.observations

@@ -1,10 +1,10 @@
-"""The network `mat`: a transformer over agents that act one after the other, each knowing its predecessors' actions.
+"""The network `mat`: a transformer over agents that act sequentially, conditioned on their predecessors' actions.
 
 An encoder attends over the observations of a team and gives each agent's value; a decoder attends over the actions of
 the agents before. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
-log-probabilities. In a match each team is a sequence of its own, of the same weights.
+log-probabilities. In a match each team is a separate sequence; the weights are shared.
 
-Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as OpenRL has them.
+Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as in OpenRL.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Mat(NetworkSettings):
     gain: Positive = 0.01
     """Orthogonal gain of attention, of residual branches' last layers, and of the output layers."""
     deviation: Literal["sigmoid", "free"] = "sigmoid"
-    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 at first (OpenRL), or a free logarithm."""
+    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 at first (OpenRL), or an unconstrained log."""
     log_std_init: float = 0.0
     """Initial log standard deviation, with deviation `free`."""
     log_std_max: float | None = None
@@ -54,7 +54,7 @@ class Mat(NetworkSettings):
 
 
 class Order(NamedTuple):
-    """Who sees whom, from the teams; agents act in the order in which their team lists them."""
+    """Attention masks and sequence positions within teams; agents act in the order in which their team lists them."""
 
     team: np.ndarray  # (A, A) bool, both are of one team: what the encoder attends to
     causal: np.ndarray  # (A, A) bool, of one team and not after: what the decoder attends to

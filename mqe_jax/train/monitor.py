@@ -34,7 +34,7 @@ _SAMPLED, _DETERMINISTIC = 0, 1
 
 
 class Monitor:
-    """Evaluates the policies of a training's seeds, all by one program: drawn and mean actions of each."""
+    """Evaluates the policies of a run's seeds in one program: sampled and mean actions of each."""
 
     def __init__(self, env: VectorEnv, config: TrainConfig) -> None:
         if env.num_envs != config.evaluation.episodes:
@@ -58,7 +58,7 @@ class Monitor:
         trees = [{"params": policy.params, "normalizer": policy.normalizer} for policy in policies]
         stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *trees)
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
-        # The same episodes for every policy and step of a training, apart from what the actions change.
+        # The same episodes for every policy and step of a run, apart from what the actions change.
         keys = jnp.tile(jax.random.PRNGKey(self._config.seed), (2 * len(policies), 1))
         results = self._evaluator((stacked, modes), episodes, keys)
         return [
@@ -122,7 +122,7 @@ class EvaluationLog:
         return load_policy(_best_path(self._run_dir, best)), best["env_steps"]
 
     def end(self, absolute: dict[str, Any], env_steps: int) -> None:
-        """Writes the absolute metric of a training that ended after `env_steps`."""
+        """Writes the absolute metric of a run that ended after `env_steps`."""
         self.absolute = absolute
         self._write({"ended_at": env_steps})
 

@@ -101,7 +101,7 @@ def network_settings(value: Any) -> Any:
     """Returns the settings record that a mapping with a `name` describes (by default actor_critic).
 
     Raises:
-        InputError: for a name that is not registered, or settings that its record refuses.
+        InputError: for a name that is not registered, or settings that fail validation.
     """
     if not isinstance(value, Mapping):
         return value

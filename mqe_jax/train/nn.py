@@ -111,10 +111,10 @@ def gru(params: Params, h: jax.Array, x: jax.Array, *, precision: str | None = P
 
 @jax.custom_vjp
 def bounded(x: jax.Array, low: float, high: float) -> jax.Array:
-    """Clips a parameter to [low, high] so that gradient descent can bring it back from beyond a bound.
+    """Clips a parameter to [low, high], with gradients that point back into the bounds.
 
-    The gradient is that of the identity within the bounds. Beyond them it passes where a descent step leads back, and
-    is 0 where it would lead farther out.
+    The gradient is that of the identity within the bounds. Beyond them it is passed on where a descent step
+    reduces the violation, and is 0 where it would increase it.
     """
     return jnp.clip(x, low, high)
 

@@ -119,5 +119,5 @@ def load_policy(run: str | Path) -> Policy:
 
     tree = load_tree(path, jax.eval_shape(template), kind="policy").tree
     if wrong := nonfinite(tree):
-        raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; a training that diverged wrote it")
+        raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; it was written by a diverged run")
     return Policy(tree["params"], tree["normalizer"], dims, config, metadata)

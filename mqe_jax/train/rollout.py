@@ -34,7 +34,7 @@ class ObservationNormalizer(NamedTuple):
 def normalize_obs(
     normalizer: ObservationNormalizer, obs: jax.Array, privileged: jax.Array, enabled: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns both observations as the networks take them: normalised where `enabled`."""
+    """Returns both observations as network inputs: normalised where `enabled`."""
     if not enabled:
         return obs, privileged
     return running_normalize(normalizer.obs, obs), running_normalize(normalizer.privileged, privileged)
@@ -55,8 +55,8 @@ def rollout(
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
-    The environment gets `action_scale` times the sampled action. Metrics: those of the environment are means over steps
-    and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
+    The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
+    steps and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
     episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `snapshot`, the metrics also
     hold `trace`, a `Trace` of all steps.
     """

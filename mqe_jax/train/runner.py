@@ -62,12 +62,12 @@ def train(
         on_update: called after every update with the state and its row of metrics.csv.
         eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
             `config.evaluation.every` is set.
-        recorder: gets the steps of every rollout, but none of evaluations.
+        recorder: receives the steps of every rollout, but none of evaluations.
 
     Raises:
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
             training, or holds a run that is not to be resumed, has no checkpoint, or has other settings.
-        NonFiniteError: after the first update that makes a loss or a weight NaN or infinite. Checkpoints and policy
+        NonFiniteError: after the first update with a non-finite loss or weight. Checkpoints and policy
             on disk are those from before.
     """
     return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, recorder)[0]
@@ -85,7 +85,7 @@ def train_seeds(
     """Trains several seeds at once in one program, each as alone and in a run folder of its own; see `train`.
 
     `configs` differ in their seed alone. Runs are resumed together, from the newest checkpoint that all of them have.
-    The recorder gets the environments of all seeds as one batch.
+    The recorder receives the environments of all seeds as one batch.
     """
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ in the seed alone")
@@ -146,9 +146,9 @@ class _Training:
         self._evaluations: list[EvaluationLog] = []
 
     def run(self, on_update: OnUpdate | None) -> list[TrainState]:
-        """Runs the updates that are left and returns the last states."""
+        """Runs the remaining updates and returns the last states."""
         config = self._config
-        self._save()  # so that a training killed before its first regular checkpoint can be resumed too
+        self._save()  # so that a run killed before its first regular checkpoint can be resumed too
         for own, folder in zip(self._configs, self._folders, strict=True):
             write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
@@ -281,7 +281,7 @@ def load_run_config(run_dir: str | Path) -> TrainConfig:
 
 
 def initial_key(config: TrainConfig) -> jax.Array:
-    """Returns the initial random key (raw uint32) of a training."""
+    """Returns the initial random key (raw uint32) of a training run."""
     return jax.random.PRNGKey(config.seed)
 
 

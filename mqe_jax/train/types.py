@@ -78,15 +78,15 @@ class Trace(NamedTuple):
     """Consecutive steps of all environments, kept where divergences are recorded (T, N, ...)."""
 
     snapshot: PyTree  # of the states before the actions
-    action: jax.Array  # (T, N, A, D), as the environment got it
+    action: jax.Array  # (T, N, A, D), as the environment received it
     diverged: jax.Array  # (T, N), the metric after the action
 
 
 class Recorder(Protocol):
     """Records the steps that led to a divergence.
 
-    `snapshot(env_state)` returns what to keep of a state (N, ...), inside compiled code; `add(trace)` gets the steps
-    since the last call, and writes those of environments that diverged.
+    `snapshot(env_state)` returns what to keep of a state (N, ...), inside compiled code; `add(trace)` receives the
+    steps since the last call, and writes those of environments that diverged.
     """
 
     def snapshot(self, env_state: Any) -> PyTree: ...

@@ -1,1 +1,1 @@
-"""How the walk policy is made: environment, rewards, training, evaluation, conversion."""
+"""Training and evaluation of the walk policy: environment, rewards, PPO, scenarios, conversion of weights."""

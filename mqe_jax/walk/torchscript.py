@@ -1,7 +1,7 @@
 """Reads the weights of a TorchScript archive without torch and without running anything in it.
 
 The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw storages in
-`<name>/data/<key>`. The unpickler below knows tensors and containers only; every module class becomes a plain
+`<name>/data/<key>`. The unpickler below supports only tensors and containers; every module class becomes a plain
 object that keeps its attributes.
 """
 
@@ -25,7 +25,7 @@ _DTYPES = {
 
 
 class _Module:
-    """Stands for any module class of the archive."""
+    """Placeholder for any module class of the archive."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

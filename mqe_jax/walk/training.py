@@ -324,7 +324,7 @@ def train_walk(
         run_dir: folder of the run.
         resume: continue from the folder's newest checkpoint; the environments are reset.
         policy: weights to fine-tune; sampled if None.
-        max_seconds: stop after this time, compilation included, with everything saved, s.
+        max_seconds: stop after this time, compilation included, after saving a checkpoint, s.
         save_every: iterations between checkpoints.
         report: called with the iteration and its metrics every 10 iterations.
 
