@@ -176,7 +176,7 @@ def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) 
 def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
     for values, message in (
-        ({}, "num_envs: 32 is not allowed; it must be 4"),
+        ({}, "num_envs: 32 is not allowed; it must be equal to the environment's num_envs, 4"),
         ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
         ({"num_envs": 4, "network": {"recurrent": True, "chunk_length": 3}}, "rollout_steps: 8 .* chunk_length"),
         ({"num_envs": 4, "curriculum__assistance": 1.0}, "curriculum.assistance: 1.0 is not allowed"),
