@@ -303,6 +303,10 @@ class WalkTrain:
     """Standard deviation of the actions at the start."""
     curriculum: int = 400
     """Iterations over which slopes, forces and kicks grow to their full size."""
+    critic_warmup: int = 0
+    """First iterations in which the weights to fine-tune stay as they are, while the critic learns their values."""
+    anneal: float = 0.25
+    """Last fraction of the training over which learning rate and entropy bonus fall linearly to zero."""
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1

@@ -23,6 +23,10 @@ def walk_train(arguments: WalkTrain) -> None:
             raise InputError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
     if not 0.0 < arguments.initial_std <= 10.0:
         raise InputError(f"initial_std: {arguments.initial_std} is not allowed; it must be above 0 and at most 10")
+    if arguments.critic_warmup < 0:
+        raise InputError(f"critic_warmup: {arguments.critic_warmup} is not allowed; it must be at least 0")
+    if not 0.0 <= arguments.anneal <= 1.0:
+        raise InputError(f"anneal: {arguments.anneal} is not allowed; it must be in [0, 1]")
     robot = robots.get(arguments.robot)
     policy = None if arguments.weights is None else walk_policy.load_params(robot, arguments.weights)
     prepare_folder(arguments.run_dir, arguments.resume, ("metrics.csv", "walk.safetensors"))
@@ -32,6 +36,8 @@ def walk_train(arguments: WalkTrain) -> None:
         iterations=arguments.iterations,
         initial_std=arguments.initial_std,
         curriculum=arguments.curriculum,
+        critic_warmup=arguments.critic_warmup,
+        anneal=arguments.anneal,
         seed=arguments.seed,
     )
 

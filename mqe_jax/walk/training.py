@@ -59,6 +59,8 @@ class WalkConfig:
         max_grad_norm: global gradient-norm clip.
         initial_std: standard deviation of the actions at the start.
         curriculum: iterations over which slopes, forces and kicks grow to their maxima.
+        critic_warmup: first iterations in which only critic and adaptation network learn, for given policy weights.
+        anneal: last fraction of the training over which learning rate and entropy bonus fall linearly to zero.
         seed: of all random numbers.
     """
 
@@ -78,6 +80,8 @@ class WalkConfig:
     max_grad_norm: float = 1.0
     initial_std: float = 1.0
     curriculum: int = 400
+    critic_warmup: int = 0
+    anneal: float = 0.0
     seed: int = 1
 
 
@@ -134,9 +138,10 @@ def init_learner(
 def make_iteration(
     env: WalkEnvironment, config: WalkConfig
 ) -> Callable[..., tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]]:
-    """Returns `iterate(learner, state, history) -> (learner, state, history, metrics)`: one rollout and its update.
+    """Returns `iterate(learner, state, history, scale) -> (learner, state, history, metrics)`: one rollout, one update.
 
-    `state` is the batched environment state, `history` each environment's last observations (N, 30, 70), newest last.
+    `state` is the batched environment state, `history` each environment's last observations (N, 30, 70), newest last,
+    `scale` () in [0, 1] the factor on learning rate and entropy bonus; below 1 the KL rule only lowers the rate.
     """
     optimizer = adam(1e-8, max_grad_norm=config.max_grad_norm)
     step = jax.vmap(env.step)
@@ -180,7 +185,7 @@ def make_iteration(
         return state, history, records
 
     def iterate(
-        learner: WalkLearner, state: Any, history: jax.Array
+        learner: WalkLearner, state: Any, history: jax.Array, scale: jax.Array
     ) -> tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]:
         key, rollout_key, shuffle_key = jax.random.split(learner.key, 3)
         difficulty = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
@@ -202,6 +207,8 @@ def make_iteration(
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
         old_log_std = learner.params["log_std"]
+        # Gradients of the policy are zero until the critic has learned the values of given weights.
+        acting = (learner.iteration >= config.critic_warmup).astype(jnp.float32)
 
         def loss(params: Any, t: jax.Array, n: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
             flat = windows(buffer, records["age"], t, n)
@@ -215,7 +222,8 @@ def make_iteration(
             value_error = jnp.mean(jnp.maximum(jnp.square(predicted - wanted), jnp.square(near - wanted)))
             adaptation = jnp.mean(jnp.square(latent - records["latent_target"][t, n]))
             bonus = jnp.mean(entropy(params["log_std"]))
-            total = policy + config.value * value_error + config.adaptation * adaptation - config.entropy * bonus
+            total = acting * (policy - scale * config.entropy * bonus)
+            total += config.value * value_error + config.adaptation * adaptation
             kl = jnp.mean(kl_divergence(records["mean"][t, n], old_log_std, mean, params["log_std"]))
             return total, {"kl": kl, "value_loss": value_error, "adaptation_loss": adaptation}
 
@@ -226,8 +234,9 @@ def make_iteration(
             params, state, rate = carry
             grads, info = jax.grad(loss, has_aux=True)(params, index // config.num_envs, index % config.num_envs)
             rate = jnp.where(info["kl"] > 2 * config.target_kl, jnp.maximum(rate / 1.5, 1e-5), rate)
-            rate = jnp.where(info["kl"] < config.target_kl / 2, jnp.minimum(rate * 1.5, 1e-2), rate)
-            params, state, info["grad_norm"] = optimizer.update(grads, state, params, rate)
+            raised = (info["kl"] < config.target_kl / 2) & (acting > 0) & (scale >= 1.0)
+            rate = jnp.where(raised, jnp.minimum(rate * 1.5, 1e-2), rate)
+            params, state, info["grad_norm"] = optimizer.update(grads, state, params, rate * scale)
             return (params, state, rate), info
 
         order = jax.vmap(lambda k: jax.random.permutation(k, samples)[: size * config.minibatches])(
@@ -353,7 +362,11 @@ def train_walk(
     with table.open("w" if fresh else "a", newline="") as file:
         writer: Any = None
         for iteration in range(first + 1, config.iterations + 1):
-            learner, state, history, metrics = iterate(learner, state, history)
+            done = (iteration - 1) / config.iterations
+            if max_seconds is not None:
+                done = max(done, min((time.monotonic() - start) / max_seconds, 1.0))
+            scale = min(1.0, (1.0 - done) / config.anneal) if config.anneal > 0 else 1.0
+            learner, state, history, metrics = iterate(learner, state, history, jnp.float32(scale))
             jax.block_until_ready(metrics)  # so that `max_seconds` measures finished work
             last = iteration == config.iterations or (
                 max_seconds is not None and time.monotonic() - start > max_seconds
