@@ -1,8 +1,8 @@
 """Measures the wall time of a training update: one seed against several, and the learner's and evaluation's shares.
 
-`python tools/bench_training.py --algorithms mappo jrpo mat --seeds 1 5 --json FILE` starts one process per algorithm and
+`python tools/bench_training.py --algorithms mappo jrpo mat --seeds 1 5 --json FILE` starts a process per algorithm and
 number of seeds. They compile side by side and are then timed in turn, with the paper's settings: the whole update, its
-rollout alone (the rest is the learner), and one evaluation of all seeds (32 episodes with sampled and 32 with mean actions).
+rollout alone (the rest is the learner), and one evaluation of all seeds (32 episodes each with sampled and mean actions).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from statistics import median
 from typing import Any
 
 
-def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, repeats: int) -> None:
+def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, total_steps: int, repeats: int) -> None:
     """Process of one case: compiles, says that it is ready, and times when it is told to."""
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
@@ -32,13 +32,18 @@ def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, repeat
     from mqe_jax.train.monitor import Monitor
     from mqe_jax.train.policy import policy_of
     from mqe_jax.train.rollout import rollout
+    from mqe_jax.train.seeds import shared_leaves, take
 
-    config = override(train_config(task, None, algorithm=algorithm), {"num_envs": num_envs, "evaluation": {"every": 20}})
+    config = override(
+        train_config(task, None, algorithm=algorithm),
+        {"num_envs": num_envs, "total_steps": total_steps, "evaluation": {"every": 20}},
+    )
     env, eval_env = environments(impl, config, seeds)
     assert eval_env is not None
     learner = make_learner(env, config)
     keys = jax.vmap(jax.random.PRNGKey)(jnp.arange(seeds))
     batched = (lambda f: f) if seeds == 1 else jax.vmap
+    shared = shared_leaves(learner.init)
     state = jax.jit(batched(learner.init))(keys[0] if seeds == 1 else keys)
 
     def roll(state: Any) -> Any:
@@ -58,7 +63,7 @@ def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, repeat
     monitor, dims = Monitor(eval_env, config), env_dims(env, config)
 
     def policies() -> list[Any]:
-        one = (lambda i: state) if seeds == 1 else (lambda i: jax.tree.map(lambda x: x[i], state))
+        one = (lambda i: state) if seeds == 1 else (lambda i: take(state, shared, i))
         return [policy_of(one(i), dims, config, task=task, env_steps=0) for i in range(seeds)]
 
     def evaluate() -> None:
@@ -108,9 +113,10 @@ def main() -> int:
     parser.add_argument("--algorithms", nargs="+", default=["mappo", "jrpo", "mat"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 5])
     parser.add_argument("--num-envs", type=int, default=500, help="of each seed")
+    parser.add_argument("--total-steps", type=int, default=40_000_000)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--work", nargs=6, help=argparse.SUPPRESS)
+    parser.add_argument("--work", nargs=7, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.work:
         work(*arguments.work[:3], *map(int, arguments.work[3:]))
@@ -119,7 +125,7 @@ def main() -> int:
     processes = []
     for algorithm, seeds in cases:
         command = [sys.executable, str(Path(__file__).resolve()), "--work", arguments.task, arguments.impl, algorithm]
-        command += [str(seeds), str(arguments.num_envs), str(arguments.repeats)]
+        command += [str(seeds), str(arguments.num_envs), str(arguments.total_steps), str(arguments.repeats)]
         # The processes share the card: none may reserve all of it.
         environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
         processes.append(

@@ -137,8 +137,10 @@ class Evaluator:
             if self._recorder is not None:
                 self._recorder.add(trace)
             if np.all(np.asarray(progress.finished) >= quota):
-                one = [jax.tree.map(lambda x: x[i], jax.device_get(progress)) for i in range(len(keys))]  # noqa: B023
-                return [_result(self._env.name, episodes, each) for each in one]
+                # Sums alone: the environments may hold leaves without an axis of the evaluation.
+                sums = jax.device_get(progress._replace(env_state=(), memory=()))
+                each = [jax.tree.map(lambda x: x[i], sums) for i in range(len(keys))]  # noqa: B023
+                return [_result(self._env.name, episodes, own) for own in each]
         raise InputError(
             f"episodes: {episodes} episodes of {self._env.name} are not finished after {self._max_steps} steps"
         )

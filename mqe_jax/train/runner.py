@@ -33,7 +33,8 @@ from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, CsvLog, ProgressLog, TensorBoardLog
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
-from mqe_jax.train.types import Recorder, VectorEnv, join_traces
+from mqe_jax.train.seeds import shared_leaves, stack, take, with_shared, without_shared
+from mqe_jax.train.types import PyTree, Recorder, VectorEnv, join_traces
 
 CONFIG_FILE = "config.yaml"
 
@@ -132,10 +133,11 @@ class _Training:
     ) -> None:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
         self._config = configs[0]
-        first = [_first_state(env, learner, c, path) for c, path in zip(configs, checkpoints, strict=True)]
+        self._shared = shared = shared_leaves(learner.init)
+        first = [_first_state(env, learner, c, path, shared) for c, path in zip(configs, checkpoints, strict=True)]
         states = [state for state, _ in first]
         self._single = len(configs) == 1
-        self._state = states[0] if self._single else jax.tree.map(lambda *x: jnp.stack(x), *states)
+        self._state = states[0] if self._single else stack(states, shared)
         self._update = jax.jit(learner.update if self._single else jax.vmap(learner.update))
         self._env_steps = int(states[0].updates) * self._config.steps_per_update
         self._saved = -1 if checkpoints[0] is None else self._env_steps
@@ -164,7 +166,7 @@ class _Training:
                         progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                         if on_update is not None:
                             for i, row in enumerate(rows):
-                                on_update(self._one(self._state, i), row)
+                                on_update(self._seed(i), row)
                         updates = int(rows[0]["updates"])
                         evaluates = self._monitor is not None and updates % (config.evaluation.every or 1) == 0
                         if evaluates or self._env_steps >= total_steps:
@@ -176,11 +178,12 @@ class _Training:
             except KeyboardInterrupt:
                 self._save()
                 raise
-        return [self._one(self._state, i) for i in range(len(self._configs))]
+        return [self._seed(i) for i in range(len(self._configs))]
 
-    def _one(self, tree: Any, seed: int) -> Any:
-        """Returns one seed's part of a stacked tree."""
-        return tree if self._single else jax.tree.map(lambda x: x[seed], tree)
+    def _seed(self, i: int, state: TrainState | None = None) -> TrainState:
+        """Returns one seed's state, of the current ones or of those given."""
+        states = self._state if state is None else state
+        return states if self._single else take(states, self._shared, i)
 
     def _step(self, files: Sequence[Sequence[Any]]) -> list[dict[str, float]]:
         """Makes one update of every seed and logs it; returns the rows of metrics.csv."""
@@ -192,9 +195,11 @@ class _Training:
         metrics = jax.device_get(metrics)
         rows = []
         for i, folder in enumerate(self._folders):
-            row = _row(self._one(after, i), self._one(metrics, i), self._config, self._start_time, began)
+            own = metrics if self._single else {name: value[i] for name, value in metrics.items()}
+            state = self._seed(i, after)
+            row = _row(state, own, self._config, self._start_time, began)
             row["fps"] *= len(self._folders)
-            _check_finite(self._one(after, i), row, folder)
+            _check_finite(state, row, folder)
             rows.append(row)
         for logs, row in zip(files, rows, strict=True):
             for log in logs:
@@ -206,7 +211,7 @@ class _Training:
     def _policies(self) -> list[Policy]:
         dims = env_dims(self._env, self._config)
         return [
-            policy_of(self._one(self._state, i), dims, config, task=self._env.name, env_steps=self._env_steps)
+            policy_of(self._seed(i), dims, config, task=self._env.name, env_steps=self._env_steps)
             for i, config in enumerate(self._configs)
         ]
 
@@ -219,8 +224,9 @@ class _Training:
         for i, (config, folder, policy) in enumerate(zip(self._configs, self._folders, self._policies(), strict=True)):
             metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
             metadata["environments"] = config.checkpoint.environments
-            state = self._one(self._state, i)
-            tree = state if config.checkpoint.environments else _without_environments(state)
+            state = self._seed(i)
+            whole = config.checkpoint.environments
+            tree = without_shared(state, self._shared) if whole else _without_environments(state)
             save_checkpoint(folder, tree, self._env_steps, metadata, kept)
             save_policy(folder, policy)
         self._saved = self._env_steps
@@ -322,9 +328,9 @@ def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def _first_state(
-    env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None
+    env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
 ) -> tuple[TrainState, float]:
-    """Returns the initial or restored state and the seconds already spent."""
+    """Returns the initial or restored state and the seconds already spent; `shared` as of `shared_leaves`."""
     if checkpoint is None:
         return jax.jit(learner.init)(initial_key(config)), 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
@@ -333,10 +339,13 @@ def _first_state(
     _check_same(checkpoint.parent.parent, metadata.get("config", {}), config)
     whole = metadata.get("environments", True)
     template = jax.eval_shape(learner.init, initial_key(config))
-    tree = load_checkpoint(checkpoint, template if whole else _without_environments(template)).tree
+    saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else _without_environments(template)
+    tree = load_checkpoint(checkpoint, saved).tree
     if wrong := nonfinite(_learned(tree) if whole else {name: tree[name] for name in _learned(template)}):
         raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
     if not whole:
         fresh = jax.jit(learner.init)(jax.random.fold_in(tree["key"], tree["updates"]))
         tree = dataclasses.replace(fresh, **tree)
+    elif any(jax.tree.leaves(shared)):
+        tree = with_shared(tree, shared, jax.jit(learner.init)(initial_key(config)))
     return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))
