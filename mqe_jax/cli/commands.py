@@ -193,12 +193,14 @@ def replay(arguments: Replay) -> dict[str, Any]:
 
 def render(arguments: Render) -> None:
     """Renders an episode to a file."""
-    for name, value in (("best_of", arguments.best_of), ("seconds", arguments.seconds)):
-        if not value > 0:
+    for name in ("best_of", "seconds", "speed"):
+        if not (value := getattr(arguments, name)) > 0:
             fail(name, value, "greater than 0")
     for name, value in (("width", arguments.width), ("fps", arguments.fps)):
         if value is not None and not 0 < value <= 4096:
             fail(name, value, "between 1 and 4096")
+    if arguments.at is not None and not arguments.at >= 0:
+        fail("at", arguments.at, "at least 0")
     check_output(arguments.output)
     player = find_player(arguments, "scripted")
     env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
@@ -212,6 +214,9 @@ def render(arguments: Render) -> None:
         deterministic=not arguments.sample,
         size=None if arguments.width is None else (arguments.width, round(arguments.width * 9 / 32) * 2),
         fps=arguments.fps,
+        view=arguments.view,
+        speed=arguments.speed,
+        at=arguments.at,
     )
     say(f"mqe: wrote {arguments.output} ({renderer})")
 
@@ -227,11 +232,16 @@ def draw(
     deterministic: bool = True,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
+    view: str | None = None,
+    speed: float = 1.0,
+    at: float | None = None,
 ) -> str:
     """Runs `episodes` episodes and renders the best one; returns the name of the renderer."""
     act, memory = player.act(env, deterministic), player.memory(episodes)
     recorded = recording.record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
-    return rendering.render_episode(env, recording.best(recorded), path, size=size, fps=fps)
+    return rendering.render_episode(
+        env, recording.best(recorded), path, size=size, fps=fps, view=view, speed=speed, at=at
+    )
 
 
 def bench(arguments: Bench) -> dict[str, Any]:

@@ -22,6 +22,19 @@ def robot_bases(model: mujoco.MjModel) -> list[int]:
     return bases
 
 
+def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
+    """Returns the ids of objects and NPCs that move in the episode: free, sliding or mocap bodies but the robots."""
+    moved = np.ptp(episode.mocap_pos, axis=0).max(-1) > 0.05 if model.nmocap else np.zeros(0, bool)
+    bodies = [body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]]
+    robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
+    translations = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    for joint in range(model.njnt):
+        body = int(model.jnt_bodyid[joint])
+        if int(model.jnt_type[joint]) in translations and int(model.body_rootid[body]) not in robots:
+            bodies.append(body)
+    return sorted(set(bodies))
+
+
 def paint(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
     """Returns the colour (red, green, blue, alpha) of a robot: that of the first visible geom of its trunk."""
     geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
 
@@ -58,9 +58,9 @@ def _renderer(model: mujoco.MjModel, width: int, height: int, backend: str) -> m
 
 
 def draw_gl(
-    model: mujoco.MjModel, episode: Episode, camera: Camera, size: tuple[int, int], backend: str
+    model: mujoco.MjModel, episode: Episode, cameras: Sequence[Camera], size: tuple[int, int], backend: str
 ) -> Iterator[np.ndarray]:
-    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer`."""
+    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera for each."""
     width, height = size
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight = width, height
@@ -85,11 +85,11 @@ def draw_gl(
     option.sitegroup[:] = 0
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
-    view.lookat[:] = camera.lookat
-    view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
     data = mujoco.MjData(model)
     with _renderer(model, width, height, backend) as renderer:
-        for index in range(len(episode)):
+        for index, camera in enumerate(cameras):
+            view.lookat[:] = camera.lookat
+            view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
             pose(model, data, episode, index)
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view, option)

@@ -1,14 +1,14 @@
 """Frames, clips and images of an episode."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mqe_jax.viz.cameras import Camera, default_camera
+from mqe_jax.viz.cameras import Camera, cameras
 from mqe_jax.viz.clips import check_output, write_clip
 from mqe_jax.viz.geometry import drawn_model
 from mqe_jax.viz.gl import draw_gl, gl_backend
@@ -21,11 +21,13 @@ GL_PACKAGES = "libegl1 libgl1-mesa-dri (Debian, Ubuntu)"
 def render_frames(
     env: Any,
     episode: Episode,
-    camera: Camera | None = None,
+    views: Sequence[Camera] | None = None,
     size: tuple[int, int] = (960, 540),
     backend: str | None = "auto",
 ) -> Iterator[np.ndarray]:
     """Yields the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
+
+    `views` holds a camera for each frame; the whole scene is in view if None.
 
     `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
@@ -34,7 +36,7 @@ def render_frames(
         backend = gl_backend()
     if backend is None:
         return draw_top(model, episode, size)
-    return draw_gl(model, episode, camera or default_camera(model, episode, size[0] / size[1]), size, backend)
+    return draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
 
 
 def render_episode(
@@ -42,14 +44,17 @@ def render_episode(
     episode: Episode,
     path: Path,
     *,
-    camera: Camera | None = None,
+    view: str | None = None,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
+    speed: float = 1.0,
+    at: float | None = None,
     backend: str | None = "auto",
 ) -> str:
     """Renders an episode to a file by suffix; returns the renderer (`egl`, `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720, middle frame.
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; a following view of a
+    clip, the whole scene in a picture. `speed` below 1 is slow motion; `at` is the time of a picture, s (the middle).
     Without GL, one line on standard error names the packages for 3-D images.
     """
     check_output(path)
@@ -63,18 +68,21 @@ def render_episode(
             f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}",
             file=sys.stderr,
         )
+    aspect = size[0] / size[1]
     if suffix == ".png":
-        camera = camera or default_camera(drawn_model(env.mj_model, episode), episode, size[0] / size[1])
-        middle = len(episode) // 2
+        views = cameras(drawn_model(env.mj_model, episode), episode, view or "scene", aspect)
+        shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
         if backend is not None:
+            views = views[shown : shown + 1]
             episode = replace(
                 episode,
-                qpos=episode.qpos[middle : middle + 1],
-                mocap_pos=episode.mocap_pos[middle : middle + 1],
-                mocap_quat=episode.mocap_quat[middle : middle + 1],
+                qpos=episode.qpos[shown : shown + 1],
+                mocap_pos=episode.mocap_pos[shown : shown + 1],
+                mocap_quat=episode.mocap_quat[shown : shown + 1],
             )
     else:
-        episode = episode.every(max(1, round(1 / (fps * episode.dt))))
-        fps = 1 / episode.dt
-    write_clip(path, render_frames(env, episode, camera, size, backend), fps)
+        episode = episode.every(max(1, round(speed / (fps * episode.dt))))
+        fps = speed / episode.dt
+        views = cameras(drawn_model(env.mj_model, episode), episode, view or "follow", aspect)
+    write_clip(path, render_frames(env, episode, views, size, backend), fps)
     return backend or "matplotlib"
