@@ -17,7 +17,7 @@ from mqe_jax.collision import OBJECT_BIT, WALL_BIT
 from mqe_jax.envs import QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object
-from mqe_jax.planners import PLANNERS, scripted_policy
+from mqe_jax.planners import scripted_policy
 from mqe_jax.planners.steering import Observation, go_to, pose
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -128,10 +128,6 @@ class CatchState:
     distance: jax.Array
 
 
-# Step 5: registration, and a scripted policy that shows that the task can be solved.
-
-
-@register_task
 class Go1Catch(QuadrupedEnv):
     """Catch a mouse.
 
@@ -187,6 +183,9 @@ class Go1Catch(QuadrupedEnv):
         return {"success": self.ending(state, robot_state) & ~failed}
 
 
+# Step 5: a scripted policy, which shows that the task can be solved, and the registration of both.
+
+
 def plan_catch(obs: Observation) -> jax.Array:
     """Returns the robot's action (1, 3): past the pillar, then towards the mouse."""
     (position, yaw), mouse = pose(obs["base"]), obs["mouse"]
@@ -197,7 +196,7 @@ def plan_catch(obs: Observation) -> jax.Array:
     return go_to(position, yaw, goal, jnp.arctan2(apart[:, 1], apart[:, 0]))
 
 
-PLANNERS[Go1Catch.name] = plan_catch
+register_task(Go1Catch, plan_catch)
 
 
 def main() -> None:
