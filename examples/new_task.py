@@ -32,13 +32,10 @@ from mqe_jax.train.evaluate import evaluate
 @register_block("pillar")
 @dataclasses.dataclass(frozen=True)
 class Pillar(TerrainBlock):
-    """Free ground with a square pillar at its centre.
-
-    Attributes:
-        side: length of the pillar's sides, m.
-    """
+    """Free ground with a square pillar at its centre."""
 
     side: float = 0.4
+    """Length of the pillar's sides, m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         assert not isinstance(self.length, tuple)  # the track has interpolated ranges (easy, hard)
@@ -52,13 +49,10 @@ class Pillar(TerrainBlock):
 
 @dataclasses.dataclass(frozen=True)
 class Mouse(Object):
-    """A ball-shaped mouse that slides over the ground. Coordinates: x, y; velocity likewise.
-
-    Attributes:
-        radius: m.
-    """
+    """A ball-shaped mouse that slides over the ground. Coordinates: x, y; velocity likewise."""
 
     radius: float = 0.12
+    """Radius, m."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         body = self._body(spec, (0, 0, 0), 1.0, (0.01, 0.01, 0.01))
@@ -89,43 +83,34 @@ def flee(mouse: jax.Array, robot: jax.Array, speed: float, sight: float = 1.5) -
 
 @record
 class CatchRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        approach: per m of decrease of the distance between robot and mouse.
-        caught: in the step in which the robot catches the mouse.
-    """
+    """Weights of the reward terms."""
 
     approach: float = 1.0
+    """Per m of decrease of the distance between robot and mouse."""
     caught: float = 5.0
+    """Paid in the step in which the robot catches the mouse."""
 
 
 @record
 class CatchParams(TaskParams):
-    """Parameters of Catch a Mouse.
-
-    Attributes:
-        reach: distance within which the mouse is caught, m.
-        mouse_speed: m/s.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Catch a Mouse."""
 
     num_agents: PositiveInt = 1
     reach: Positive = 0.45
+    """Distance within which the mouse is caught, m."""
     mouse_speed: NonNegative = 0.4
+    """Mouse speed, m/s."""
     rewards: CatchRewards = CatchRewards()
+    """Weights of the reward terms."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CatchState:
-    """The task's own state.
-
-    Attributes:
-        distance: of the robot to the mouse after the last step (), m.
-    """
+    """The task's own state."""
 
     distance: jax.Array
+    """Distance of the robot to the mouse after the last step (), m."""
 
 
 class Go1Catch(QuadrupedEnv):

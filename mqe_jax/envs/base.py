@@ -29,82 +29,88 @@ from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import RandomizedParams, Randomizer
 from mqe_jax.envs.reward import weigh
 from mqe_jax.errors import InputError
+from mqe_jax.objects import ObjectIndex
 from mqe_jax.physics import Physics
-from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.rotation import euler_to_quaternion
-from mqe_jax.scene import Scene, build_model, compile_scene
+from mqe_jax.scene import CompiledScene, Scene, build_model, compile_scene
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """State of one environment with A agents, R robots and G anchors; a batch has leading axes.
-
-    Attributes:
-        data: physics state.
-        obs: the agents' observations (A, O); after an auto-reset, those of the new episode.
-        privileged_obs: simulator state, for critics and distillation (P,); after an auto-reset likewise.
-        final_obs: observations at the end of the last step (A, O); differs from `obs` only after an auto-reset.
-        final_privileged_obs: likewise (P,).
-        reward: (A,).
-        terminated: () bool; the episode ended by its rules.
-        truncated: () bool; the episode ended by the time limit.
-        metrics: `reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the
-            physics engine dropped contacts or constraints in this step) and the task's own, () each.
-        step: environment steps since the reset () int32.
-        anchors: positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame.
-        control: controller state.
-        randomized: randomised physics parameters.
-        task: the task's own fields.
-        assistance: curriculum level () in [0, 1]; 0 is the unmodified task.
-        frozen_steps: initial steps during which each agent's action is replaced by zero (A,) int32.
-        key: random key.
-    """
+    """State of one environment with A agents, R robots and G anchors; a batch has leading axes."""
 
     data: mjx.Data
+    """Physics state."""
     obs: jax.Array
+    """The agents' observations (A, O); after an auto-reset, those of the new episode."""
     privileged_obs: jax.Array
+    """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new episode."""
     final_obs: jax.Array
+    """Observations at the end of the last step (A, O); differs from `obs` only after an auto-reset."""
     final_privileged_obs: jax.Array
+    """Privileged observation at the end of the last step (P,)."""
     reward: jax.Array
+    """Reward (A,)."""
     terminated: jax.Array
+    """Whether the episode ended by its rules () bool."""
     truncated: jax.Array
+    """Whether the episode ended by the time limit () bool."""
     metrics: dict[str, jax.Array]
+    """`reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the physics
+    engine dropped contacts or constraints in this step) and the task's own, () each.
+    """
     step: jax.Array
+    """Environment steps since the reset () int32."""
     anchors: jax.Array
+    """Positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame."""
     control: ControlState
+    """Controller state."""
     randomized: RandomizedParams
+    """Randomised physics parameters."""
     task: Any
+    """The task's own fields."""
     assistance: jax.Array
+    """Curriculum level () in [0, 1]; 0 is the unmodified task."""
     frozen_steps: jax.Array
+    """Initial steps during which each agent's action is replaced by zero (A,) int32."""
     key: jax.Array
+    """Random key."""
 
 
 class QuadrupedEnv:
-    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`.
-
-    Attributes:
-        name: id of the task.
-        title: name of the task in the paper.
-        Params: class of the task's parameters.
-        metrics_if_diverged: metrics that are not 0 in a step in which the physics diverged.
-        variable_num_agents: whether `num_agents` may differ from the task's default.
-        params: the task's parameters.
-        impl: physics engine: 'jax', 'warp' or 'c'.
-        control: action mode: 'command', 'position' or 'torque'.
-        num_agents: number of controlled robots A.
-        robot: all robots of the task.
-        dt: environment step, s: the physics step times the substeps.
-        compiled: the compiled scene.
-        index: index tables of the robots.
-        objects: index tables of the objects by name.
-    """
+    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
     name: ClassVar[str] = ""
+    """Id of the task."""
     title: ClassVar[str] = ""
+    """Name of the task in the paper."""
     Params: ClassVar[type[TaskParams]] = TaskParams
+    """Class of the task's parameters."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
+    """Metrics that are not 0 in a step in which the physics diverged."""
     variable_num_agents: ClassVar[bool] = False
+    """Whether `num_agents` may differ from the task's default."""
+
+    params: Any
+    """The task's parameters."""
+    impl: str
+    """Physics engine: 'jax', 'warp' or 'c'."""
+    control: str
+    """Action mode: 'command', 'position' or 'torque'."""
+    num_agents: int
+    """Number of controlled robots A."""
+    robot: robots.Robot
+    """Robot type of all robots of the task."""
+    dt: float
+    """Environment step, s: the physics step times the substeps."""
+    compiled: CompiledScene
+    """The compiled scene."""
+    index: RobotIndex
+    """Index tables of the robots."""
+    objects: Mapping[str, ObjectIndex]
+    """Index tables of the objects by name."""
 
     def __init__(
         self,
@@ -114,7 +120,7 @@ class QuadrupedEnv:
         control: str = "command",
         num_envs: int = 4096,
     ) -> None:
-        self.params: Any = self.Params() if params is None else params
+        self.params = self.Params() if params is None else params
         expected = self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} is for {expected} robots")

@@ -26,23 +26,20 @@ _FIELDS = ("step", "anchors", "control", "randomized", "task", "assistance", "fr
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Consecutive states of one environment within an episode, and the actions per state.
-
-    Attributes:
-        task: id of the task.
-        params: its parameters as nested mappings.
-        impl: physics engine.
-        control: action mode.
-        states: the fields of `State` on which a step depends, before each action, by path (T, ...).
-        actions: (T, A, D).
-    """
+    """Consecutive states of one environment within an episode, and the actions per state."""
 
     task: str
+    """Id of the task."""
     params: dict[str, Any]
+    """The task's parameters as nested mappings."""
     impl: str
+    """Physics engine."""
     control: str
+    """Action mode."""
     states: dict[str, np.ndarray]
+    """The fields of `State` on which a step depends, before each action, by path (T, ...)."""
     actions: np.ndarray
+    """Actions (T, A, D)."""
 
     def make_env(self, impl: str | None = None) -> QuadrupedEnv:
         """Creates the recorded environment, on the recorded engine if `impl` is None."""

@@ -56,10 +56,14 @@ class Mat(NetworkSettings):
 class Order(NamedTuple):
     """Attention masks and sequence positions within teams; agents act in the order in which their team lists them."""
 
-    team: np.ndarray  # (A, A) bool, both are of one team: what the encoder attends to
-    causal: np.ndarray  # (A, A) bool, of one team and not after: what the decoder attends to
-    rank: np.ndarray  # (A,) place in the team's sequence
-    previous: np.ndarray  # (A,) the agent before, itself where there is none
+    team: np.ndarray
+    """Whether both agents are of one team (A, A) bool: what the encoder attends to."""
+    causal: np.ndarray
+    """Whether the second is of the same team and not after the first (A, A) bool: what the decoder attends to."""
+    rank: np.ndarray
+    """Place in the team's sequence (A,)."""
+    previous: np.ndarray
+    """The agent before, itself where there is none (A,)."""
 
 
 def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:

@@ -33,117 +33,107 @@ DT = walk_policy.STEP
 
 @dataclasses.dataclass(frozen=True)
 class WalkTask:
-    """Parameters of the walking task.
-
-    Attributes:
-        rewards: weights.
-        episode_length: time limit, s.
-        command_period: interval at which commands, slope and force are resampled, s; 0 never resamples.
-        max_vx, max_vy, max_yaw: ranges of the velocity commands, m/s, m/s, rad/s.
-        slope: maximum slope, rad.
-        force: maximum sustained horizontal force on the trunk, N.
-        kick: maximum instantaneous change of the trunk's velocity, m/s.
-        kick_period: mean time between kicks, s.
-        randomize: whether friction, payload, centre of mass, motors and observations are randomised.
-        solver_iterations: of the physics.
-    """
+    """Parameters of the walking task."""
 
     rewards: WalkRewards = WalkRewards()
+    """Weights of the reward terms."""
     episode_length: float = 20.0
+    """Time limit, s."""
     command_period: float = 8.0
+    """Interval at which commands, slope and force are resampled, s; 0 never resamples."""
     max_vx: float = 1.2
+    """Largest commanded forward velocity, m/s."""
     max_vy: float = 0.7
+    """Largest commanded lateral velocity, m/s."""
     max_yaw: float = 1.2
+    """Largest commanded yaw rate, rad/s."""
     slope: float = 0.32
+    """Maximum slope, rad."""
     force: float = 40.0
+    """Maximum sustained horizontal force on the trunk, N."""
     kick: float = 0.9
+    """Maximum instantaneous change of the trunk's velocity, m/s."""
     kick_period: float = 4.0
+    """Mean time between kicks, s."""
     randomize: bool = True
+    """Whether friction, payload, centre of mass, motors and observations are randomised."""
     solver_iterations: int = 4
+    """Solver iterations per physics step."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class EpisodeSpec:
-    """Commands and disturbances sampled for one episode.
-
-    Attributes:
-        commands: of the walk policy (15,).
-        slope: inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x.
-        force: sustained force on the trunk (2,), N, along its heading and to its left, horizontal.
-        kick: instantaneous change of the trunk's velocity at each kick (), m/s.
-    """
+    """Commands and disturbances sampled for one episode."""
 
     commands: jax.Array
+    """Commands of the walk policy (15,)."""
     slope: jax.Array
+    """Inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x."""
     force: jax.Array
+    """Sustained force on the trunk (2,), N, along its heading and to its left, horizontal."""
     kick: jax.Array
+    """Instantaneous change of the trunk's velocity at each kick (), m/s."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RandomizedBody:
-    """Randomised physical parameters of one environment's robot.
-
-    Attributes:
-        friction: sliding friction of its shapes ().
-        payload: extra mass of the trunk (), kg.
-        com: shift of the trunk's centre of mass (3,), m.
-        strength: factor on the motors' torques ().
-        motor_offset: offset added to the joint targets (12,), rad.
-    """
+    """Randomised physical parameters of one environment's robot."""
 
     friction: jax.Array
+    """Sliding friction of its shapes ()."""
     payload: jax.Array
+    """Extra mass of the trunk (), kg."""
     com: jax.Array
+    """Shift of the trunk's centre of mass (3,), m."""
     strength: jax.Array
+    """Factor on the motors' torques ()."""
     motor_offset: jax.Array
+    """Offset added to the joint targets (12,), rad."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkState:
-    """State of one environment.
-
-    Attributes:
-        data: physics state.
-        obs: the walk policy's observation (70,), noisy if randomised.
-        privileged_obs: for the critic (P,).
-        latent_target: regression target of the adaptation network (2,): friction and payload, scaled.
-        reward: ().
-        terminated: () bool, fallen.
-        truncated: () bool, time limit.
-        metrics: reward terms and tracking errors, () each.
-        spec: commands and disturbances.
-        slope: current slope, rate-limited towards the spec's (2,), rad.
-        force: current force, likewise (2,), N.
-        body: randomised parameters of the robot.
-        memory: gait phase and last actions; its history is empty.
-        mean_error: exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s.
-        step: steps counted towards the time limit () int32; starts at any offset.
-        age: steps since the reset () int32.
-        difficulty: curriculum level () in [0, 1], which scales slopes, forces and kicks.
-        key: random key.
-    """
+    """State of one environment."""
 
     data: mjx.Data
+    """Physics state."""
     obs: jax.Array
+    """The walk policy's observation (70,), noisy if randomised."""
     privileged_obs: jax.Array
+    """Observation of the critic (P,)."""
     latent_target: jax.Array
+    """Regression target of the adaptation network (2,): friction and payload, scaled."""
     reward: jax.Array
+    """Reward ()."""
     terminated: jax.Array
+    """Whether the robot has fallen () bool."""
     truncated: jax.Array
+    """Whether the episode ended by the time limit () bool."""
     metrics: dict[str, jax.Array]
+    """Reward terms and tracking errors, () each."""
     spec: EpisodeSpec
+    """Commands and disturbances."""
     slope: jax.Array
+    """Current slope, rate-limited towards the spec's (2,), rad."""
     force: jax.Array
+    """Current force, rate-limited towards the spec's (2,), N."""
     body: RandomizedBody
+    """Randomised parameters of the robot."""
     memory: WalkMemory
+    """Gait phase and last actions; its history is empty."""
     mean_error: jax.Array
+    """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
     step: jax.Array
+    """Steps counted towards the time limit () int32; starts at any offset."""
     age: jax.Array
+    """Steps since the reset () int32."""
     difficulty: jax.Array
+    """Curriculum level () in [0, 1], which scales slopes, forces and kicks."""
     key: jax.Array
+    """Random key."""
 
 
 class WalkEnv:
