@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from mqe_jax.envs.autoreset import VectorEnv
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task
+from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import override
 

@@ -7,7 +7,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 
 # Fields that describe the last step; an auto-reset keeps them.

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from annotated_types import Gt
 from mujoco import mjx
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Door
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene

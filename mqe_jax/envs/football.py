@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Ball
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene

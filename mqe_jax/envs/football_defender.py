@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
 from mqe_jax.settings import record

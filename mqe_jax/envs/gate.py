@@ -11,9 +11,10 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs import reward
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, record

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS
 

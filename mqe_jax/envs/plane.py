@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import Positive, record

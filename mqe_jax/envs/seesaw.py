@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mqe_jax.envs import reward
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
 from mqe_jax.robots.index import RobotState

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Cylinder
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
