@@ -18,8 +18,9 @@ from mqe_jax import control, robots, walk_policy
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.walk import convert, training
-from mqe_jax.walk.env import WalkEnv, WalkTask, gravity_w
+from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
+from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import windows
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
 

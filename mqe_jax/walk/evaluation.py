@@ -14,7 +14,8 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
-from mqe_jax.walk.env import EpisodeSpec, WalkEnv, WalkTask
+from mqe_jax.walk.env import WalkEnv
+from mqe_jax.walk.task import EpisodeSpec, WalkTask
 
 WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 
