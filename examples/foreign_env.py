@@ -19,17 +19,25 @@ from mqe_jax.train.runner import train
 class State(NamedTuple):
     """N environments of two agents; see `mqe_jax.train.types.EnvState`."""
 
-    position: jax.Array  # (N, 2, 2), m
-    step: jax.Array  # (N,) int32
+    position: jax.Array
+    """Positions of both agents (N, 2, 2), m."""
+    step: jax.Array
+    """Steps since the reset (N,) int32."""
     key: jax.Array
-    obs: jax.Array  # (N, 2, 6)
-    privileged_obs: jax.Array  # (N, 4)
+    obs: jax.Array
+    """Observations (N, 2, 6)."""
+    privileged_obs: jax.Array
+    """Privileged observations (N, 4)."""
     final_obs: jax.Array
     final_privileged_obs: jax.Array
-    reward: jax.Array  # (N, 2)
-    terminated: jax.Array  # (N,)
-    truncated: jax.Array  # (N,)
-    metrics: dict[str, jax.Array]  # (N,) each
+    reward: jax.Array
+    """Rewards (N, 2)."""
+    terminated: jax.Array
+    """Whether an episode ended by its rules (N,)."""
+    truncated: jax.Array
+    """Whether an episode ended by the time limit (N,)."""
+    metrics: dict[str, jax.Array]
+    """Metrics by name (N,) each."""
 
 
 def distance(position: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ from mqe_jax.collision import OBJECT_BIT, WALL_BIT
 from mqe_jax.envs import QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object
-from mqe_jax.planners import PLANNERS, scripted_policy
+from mqe_jax.planners import scripted_policy
 from mqe_jax.planners.steering import Observation, go_to, pose
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -32,13 +32,10 @@ from mqe_jax.train.evaluate import evaluate
 @register_block("pillar")
 @dataclasses.dataclass(frozen=True)
 class Pillar(TerrainBlock):
-    """Free ground with a square pillar at its centre.
-
-    Attributes:
-        side: length of the pillar's sides, m.
-    """
+    """Free ground with a square pillar at its centre."""
 
     side: float = 0.4
+    """Length of the pillar's sides, m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         assert not isinstance(self.length, tuple)  # the track has interpolated ranges (easy, hard)
@@ -52,13 +49,10 @@ class Pillar(TerrainBlock):
 
 @dataclasses.dataclass(frozen=True)
 class Mouse(Object):
-    """A ball-shaped mouse that slides over the ground. Coordinates: x, y; velocity likewise.
-
-    Attributes:
-        radius: m.
-    """
+    """A ball-shaped mouse that slides over the ground. Coordinates: x, y; velocity likewise."""
 
     radius: float = 0.12
+    """Radius, m."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         body = self._body(spec, (0, 0, 0), 1.0, (0.01, 0.01, 0.01))
@@ -89,49 +83,36 @@ def flee(mouse: jax.Array, robot: jax.Array, speed: float, sight: float = 1.5) -
 
 @record
 class CatchRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        approach: per m of decrease of the distance between robot and mouse.
-        caught: in the step in which the robot catches the mouse.
-    """
+    """Weights of the reward terms."""
 
     approach: float = 1.0
+    """Per m of decrease of the distance between robot and mouse."""
     caught: float = 5.0
+    """Paid in the step in which the robot catches the mouse."""
 
 
 @record
 class CatchParams(TaskParams):
-    """Parameters of Catch a Mouse.
-
-    Attributes:
-        reach: distance within which the mouse is caught, m.
-        mouse_speed: m/s.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Catch a Mouse."""
 
     num_agents: PositiveInt = 1
     reach: Positive = 0.45
+    """Distance within which the mouse is caught, m."""
     mouse_speed: NonNegative = 0.4
+    """Mouse speed, m/s."""
     rewards: CatchRewards = CatchRewards()
+    """Weights of the reward terms."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CatchState:
-    """The task's own state.
-
-    Attributes:
-        distance: of the robot to the mouse after the last step (), m.
-    """
+    """The task's own state."""
 
     distance: jax.Array
+    """Distance of the robot to the mouse after the last step (), m."""
 
 
-# Step 5: registration, and a scripted policy that shows that the task can be solved.
-
-
-@register_task
 class Go1Catch(QuadrupedEnv):
     """Catch a mouse.
 
@@ -187,6 +168,9 @@ class Go1Catch(QuadrupedEnv):
         return {"success": self.ending(state, robot_state) & ~failed}
 
 
+# Step 5: a scripted policy, which shows that the task can be solved, and the registration of both.
+
+
 def plan_catch(obs: Observation) -> jax.Array:
     """Returns the robot's action (1, 3): past the pillar, then towards the mouse."""
     (position, yaw), mouse = pose(obs["base"]), obs["mouse"]
@@ -197,7 +181,7 @@ def plan_catch(obs: Observation) -> jax.Array:
     return go_to(position, yaw, goal, jnp.arctan2(apart[:, 1], apart[:, 0]))
 
 
-PLANNERS[Go1Catch.name] = plan_catch
+register_task(Go1Catch, plan_catch)
 
 
 def main() -> None:

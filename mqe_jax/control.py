@@ -120,48 +120,42 @@ def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Arra
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ControlState:
-    """Controller state of one environment (R robots).
-
-    Attributes:
-        walk: memories of the walk policies, leading axis R; None where no robot uses one.
-        delayed: past actuator targets, newest first (lag + 1, R, 12).
-        error: joint position errors of the last two physics steps (2, R, 12), rad; empty without an actuator network.
-        velocity: joint velocities likewise (2, R, 12), rad/s.
-    """
+    """Controller state of one environment (R robots)."""
 
     walk: WalkMemory | None
+    """Memories of the walk policies, leading axis R; None where no robot uses one."""
     delayed: jax.Array
+    """Past actuator targets, newest first (lag + 1, R, 12)."""
     error: jax.Array
+    """Joint position errors of the last two physics steps (2, R, 12), rad; empty without an actuator network."""
     velocity: jax.Array
+    """Joint velocities of the last two physics steps (2, R, 12), rad/s; empty likewise."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """Computes actuator targets from actions and steps the physics under them.
-
-    Attributes:
-        mode: one of `MODES`.
-        robot: robot type shared by all R robots.
-        physics: of the environment.
-        index: of the robots.
-        num_agents: A, the first A robots.
-        walk_params: weights of the walk policy, or None where it is not used.
-        actuator_params: weights of the actuator network, or None for PD.
-        commands: commands exposed to the action.
-        default_commands: of the walk policy (15,).
-        lag: maximum action lag, environment steps.
-    """
+    """Computes actuator targets from actions and steps the physics under them."""
 
     mode: str
+    """Action mode: one of `MODES`."""
     robot: Robot
+    """Robot type shared by all R robots."""
     physics: Physics
+    """Physics of the environment."""
     index: RobotIndex
+    """Index tables of the robots."""
     num_agents: int
+    """Number of agents A: the first A robots."""
     walk_params: walk_policy.Params | None
+    """Weights of the walk policy, or None where it is not used."""
     actuator_params: ActuatorParams | None
+    """Weights of the actuator network, or None for PD."""
     commands: tuple[str, ...]
+    """Commands that the action sets, in order."""
     default_commands: np.ndarray
+    """Default commands of the walk policy (15,)."""
     lag: int = 0
+    """Maximum action lag, environment steps."""
 
     @property
     def action_size(self) -> int:

@@ -32,13 +32,10 @@ _FLOOR = {"contype": GROUND_BIT, "conaffinity": 0}
 
 @dataclasses.dataclass(frozen=True)
 class Object:
-    """Base of all objects.
-
-    Attributes:
-        name: unique in the scene.
-    """
+    """Base of all objects."""
 
     name: str
+    """Name, unique in the scene."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the body to a scene, with its purely visual geoms if `visual`."""
@@ -79,17 +76,14 @@ def _visual_geom(body: Any, kind: Any, color: Color, **shape: Any) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Box(Object):
-    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
-
-    Attributes:
-        size: full extents, m.
-        mass: kg.
-        friction: sliding friction; takes precedence over the ground's.
-    """
+    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body)."""
 
     size: Vector = (1.0, 1.0, 1.0)
+    """Full extents, m."""
     mass: float = 6.0
+    """Mass, kg."""
     friction: float = 1.0
+    """Sliding friction; takes precedence over the ground's."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the box."""
@@ -102,19 +96,16 @@ class Box(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Ball(Object):
-    """A football with rolling resistance. Coordinates and velocity as in `Box`.
-
-    Attributes:
-        radius: m.
-        mass: kg.
-        drag: linear damping, N s/m.
-        spin_drag: angular damping, N m s/rad.
-    """
+    """A football with rolling resistance. Coordinates and velocity as in `Box`."""
 
     radius: float = 0.1
+    """Radius, m."""
     mass: float = 0.318
+    """Mass, kg."""
     drag: float = 0.1
+    """Linear damping, N s/m."""
     spin_drag: float = 0.0003
+    """Angular damping, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the ball, a thin shell, on three slides and a ball joint.
@@ -143,22 +134,20 @@ class Cylinder(Object):
 
     Its collision geom is a capsule whose cylindrical part has the cylinder's height; ground friction is modelled as
     friction loss of the slide, which needs no contacts.
-
-    Attributes:
-        position: of its axis at y = 0 (x, y), m.
-        radius: m.
-        height: m.
-        mass: kg.
-        friction: sliding friction between cylinder and ground.
-        reach: maximum |y|, m.
     """
 
     position: tuple[float, float] = (0.0, 0.0)
+    """Position of the axis at y = 0 (x, y), m."""
     radius: float = 1.2
+    """Radius, m."""
     height: float = 0.5
+    """Height, m."""
     mass: float = 3.0
+    """Mass, kg."""
     friction: float = 1.0
+    """Sliding friction between cylinder and ground."""
     reach: float = 1.8
+    """Maximum |y|, m."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the cylinder."""
@@ -189,21 +178,18 @@ class Cylinder(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Door(Object):
-    """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y.
-
-    Attributes:
-        position: of the hinge (x, y), m.
-        size: thickness, width and height, m.
-        mass: kg.
-        inertia: about the hinge, kg m^2.
-        damping: of the hinge, N m s/rad.
-    """
+    """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y."""
 
     position: tuple[float, float] = (0.0, 0.0)
+    """Position of the hinge (x, y), m."""
     size: Vector = (0.08, 1.95, 0.8)
+    """Thickness, width and height, m."""
     mass: float = 4.0
+    """Mass, kg."""
     inertia: float = 1.232
+    """Inertia about the hinge, kg m^2."""
     damping: float = 0.5
+    """Damping of the hinge, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the door."""
@@ -214,26 +200,24 @@ class Door(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Seesaw(Object):
-    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative with the near end down.
-
-    Attributes:
-        hinge: position (x, y, z), m.
-        size: length, width and thickness of the plank, m.
-        behind: distance of the plank's centre from the hinge, towards the near end, m.
-        mass: kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every angle.
-        inertia: about the hinge, kg m^2.
-        limit: maximum |angle|, rad; at the lower limit the near end is on the ground.
-        damping: of the hinge, N m s/rad; limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge, turns
-            it at 0.21 rad/s.
-    """
+    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative with the near end down."""
 
     hinge: Vector = (5.6, 0.0, 0.545)
+    """Position of the hinge (x, y, z), m."""
     size: Vector = (4.123, 1.0, 0.03)
+    """Length, width and thickness of the plank, m."""
     behind: float = 0.103
+    """Distance of the plank's centre from the hinge, towards the near end, m."""
     mass: float = 100.0
+    """Mass, kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every angle."""
     inertia: float = 100.0
+    """Inertia about the hinge, kg m^2."""
     limit: float = 0.254
+    """Maximum |angle|, rad; at the lower limit the near end is on the ground."""
     damping: float = 1000.0
+    """Damping of the hinge, N m s/rad; limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge, turns it
+    at 0.21 rad/s.
+    """
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the plank, and its posts as visual geoms."""
@@ -266,17 +250,14 @@ class Seesaw(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Platform(Object):
-    """A fixed block that supports robots. No coordinates.
-
-    Attributes:
-        center: of its top face (x, y, z), m.
-        size: full extents, m.
-        column: radius of the supporting column, m; none if 0.
-    """
+    """A fixed block that supports robots. No coordinates."""
 
     center: Vector = (0.0, 0.0, 1.0)
+    """Centre of the top face (x, y, z), m."""
     size: Vector = (1.0, 1.0, 1.0)
+    """Full extents, m."""
     column: float = 0.0
+    """Radius of the supporting column, m; none if 0."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the block."""
@@ -310,17 +291,14 @@ class Platform(Object):
 
 @dataclasses.dataclass(frozen=True)
 class Ring(Object):
-    """A circle marked on the ground, without collision geoms. No coordinates.
-
-    Attributes:
-        center: (x, y, z), m.
-        radius: m.
-        width: of the line, m.
-    """
+    """A circle marked on the ground, without collision geoms. No coordinates."""
 
     center: Vector = (0.0, 0.0, 0.0)
+    """Centre (x, y, z), m."""
     radius: float = 1.7
+    """Radius, m."""
     width: float = 0.04
+    """Width of the line, m."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the line as short visual segments."""
@@ -345,16 +323,14 @@ class Sheep(Object):
     """An upright sheep that slides over the ground without rotating. Coordinates: x, y; velocity likewise.
 
     Ground friction is part of `flock`, which needs no contacts.
-
-    Attributes:
-        radius: m.
-        height: m.
-        mass: kg.
     """
 
     radius: float = 0.2
+    """Radius, m."""
     height: float = 0.5
+    """Height, m."""
     mass: float = 5.0
+    """Mass, kg."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the sheep: a capsule whose lower end is below the ground, so that it is cylindrical at ground level."""
@@ -397,19 +373,16 @@ class Sheep(Object):
 
 @dataclasses.dataclass(frozen=True)
 class ObjectIndex:
-    """Addresses of one object in a compiled model; host integers.
-
-    Attributes:
-        qpos: of its coordinates in qpos (C,).
-        qvel: of its velocities in qvel (V,).
-        body: body id.
-        geom: id of its collision geom, -1 if it has none.
-    """
+    """Addresses of one object in a compiled model; host integers."""
 
     qpos: np.ndarray
+    """Addresses of its coordinates in qpos (C,)."""
     qvel: np.ndarray
+    """Addresses of its velocities in qvel (V,)."""
     body: int
+    """Body id."""
     geom: int
+    """Id of its collision geom, -1 if it has none."""
 
 
 def index_objects(model: mujoco.MjModel, objects: Sequence[Object]) -> Mapping[str, ObjectIndex]:

@@ -78,16 +78,20 @@ def _has_cuda() -> bool:
 
 
 class Physics:
-    """Steps one environment of a compiled model on one engine; batch with `jax.vmap`.
+    """Steps one environment of a compiled model on one engine; batch with `jax.vmap`."""
 
-    Attributes:
-        model: the compiled `mujoco.MjModel`.
-        impl: 'jax', 'warp' or 'c'.
-        num_substeps: physics steps per call of `step`.
-        num_envs: environments for which Warp's contact buffer is sized.
-        contacts_per_env: contacts per environment for which that buffer is sized, on average over environments.
-        max_constraints_per_env: maximum constraints of each environment on Warp (njmax).
-    """
+    model: mujoco.MjModel
+    """Compiled model."""
+    impl: str
+    """Engine: 'jax', 'warp' or 'c'."""
+    num_substeps: int
+    """Physics steps per call of `step`."""
+    num_envs: int
+    """Environments for which Warp's contact buffer is sized."""
+    contacts_per_env: int
+    """Contacts per environment for which that buffer is sized, on average over environments."""
+    max_constraints_per_env: int
+    """Maximum constraints of each environment on Warp (njmax)."""
 
     def __init__(
         self,

@@ -21,38 +21,36 @@ from mqe_jax.terrain import Layout, Track, build_terrain
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A scene to compile.
-
-    Attributes:
-        track: ground, walls and spawn poses.
-        num_robots: R.
-        robot: robot type shared by all R robots.
-        contacts: set of the robots' collision shapes, one of `mqe_jax.robots.CONTACTS`.
-        objects: movable and fixed objects, added after the robots.
-        colors: of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty.
-        friction: sliding friction of the robots' shapes and the ground.
-        torque_robots: the actuators of the first `torque_robots` robots take torques (N m), not PD joint targets (rad).
-        foot_sensors: whether the feet's contact forces are measured too.
-        timestep: physics step, s.
-        solver_iterations: maximum Newton iterations per physics step.
-        line_search_iterations: maximum line search steps per iteration.
-        max_contacts: maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX allocates
-            constraints for every candidate geom pair, which halves CPU throughput. The other engines keep all.
-    """
+    """A scene to compile."""
 
     track: Track
+    """Ground, walls and spawn poses."""
     num_robots: int = 2
+    """Number of robots R."""
     robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
+    """Robot type shared by all R robots."""
     contacts: str = "full"
+    """Set of the robots' collision shapes, one of `mqe_jax.robots.CONTACTS`."""
     objects: tuple[Object, ...] = ()
+    """Movable and fixed objects, added after the robots."""
     colors: tuple[int, ...] = ()
+    """Colors of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty."""
     friction: float = 1.0
+    """Sliding friction of the robots' shapes and the ground."""
     torque_robots: int = 0
+    """Number of robots, the first ones, whose actuators take torques (N m), not PD joint targets (rad)."""
     foot_sensors: bool = False
+    """Whether the feet's contact forces are measured too."""
     timestep: float = 0.005
+    """Physics step, s."""
     solver_iterations: int = 4
+    """Maximum Newton iterations per physics step."""
     line_search_iterations: int = 8
+    """Maximum line search steps per iteration."""
     max_contacts: int = 32
+    """Maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX allocates constraints for
+    every candidate geom pair, which halves CPU throughput. The other engines keep all.
+    """
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_robots <= MAX_ROBOTS:
@@ -65,25 +63,22 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class CompiledScene:
-    """A compiled scene.
-
-    Attributes:
-        scene: source scene.
-        model: for the physics, without visual geoms.
-        index: tables of the robots.
-        objects: index tables of the objects, by name.
-        layout: the track's walls, anchors and spawn poses.
-        mocap_offset: of each moving wall from its anchor (W, 3), m; the anchor's z is 0.
-        mocap_anchor: the anchor of each moving wall (W,).
-    """
+    """A compiled scene."""
 
     scene: Scene
+    """Source scene."""
     model: mujoco.MjModel
+    """Model for the physics, without visual geoms."""
     index: RobotIndex
+    """Index tables of the robots."""
     objects: Mapping[str, ObjectIndex]
+    """Index tables of the objects, by name."""
     layout: Layout
+    """The track's walls, anchors and spawn poses."""
     mocap_offset: np.ndarray
+    """Offset of each moving wall from its anchor (W, 3), m; the anchor's z is 0."""
     mocap_anchor: np.ndarray
+    """Anchor of each moving wall (W,)."""
 
     @property
     def anchor_mean(self) -> np.ndarray:

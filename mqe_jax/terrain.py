@@ -28,68 +28,56 @@ FLOOR_COLOR = (0.69, 0.69, 0.77, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class Wall:
-    """A box-shaped wall.
-
-    Attributes:
-        name: unique in the track.
-        center: (3,) m; relative to the anchor (z: to the ground) if `anchor` is not None.
-        size: full extents (3,) m.
-        anchor: index of the anchor to which it is attached, or None for a fixed wall.
-    """
+    """A box-shaped wall."""
 
     name: str
+    """Name, unique in the track."""
     center: tuple[float, float, float]
+    """Centre (3,), m; relative to the anchor (z: to the ground) if `anchor` is not None."""
     size: tuple[float, float, float]
+    """Full extents (3,), m."""
     anchor: int | None = None
+    """Index of the anchor to which it is attached, or None for a fixed wall."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Barrier:
-    """An infinite vertical plane that blocks motion against `normal`; rendered as a box.
-
-    Attributes:
-        name: unique in the track.
-        point: a point on the plane (2,), m.
-        normal: unit normal (2,).
-        length: rendered length, m.
-    """
+    """An infinite vertical plane that blocks motion against `normal`; rendered as a box."""
 
     name: str
+    """Name, unique in the track."""
     point: tuple[float, float]
+    """A point on the plane (2,), m."""
     normal: tuple[float, float]
+    """Unit normal (2,)."""
     length: float
+    """Rendered length, m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Anchor:
-    """A reference point for moving walls, sampled at every reset.
-
-    Attributes:
-        name: the block's name and number, such as `gate1`.
-        position: mean (2,), m.
-        spread: half-widths of the uniform range in x and y (2,), m.
-    """
+    """A reference point for moving walls, sampled at every reset."""
 
     name: str
+    """The block's name and number, such as `gate1`."""
     position: tuple[float, float]
+    """Mean position (2,), m."""
     spread: tuple[float, float]
+    """Half-widths of the uniform range in x and y (2,), m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Contribution of one block to the track; positions in the environment frame, m.
-
-    Attributes:
-        walls: fixed and moving walls; `anchor` is an index into this layout's anchors.
-        barriers: infinite walls.
-        anchors: the block's anchors.
-        spawn: spawn poses (x, y, yaw) of the robots, m and rad.
-    """
+    """Contribution of one block to the track; positions in the environment frame, m."""
 
     walls: tuple[Wall, ...] = ()
+    """Fixed and moving walls; `anchor` is an index into this layout's anchors."""
     barriers: tuple[Barrier, ...] = ()
+    """Infinite walls."""
     anchors: tuple[Anchor, ...] = ()
+    """The block's anchors."""
     spawn: tuple[tuple[float, float, float], ...] = ()
+    """Spawn poses (x, y, yaw) of the robots, m and rad."""
 
 
 BLOCKS: dict[str, type[Block]] = {}
@@ -126,14 +114,11 @@ def block(name: str, **parameters: Any) -> Block:
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Base of all blocks.
-
-    Attributes:
-        length: extent along x, m.
-    """
+    """Base of all blocks."""
 
     name: ClassVar[str] = ""
     length: Ranged = 1.0
+    """Extent along x, m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         """Returns the walls and poses of the block from x = `start`, m; `number` is its index in the track."""
@@ -161,18 +146,15 @@ def _number(value: Ranged) -> float:
 @register_block("spawn")
 @dataclasses.dataclass(frozen=True)
 class SpawnArea(Block):
-    """Spawn poses side by side across the track, with a wall behind them.
-
-    Attributes:
-        spawn_x: x of the spawn poses from the block's start, m; half its length if None.
-        room_width: distance between neighbouring spawn poses, m; the track's width / number of robots if None.
-        back_wall: whether there is a wall behind the robots.
-    """
+    """Spawn poses side by side across the track, with a wall behind them."""
 
     length: Ranged = 2.0
     spawn_x: float | None = None
+    """X of the spawn poses from the block's start, m; half its length if None."""
     room_width: float | None = None
+    """Distance between neighbouring spawn poses, m; the track's width / number of robots if None."""
     back_wall: bool = True
+    """Whether there is a wall behind the robots."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         x = start + (_number(self.length) / 2 if self.spawn_x is None else self.spawn_x)
@@ -206,20 +188,17 @@ class EndWall(Block):
 @register_block("gate")
 @dataclasses.dataclass(frozen=True)
 class Gate(Block):
-    """A wall across the middle of the block with a gap.
-
-    Attributes:
-        width: of the gap, m.
-        depth: thickness of the wall along x, m.
-        offset: of the gap's mean centre from the block's centre (x, y), m.
-        random: half-widths of the range of the gap's centre, sampled at reset (x, y), m.
-    """
+    """A wall across the middle of the block with a gap."""
 
     length: Ranged = 3.0
     width: Ranged = 0.6
+    """Width of the gap, m."""
     depth: Ranged = 0.1
+    """Thickness of the wall along x, m."""
     offset: tuple[float, float] = (0.0, 0.0)
+    """Offset of the gap's mean centre from the block's centre (x, y), m."""
     random: tuple[float, float] = (0.0, 0.0)
+    """Half-widths of the range of the gap's centre, sampled at reset (x, y), m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         gap, depth, height = _number(self.width), _number(self.depth), track.wall_height
@@ -251,21 +230,18 @@ class DoorGap(Gate):
 
 @dataclasses.dataclass(frozen=True)
 class RoughGround:
-    """Perlin-noise ground instead of the flat floor; a height field, on all engines.
-
-    Attributes:
-        amplitude: maximum height above the flat ground, m.
-        wavelength: period of the coarsest octave, m.
-        octaves: number of noise octaves, each with half the wavelength and amplitude of the previous one.
-        resolution: grid spacing, m.
-        seed: of the noise.
-    """
+    """Perlin-noise ground instead of the flat floor; a height field, on all engines."""
 
     amplitude: Ranged = 0.03
+    """Maximum height above the flat ground, m."""
     wavelength: float = 1.0
+    """Period of the coarsest octave, m."""
     octaves: int = 2
+    """Number of noise octaves, each with half the wavelength and amplitude of the previous one."""
     resolution: float = 0.1
+    """Grid spacing, m."""
     seed: int = 0
+    """Seed of the noise."""
 
     def heights(self, length: float, width: float, difficulty: float = 1.0) -> np.ndarray:
         """Returns heights in [0, amplitude] (rows along y, columns along x), m; `difficulty` as in `Track`."""
@@ -299,27 +275,24 @@ def _perlin(y: np.ndarray, x: np.ndarray, random: np.random.Generator) -> np.nda
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """A row of blocks between two side walls.
-
-    Attributes:
-        blocks: in order along x.
-        width: between the side walls, m.
-        num_robots: number of spawn poses of a `SpawnArea`.
-        wall_height: of every wall, m.
-        wall_thickness: of the side walls, m.
-        difficulty: in [0, 1]; interpolates block parameters given as pairs (easy, hard).
-        rough: Perlin-noise ground, or None for a flat floor.
-        walled: whether there are side walls.
-    """
+    """A row of blocks between two side walls."""
 
     blocks: tuple[Block, ...] = ()
+    """Blocks in order along x."""
     width: float = 3.0
+    """Distance between the side walls, m."""
     num_robots: int = 2
+    """Number of spawn poses of a `SpawnArea`."""
     wall_height: float = 0.5
+    """Height of every wall, m."""
     wall_thickness: float = 0.04
+    """Thickness of the side walls, m."""
     difficulty: float = 1.0
+    """Difficulty in [0, 1]; interpolates block parameters given as pairs (easy, hard)."""
     rough: RoughGround | None = None
+    """Perlin-noise ground, or None for a flat floor."""
     walled: bool = True
+    """Whether there are side walls."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.difficulty <= 1.0:

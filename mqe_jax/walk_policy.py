@@ -102,19 +102,16 @@ def default_commands(robot: Robot, gait: str = "trot", **values: float) -> np.nd
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkMemory:
-    """Memory of one robot's walk policy.
-
-    Attributes:
-        history: last observations, oldest first (30, 70); zeros after a reset.
-        action: last action (12,).
-        previous_action: the action before it (12,).
-        gait: phase of the gait cycle () in [0, 1).
-    """
+    """Memory of one robot's walk policy."""
 
     history: jax.Array
+    """Last observations, oldest first (30, 70); zeros after a reset."""
     action: jax.Array
+    """Last action (12,)."""
     previous_action: jax.Array
+    """The action before it (12,)."""
     gait: jax.Array
+    """Phase of the gait cycle () in [0, 1)."""
 
 
 def initial_memory() -> WalkMemory:

@@ -11,6 +11,20 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 
 import pytest
 
+# The tests compile far longer than they simulate: unoptimised code halves their time. The soak runs optimised code.
+UNOPTIMISED = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+
+
+def _soak_asked_for(config: pytest.Config) -> bool:
+    return os.environ.get("MQE_SOAK") == "1" or "soak" in str(config.getoption("-m", default=""))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Lets XLA compile without optimisation on the CPU, also in processes that tests start; XLA_FLAGS win."""
+    given = os.environ.get("XLA_FLAGS", "")
+    if os.environ["JAX_PLATFORMS"] == "cpu" and not _soak_asked_for(config) and UNOPTIMISED not in given:
+        os.environ["XLA_FLAGS"] = f"{UNOPTIMISED} {given}".strip()
+
 
 def _gpu_missing() -> str:
     """Why a GPU test cannot run here; empty where it can."""
@@ -32,7 +46,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     reason = _gpu_missing() if marked else ""
     for item in marked if reason else []:
         item.add_marker(pytest.mark.skip(reason=reason))
-    if os.environ.get("MQE_SOAK") == "1" or "soak" in str(config.getoption("-m", default="")):
+    if _soak_asked_for(config):
         return
     for item in items:
         if item.get_closest_marker("soak"):

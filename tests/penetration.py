@@ -28,9 +28,8 @@ import numpy as np
 from mqe_jax import robots
 from mqe_jax.cli.players import against, planner
 from mqe_jax.collision import robot_bits
-from mqe_jax.envs import TASKS, make
+from mqe_jax.envs import PLANNERS, TASKS, make
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.planners import PLANNERS
 from mqe_jax.robots.robot import JOINTS, LEGS
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import build_terrain

@@ -32,3 +32,10 @@ def test_a_wrong_import_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     monkeypatch.setattr(architecture, "ROOT", tmp_path)
     monkeypatch.setattr(architecture, "PACKAGE", package)
     assert architecture.violations() == ["mqe_jax/train/__init__.py: train may not import envs"]
+
+
+def test_fields_are_documented_by_the_docstring_under_them() -> None:
+    """The other style, a section of the class's docstring, is not used."""
+    files = [*architecture.PACKAGE.rglob("*.py"), *(architecture.ROOT / "examples").glob("*.py")]
+    assert len(files) > 80
+    assert [path.name for path in files if "    Attributes:" in path.read_text(encoding="utf-8")] == []

@@ -129,7 +129,8 @@ QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes
 def test_two_engines_step_alike(task: str) -> None:
     """MuJoCo's C engine and MJX-JAX lead from the same states to the same observations and rewards."""
     full = task == "go1seesaw" or "MQE_SOAK" in os.environ  # full contacts take MJX-JAX three times as long to compile
-    lowered, starts, action = lowered_on_both(task, "full" if full else "minimal")
+    envs, starts, action = on_both_engines(task, "full" if full else "minimal")
+    lowered = [jax.jit(jax.vmap(env.step)).lower(start, action) for env, start in zip(envs, starts, strict=True)]
     after = [low.compile(compiler_options=QUICK)(start, action) for low, start in zip(lowered, starts, strict=True)]
     for name in ("obs", "privileged_obs", "reward"):
         expected, actual = (np.asarray(getattr(state, name)) for state in after)
@@ -140,20 +141,20 @@ def test_two_engines_step_alike(task: str) -> None:
 
 @pytest.mark.parametrize("task", [task for task in TASKS if task not in EVERY_OBJECT])
 def test_two_engines_return_the_same_shapes(task: str) -> None:
-    lowered, _, _ = lowered_on_both(task, "minimal")
-    shapes = [jax.tree.map(lambda x: x.shape, dataclasses.replace(low.out_info, data=None)) for low in lowered]
+    envs, starts, action = on_both_engines(task, "minimal")
+    after = [jax.eval_shape(jax.vmap(env.step), start, action) for env, start in zip(envs, starts, strict=True)]
+    shapes = [jax.tree.map(lambda x: x.shape, dataclasses.replace(state, data=None)) for state in after]
     assert shapes[0] == shapes[1]
 
 
-def lowered_on_both(task: str, contacts: str) -> tuple[list[Any], list[State], Array]:
-    """The batched step lowered on both engines, the same initial states on each, and an action."""
+def on_both_engines(task: str, contacts: str) -> tuple[list[QuadrupedEnv], list[State], Array]:
+    """The task on both engines, the same two initial states on each, and an action."""
     envs = [make(task, impl=impl, control="position", num_envs=2, contacts=contacts) for impl in ("c", "jax")]
     state = jax.jit(jax.vmap(envs[0].reset))(jax.random.split(jax.random.PRNGKey(3), 2))
     action = jax.random.uniform(jax.random.PRNGKey(4), (2, envs[0].num_agents, 12), minval=-1.0)
     parts = [getattr(state.data, name) for name in ("qpos", "qvel", "mocap_pos", "ctrl")]
     starts = [dataclasses.replace(state, data=jax.vmap(env.physics.init)(*parts)) for env in envs]
-    lowered = [jax.jit(jax.vmap(env.step)).lower(start, action) for env, start in zip(envs, starts, strict=True)]
-    return lowered, starts, action
+    return envs, starts, action
 
 
 def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv, fresh: State) -> None:
@@ -200,7 +201,7 @@ def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, fres
 
 def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
     """A fall, a trunk too low or too high, a collision and the time limit end an episode; standing does not."""
-    state = gate.reset(jax.random.PRNGKey(1))
+    state = jax.jit(gate.reset)(jax.random.PRNGKey(1))
     still = jnp.zeros((2, 12))
     stand = placed(gate, [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state)
     after = gate_step(stand, still)

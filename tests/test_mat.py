@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.errors import InputError
-from mqe_jax.train.mat import Mat, order_of
+from mqe_jax.train.mat import Mat, log_std_of, order_of
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.types import NetworkMemory, Params
 
@@ -97,6 +97,20 @@ def test_the_deviation_starts_as_openrl_has_it_or_free() -> None:
         mean, density, _ = network.act(network.acting(params), (), obs, None)
         np.testing.assert_allclose(density, -np.log(deviation * np.sqrt(2 * np.pi)), rtol=1e-5)
         assert mean.shape == (4, 3, 2)
+
+
+def test_a_free_deviation_beyond_its_bounds_gets_the_gradient_that_leads_back() -> None:
+    settings = Mat(deviation="free", log_std_init=-2.0, log_std_max=-1.0, log_std_min=-3.0)
+
+    def log_std(parameter: jax.Array) -> jax.Array:
+        return jnp.sum(log_std_of({"deviation": parameter}, settings))
+
+    beyond = jnp.array([0.0, -2.0, -4.0])
+    np.testing.assert_allclose(log_std_of({"deviation": beyond}, settings), [-1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(jax.grad(log_std)(beyond), [1.0, 1.0, 0.0])
+    np.testing.assert_array_equal(jax.grad(lambda x: -log_std(x))(beyond), [0.0, -1.0, -1.0])
+    with pytest.raises(InputError, match=r"log_std_init: 0.0 is not allowed; it must be at most log_std_max"):
+        Mat(deviation="free", log_std_max=-1.0)
 
 
 def test_actions_start_small_and_acting_needs_no_value_head() -> None:

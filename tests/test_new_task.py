@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.envs import TASKS, VectorEnv, make, register_task
-from mqe_jax.planners import PLANNERS, scripted_policy
+from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make, register_task
+from mqe_jax.errors import InputError
+from mqe_jax.planners import planner_of, scripted_policy
 from mqe_jax.terrain import BLOCKS
 from mqe_jax.train.evaluate import evaluate
 
@@ -45,6 +46,15 @@ def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: A
     np.testing.assert_allclose(example.flee(jnp.array([3.0, 2.0]), jnp.array([3.0, 0.0]), speed=0.4), [0, 0])
     pillar = env.env.compiled.model.geom("wall/pillar1")
     np.testing.assert_allclose(pillar.pos[:2], [2.5, 0.0])
+
+
+def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> None:
+    """All tasks but the plane have one, of a module of their own package."""
+    assert set(TASKS) - set(PLANNERS) == {"go1plane"}
+    for task in PLANNERS:
+        assert planner_of(task).__module__.startswith("mqe_jax.planners.")
+    with pytest.raises(InputError, match=r"go1plane has no scripted policy; allowed for: go1gate, "):
+        planner_of("go1plane")
 
 
 def test_a_taken_or_missing_id_is_refused() -> None:

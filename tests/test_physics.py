@@ -113,12 +113,12 @@ def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> N
 def test_trunk_force_is_read(impl: str) -> None:
     """Two robots that overlap feel each other; a robot lying on its belly feels the ground."""
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
-    state = env.reset(jax.random.PRNGKey(0))
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     index = env.index
     near = state.data.qpos.at[index.base_qpos[0, :3]].set(jnp.array([1.0, 0.0, 0.30]))
     near = near.at[index.base_qpos[1, :3]].set(jnp.array([1.0, 0.10, 0.30]))
     low = state.data.qpos.at[index.base_qpos[0, 2]].set(0.05)
-    both = jax.vmap(lambda qpos: env.reset(jax.random.PRNGKey(0)).data.replace(qpos=qpos))(jnp.stack([near, low]))
+    both = jax.vmap(lambda qpos: state.data.replace(qpos=qpos))(jnp.stack([near, low]))
     ctrl = jnp.asarray(state.data.ctrl)
     after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)))(both)
     robot_state = jax.vmap(env.read)(after)
@@ -129,7 +129,7 @@ def test_trunk_force_is_read(impl: str) -> None:
 def test_gate_stands_where_each_environment_drew_it() -> None:
     """Walls stand where each environment's gate was drawn, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
     gap = states.anchors[:, 0]
     assert len(np.unique(np.asarray(gap[:, 0]))) == 3
     assert np.all(np.abs(np.asarray(gap) - [3.5, 0.0]) <= 0.5)

@@ -18,8 +18,9 @@ from mqe_jax import control, robots, walk_policy
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.walk import convert, training
-from mqe_jax.walk.env import WalkEnv, WalkTask, gravity_w
+from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
+from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import windows
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
 
@@ -241,7 +242,8 @@ def test_windows_are_the_histories_of_the_rollout() -> None:
 def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pathlib.Path) -> None:
     """Weights, learning rate, iteration and key are exact, Adam's second moments to 8 bits; at most 16 MB a file."""
     config = training.WalkConfig()
-    learner = training.init_learner(jax.random.PRNGKey(0), config, 110)
+    init_learner = jax.jit(training.init_learner, static_argnums=(1, 2))
+    learner = init_learner(jax.random.PRNGKey(0), config, 110)
     square = jax.tree.map(lambda x: jnp.square(x) + 1e-7, learner.params)
     learner = dataclasses.replace(
         learner,
@@ -251,7 +253,7 @@ def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pa
     )
     path = training.save(tmp_path, learner, GO1, config)
     assert path.stat().st_size < 16e6
-    fresh = training.init_learner(jax.random.PRNGKey(1), config, 110)
+    fresh = init_learner(jax.random.PRNGKey(1), config, 110)
     found = training.restore(tmp_path, fresh, GO1)
     jax.tree.map(np.testing.assert_array_equal, found.params, learner.params)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1 / 128), found.optimizer.square, square)

@@ -16,10 +16,9 @@ from mqe_jax.cli.output import print_table, say
 from mqe_jax.cli.players import PLANNER_NAMES, Player
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
-from mqe_jax.envs import ALIASES, TASKS
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS
 from mqe_jax.envs import replay as recordings
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.planners import PLANNERS
 from mqe_jax.settings import fail, override
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import runner

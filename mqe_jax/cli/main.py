@@ -1,44 +1,22 @@
-"""The entry point of `mqe`: exit codes and output streams."""
+"""The entry point of `mqe` and its exit codes."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from mqe_jax.cli.arguments import FIRST_STEPS, Command, parse
+from mqe_jax.cli.output import print_json, standard_output
 from mqe_jax.errors import InputError, NonFiniteError
-
-
-@contextlib.contextmanager
-def _quiet_stdout(active: bool) -> Iterator[Any]:
-    """While active, redirects standard output, that of C code included, to standard error.
-
-    Yields a file that writes to the real standard output.
-    """
-    if not active:
-        yield sys.stdout
-        return
-    sys.stdout.flush()
-    real = os.dup(1)
-    try:
-        os.dup2(2, 1)
-        with contextlib.redirect_stdout(sys.stderr), os.fdopen(os.dup(real), "w", encoding="utf-8") as file:
-            yield file
-    finally:
-        os.dup2(real, 1)
-        os.close(real)
 
 
 def _run(command: Command) -> None:
     as_json = bool(getattr(getattr(command, "action", command), "json", False))
-    with _quiet_stdout(as_json) as out:
+    with standard_output(reserved=as_json) as out:
         result = command.run()
         if as_json and result is not None:
-            print(json.dumps(result, allow_nan=True), file=out, flush=True)
+            print_json(result, out)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,19 +20,16 @@ PLANNER_NAMES = ("scripted", "random", "idle", "forward")
 
 @dataclasses.dataclass(frozen=True)
 class Player:
-    """A task with its parameters, and the policy to run.
-
-    Attributes:
-        task: id of the task.
-        overrides: of the task's parameters.
-        policy: trained policy, or one of `PLANNER_NAMES`.
-        opponent: of team 1 in a match: one of `PLANNER_NAMES`, or self; None is idle.
-    """
+    """A task with its parameters, and the policy to run."""
 
     task: str
+    """Id of the task."""
     overrides: dict[str, Any]
+    """Task parameters that differ from the defaults."""
     policy: Policy | str
+    """Trained policy, or one of `PLANNER_NAMES`."""
     opponent: str | None = None
+    """Opponent of team 1 in a match: one of `PLANNER_NAMES`, or self; None is idle."""
 
     def act(self, env: Any, deterministic: bool) -> Act:
         """Returns the batched `act` of all agents.

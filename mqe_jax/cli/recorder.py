@@ -20,11 +20,10 @@ LIMIT = 100
 
 
 class DivergenceRecorder:
-    """Writes the last steps of environments that diverge to `FOLDER/diverged_0000.npz`, ...
+    """Writes the last steps of environments that diverge to `FOLDER/diverged_0000.npz`, ..."""
 
-    Attributes:
-        written: the files written.
-    """
+    written: list[Path]
+    """Files written."""
 
     def __init__(self, env: Any, folder: Path) -> None:
         check_folder(folder)

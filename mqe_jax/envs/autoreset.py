@@ -7,7 +7,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 
 # Fields that describe the last step; an auto-reset keeps them.
@@ -35,14 +36,16 @@ def autoreset(env: QuadrupedEnv, state: State) -> State:
 
 
 class VectorEnv:
-    """A batch of environments that are reset when their episodes end: the environment of trainers.
+    """A batch of environments that are reset when their episodes end: the environment of trainers."""
 
-    Attributes:
-        env: the task.
-        num_envs: number of environments N.
-        teams: agents of each team.
-        max_episode_steps: environment steps until the time limit.
-    """
+    env: QuadrupedEnv
+    """The task."""
+    num_envs: int
+    """Number of environments N."""
+    teams: tuple[tuple[int, ...], ...]
+    """Agents of each team."""
+    max_episode_steps: int
+    """Environment steps until the time limit."""
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
         """Makes the batch; `copies` such batches may be stepped together by a further `vmap`, as seeds are."""

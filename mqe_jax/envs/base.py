@@ -1,8 +1,8 @@
 """The environment core: one environment of several robots as pure `reset` and `step` functions, batched by `jax.vmap`.
 
-A task is a subclass in a file of its own that defines, in this order: its parameters, its scene, its randomised
-initial state, its observation, its reward terms and its ending. Everything that tasks share is here: spawning,
-control, physics, randomisation, falls, collisions, the time limit and the guard against diverged physics.
+A task is a subclass in a file of its own; `mqe_jax.envs.task` lists what it defines. Everything that tasks share is
+here: spawning, control, physics, randomisation, falls, collisions, the time limit and the guard against diverged
+physics.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
 
 import gymnasium
 import jax
@@ -22,89 +20,23 @@ from jax.core import Tracer
 from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
-from mqe_jax.control import Controller, ControlState, check_mode, load_actuator_network
+from mqe_jax.control import Controller, check_mode, load_actuator_network
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.privileged import PrivilegedObservation
-from mqe_jax.envs.randomization import RandomizedParams, Randomizer
+from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import weigh
+from mqe_jax.envs.state import State
+from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
-from mqe_jax.scene import Scene, build_model, compile_scene
+from mqe_jax.scene import build_model, compile_scene
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class State:
-    """State of one environment with A agents, R robots and G anchors; a batch has leading axes.
-
-    Attributes:
-        data: physics state.
-        obs: the agents' observations (A, O); after an auto-reset, those of the new episode.
-        privileged_obs: simulator state, for critics and distillation (P,); after an auto-reset likewise.
-        final_obs: observations at the end of the last step (A, O); differs from `obs` only after an auto-reset.
-        final_privileged_obs: likewise (P,).
-        reward: (A,).
-        terminated: () bool; the episode ended by its rules.
-        truncated: () bool; the episode ended by the time limit.
-        metrics: `reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the
-            physics engine dropped contacts or constraints in this step) and the task's own, () each.
-        step: environment steps since the reset () int32.
-        anchors: positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame.
-        control: controller state.
-        randomized: randomised physics parameters.
-        task: the task's own fields.
-        assistance: curriculum level () in [0, 1]; 0 is the unmodified task.
-        frozen_steps: initial steps during which each agent's action is replaced by zero (A,) int32.
-        key: random key.
-    """
-
-    data: mjx.Data
-    obs: jax.Array
-    privileged_obs: jax.Array
-    final_obs: jax.Array
-    final_privileged_obs: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    metrics: dict[str, jax.Array]
-    step: jax.Array
-    anchors: jax.Array
-    control: ControlState
-    randomized: RandomizedParams
-    task: Any
-    assistance: jax.Array
-    frozen_steps: jax.Array
-    key: jax.Array
-
-
-class QuadrupedEnv:
-    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`.
-
-    Attributes:
-        name: id of the task.
-        title: name of the task in the paper.
-        Params: class of the task's parameters.
-        metrics_if_diverged: metrics that are not 0 in a step in which the physics diverged.
-        variable_num_agents: whether `num_agents` may differ from the task's default.
-        params: the task's parameters.
-        impl: physics engine: 'jax', 'warp' or 'c'.
-        control: action mode: 'command', 'position' or 'torque'.
-        num_agents: number of controlled robots A.
-        robot: all robots of the task.
-        dt: environment step, s: the physics step times the substeps.
-        compiled: the compiled scene.
-        index: index tables of the robots.
-        objects: index tables of the objects by name.
-    """
-
-    name: ClassVar[str] = ""
-    title: ClassVar[str] = ""
-    Params: ClassVar[type[TaskParams]] = TaskParams
-    metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
-    variable_num_agents: ClassVar[bool] = False
+class QuadrupedEnv(Task):
+    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
     def __init__(
         self,
@@ -114,7 +46,7 @@ class QuadrupedEnv:
         control: str = "command",
         num_envs: int = 4096,
     ) -> None:
-        self.params: Any = self.Params() if params is None else params
+        self.params = self.Params() if params is None else params
         expected = self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} is for {expected} robots")
@@ -175,80 +107,6 @@ class QuadrupedEnv:
             default_commands=walk_policy.default_commands(self.robot, self.params.gait),
             lag=self.params.randomization.action_lag,
         )
-
-    # -- task interface (override) ------------------------------------------------------------------------------
-
-    def scene(self) -> Scene:
-        """Returns the scene: track, robots and objects."""
-        raise NotImplementedError(f"{type(self).__name__}: scene() is not defined")
-
-    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
-        """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the track's blocks."""
-        return self.compiled.layout.spawn
-
-    def spawn(self, key: jax.Array) -> jax.Array:
-        """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
-        params = self.params
-        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32)
-        noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
-        return jnp.asarray(pose).at[:, :2].add(noise)
-
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,)."""
-        return qpos, qvel
-
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> Any:
-        """Returns the task's own state fields at the start of an episode."""
-        return None
-
-    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array | None:
-        """Returns the walk commands (R - A, 15) of the NPC robots, or None if there are none."""
-        return None
-
-    def unmirror_action(self, action: jax.Array) -> jax.Array:
-        """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the robots' frame."""
-        return action
-
-    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
-        """Applies scripted NPC behaviour: sets NPC velocities for the next physics step."""
-        return data
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """The blocks of an agent's observation, in order."""
-        raise NotImplementedError(f"{type(self).__name__}: observation_layout is not defined")
-
-    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (A, width)."""
-        raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
-
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the unweighted reward terms, () or (A,), and the task's own fields after the step.
-
-        Args:
-            state: the state before the step, with the physics state after it.
-            robot_state: after the step.
-            collision: whether there is any trunk contact of an agent () bool.
-        """
-        raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
-
-    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
-        """Returns whether the task's own rules end the episode () bool."""
-        return jnp.zeros((), bool)
-
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Returns `success` () and further `success/...` metrics, which are evaluated at the end of an episode.
-
-        Args:
-            state: after the step.
-            robot_state: after the step.
-            failed: whether a fall, a collision or diverged physics ended the episode () bool.
-        """
-        return {"success": jnp.zeros(())}
-
-    def external_forces(self, state: State) -> jax.Array | None:
-        """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
-        return None
 
     # -- public API ---------------------------------------------------------------------------------------------
 

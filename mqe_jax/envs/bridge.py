@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Platform
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -21,44 +21,40 @@ from mqe_jax.terrain import Plane, SpawnArea, Track
 
 @record
 class BridgeRewards:
-    """Weights of the reward terms; each is a robot's own term minus the opponent's.
-
-    Attributes:
-        win: when the opponent is off the bridge or has fallen.
-        far_side: while the robot is on the opponent's platform.
-    """
+    """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     win: float = 10.0
+    """Paid when the opponent is off the bridge or has fallen."""
     far_side: float = 1.0
+    """Paid while the robot is on the opponent's platform."""
 
 
 @record
 class BridgeParams(TaskParams):
-    """Parameters of Traverse Bridge.
-
-    Attributes:
-        platform: extents of both platforms along x and y, m; their long sides are perpendicular to the bridge, as in
-            the paper's figure.
-        platform_x: of the platforms' centres, m.
-        top: height of platforms and bridge, m.
-        bridge_width: m.
-        bridge_thickness: m.
-        spawn_x: of the robots, m. The released system spawns the first robot at 2.0, with its hind feet on the
-            platform's edge; here the two poses are symmetric.
-        off_height: height of a trunk below which a robot counts as off the bridge, m.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Traverse Bridge."""
 
     episode_length: Positive = 20.0
     spawn_height: Positive = 1.4
     platform: tuple[Positive, Positive] = (1.3, 2.5)
+    """Extents of both platforms along x and y, m; their long sides are perpendicular to the bridge, as in the paper's
+    figure.
+    """
     platform_x: Range = (2.35, 7.65)
+    """X of the platforms' centres, m."""
     top: Positive = 1.02
+    """Height of platforms and bridge, m."""
     bridge_width: Positive = 0.7
+    """Width of the bridge, m."""
     bridge_thickness: Positive = 0.3
+    """Thickness of the bridge, m."""
     spawn_x: Range = (2.5, 7.5)
+    """X of the robots' spawn poses, m. The released system spawns the first robot at 2.0, with its hind feet on the
+    platform's edge; here the two poses are symmetric.
+    """
     off_height: float = 0.5
+    """Height of a trunk below which a robot counts as off the bridge, m."""
     rewards: BridgeRewards = BridgeRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

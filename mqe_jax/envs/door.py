@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from annotated_types import Gt
 from mujoco import mjx
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Door
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -25,47 +25,41 @@ _WALL_LENGTH = 1.0  # m along x, of the block whose middle holds the door
 
 @record
 class DoorRewards:
-    """Weights of the reward terms; each is a robot's own term minus the opponent's.
-
-    Attributes:
-        win: for crossing the line first, or if the opponent falls.
-        approach: per m of decrease of the distance to the midpoint of the line.
-    """
+    """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     win: float = 10.0
+    """Paid for crossing the line first, or if the opponent falls."""
     approach: float = 1.0
+    """Per m of decrease of the distance to the midpoint of the line."""
 
 
 @record
 class DoorParams(TaskParams):
-    """Parameters of Revolving Door.
-
-    Attributes:
-        track_width: m.
-        gap: width of the gap that holds the door, m.
-        door_x: of the hinge, m.
-        door_size: thickness, width and height of the door, m.
-        door_mass: kg.
-        door_inertia: about the hinge, kg m^2.
-        door_damping: of the hinge, N m s/rad.
-        spawn_x: of the robots, m.
-        spawn_y: distance of the robots from the centre line, m.
-        line_x: x of the finish line, m.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Revolving Door."""
 
     episode_length: Positive = 5.0
     track_width: Positive = 3.5
+    """Width of the track, m."""
     gap: Positive = 2.0
+    """Width of the gap that holds the door, m."""
     door_x: Annotated[float, Gt(_WALL_LENGTH / 2)] = 2.6
+    """X of the hinge, m."""
     door_size: tuple[Positive, Positive, Positive] = (0.08, 1.95, 0.8)
+    """Thickness, width and height of the door, m."""
     door_mass: Positive = 4.0
+    """Mass of the door, kg."""
     door_inertia: Positive = 1.232
+    """Inertia about the hinge, kg m^2."""
     door_damping: NonNegative = 0.5
+    """Damping of the hinge, N m s/rad."""
     spawn_x: float = 0.5
+    """X of the robots' spawn poses, m."""
     spawn_y: NonNegative = 1.0
+    """Distance of the robots from the centre line, m."""
     line_x: float = 3.85
+    """X of the finish line, m."""
     rewards: DoorRewards = DoorRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,13 +71,10 @@ class DoorParams(TaskParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DoorState:
-    """The task's own state.
-
-    Attributes:
-        distance: of each robot to the midpoint of the line after the last step (2,), m.
-    """
+    """The task's own state."""
 
     distance: jax.Array
+    """Distance of each robot to the midpoint of the line after the last step (2,), m."""
 
 
 class Go1RevolvingDoor(Duel):

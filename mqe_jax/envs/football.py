@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Ball
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -33,26 +34,23 @@ BALL_BLOCKS = (Block("ball", 3, "centre, m"), Block("ball_velocity", 3, "m/s"))
 
 @record
 class FootballParams(TaskParams):
-    """Parameters of all football tasks.
-
-    Attributes:
-        field_width: m.
-        goal_width: of the goal mouths, m.
-        wall_height: of all walls, m.
-        ball_radius: m.
-        ball_mass: kg.
-        ball_drag: linear drag coefficient, N s/m.
-        ball_noise: half-width of the uniform noise on the ball's position at reset, m.
-    """
+    """Parameters of all football tasks."""
 
     episode_length: Positive = 20.0
     field_width: Positive = 9.0
+    """Width of the field, m."""
     goal_width: Positive = 2.0
+    """Width of the goal mouths, m."""
     wall_height: Positive = 1.0
+    """Height of all walls, m."""
     ball_radius: Positive = 0.1
+    """Radius of the ball, m."""
     ball_mass: Positive = 0.318
+    """Mass of the ball, kg."""
     ball_drag: NonNegative = 0.1
+    """Linear drag coefficient of the ball, N s/m."""
     ball_noise: NonNegative = 0.0
+    """Half-width of the uniform noise on the ball's position at reset, m."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,17 +58,14 @@ class FootballParams(TaskParams):
 
 
 class Football(QuadrupedEnv):
-    """Base of the football tasks: the field, the ball and the kick-off.
-
-    Attributes:
-        kick_off: spawn pose x, y, yaw of each robot, m and rad.
-        ball_spot: x, y of the ball at reset, m.
-        colors: of the robots, as in `Scene`.
-    """
+    """Base of the football tasks: the field, the ball and the kick-off."""
 
     kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()
+    """Spawn pose x, y, yaw of each robot, m and rad."""
     ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)
+    """X, y of the ball at reset, m."""
     colors: ClassVar[tuple[int, ...]] = ()
+    """Colors of the robots, as in `Scene`."""
 
     def scene(self) -> Scene:
         params = self.params
@@ -119,55 +114,44 @@ class FootballMatchRewards:
     """Weights of the reward terms; each is a team's own term minus the opponents'.
 
     The released system defines no rewards for these matches; all terms except the goal are this package's.
-
-    Attributes:
-        goal: when the ball is in the goal that the team attacks, which ends the episode.
-        progress: per m of decrease of the ball's distance to the midpoint of that goal.
-        approach: per m of decrease of the distance between the ball and the team's nearest robot.
-        fall: when a robot of the team has fallen, which ends and loses the match.
     """
 
     goal: float = 10.0
+    """Paid when the ball is in the goal that the team attacks, which ends the episode."""
     progress: float = 0.3
+    """Per m of decrease of the ball's distance to the midpoint of that goal."""
     approach: float = 0.1
+    """Per m of decrease of the distance between the ball and the team's nearest robot."""
     fall: float = -10.0
+    """Paid when a robot of the team has fallen, which ends and loses the match."""
 
 
 @record
 class Football1vs1Params(FootballParams):
-    """Parameters of Football (1 vs 1).
-
-    Attributes:
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Football (1 vs 1)."""
 
     rewards: FootballMatchRewards = FootballMatchRewards()
+    """Weights of the reward terms."""
 
 
 @record
 class Football2vs2Params(FootballParams):
-    """Parameters of Football (2 vs 2).
-
-    Attributes:
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Football (2 vs 2)."""
 
     num_agents: PositiveInt = 4
     rewards: FootballMatchRewards = FootballMatchRewards()
+    """Weights of the reward terms."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FootballMatchState:
-    """The task's own state.
-
-    Attributes:
-        goal: distance of the ball to the goal that each team attacks, after the last step (2,), m.
-        robot: distance of the ball to each team's nearest robot, after the last step (2,), m.
-    """
+    """The task's own state."""
 
     goal: jax.Array
+    """Distance of the ball to the goal that each team attacks, after the last step (2,), m."""
     robot: jax.Array
+    """Distance of the ball to each team's nearest robot, after the last step (2,), m."""
 
 
 class FootballMatch(Football, Match):

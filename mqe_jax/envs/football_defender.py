@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
 from mqe_jax.settings import record
@@ -22,40 +22,31 @@ from mqe_jax.walk_policy import command_index
 
 @record
 class DefenderRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        goal: while the ball is in the goal.
-        nearness: of exp(-distance of the ball to the goal's midpoint / 3 m).
-    """
+    """Weights of the reward terms."""
 
     goal: float = 10.0
+    """Paid while the ball is in the goal."""
     nearness: float = 3.0
+    """Per exp(-distance of the ball to the goal's midpoint / 3 m)."""
 
 
 @record
 class DefenderParams(FootballParams):
-    """Parameters of Football (2 vs 1).
-
-    Attributes:
-        defender_idle: whether the defender stands still.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Football (2 vs 1)."""
 
     defender_idle: bool = False
+    """Whether the defender stands still."""
     rewards: DefenderRewards = DefenderRewards()
+    """Weights of the reward terms."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DefenderState:
-    """The task's own state.
-
-    Attributes:
-        scored: whether the ball has been in the goal in this episode () bool.
-    """
+    """The task's own state."""
 
     scored: jax.Array
+    """Whether the ball has been in the goal in this episode () bool."""
 
 
 class Go1FootballDefender(Football):

@@ -11,9 +11,10 @@ import numpy as np
 from mujoco import mjx
 
 from mqe_jax.envs import reward
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, record
@@ -22,35 +23,21 @@ from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 @record
 class GateRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        success: per robot past the gate.
-        approach: per m of decrease of a robot's distance to its target.
-        crowding: per robot and 1 / d^2 while the distance d between the robots is below 0.5 m.
-        collision: in steps with any trunk contact.
-    """
+    """Weights of the reward terms."""
 
     success: float = 5.0
+    """Per robot past the gate."""
     approach: float = 1.0
+    """Per m of decrease of a robot's distance to its target."""
     crowding: float = -0.025
+    """Per robot and 1 / d^2 while the distance d between the robots is below 0.5 m."""
     collision: float = -2.0
+    """Paid in steps with any trunk contact."""
 
 
 @record
 class GateParams(TaskParams):
-    """Parameters of Narrow Gate.
-
-    Attributes:
-        track_width: m.
-        gate_width: of the gap, m.
-        gate_depth: thickness of the wall along x, m.
-        gate_random: half-widths of the range of the gap's centre in x and y, m.
-        past_gate: distance behind the gate's centre at which a robot counts as through, m.
-        target_x: x of the robots' targets, m.
-        target_y: |y| of the targets, m; the robots' paths cross: the first robot's target is on the left.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Narrow Gate."""
 
     episode_length: Positive = 10.0
     spawn_noise: NonNegative = 0.0
@@ -58,13 +45,21 @@ class GateParams(TaskParams):
     max_height: float = 1.5
     end_on_collision: bool = True
     track_width: Positive = 3.0
+    """Width of the track, m."""
     gate_width: Positive = 0.6
+    """Width of the gap, m."""
     gate_depth: Positive = 0.1
+    """Thickness of the wall along x, m."""
     gate_random: tuple[NonNegative, NonNegative] = (0.5, 0.5)
+    """Half-widths of the range of the gap's centre in x and y, m."""
     past_gate: float = 0.25
+    """Distance behind the gate's centre at which a robot counts as through, m."""
     target_x: float = 5.5
+    """X of the robots' targets, m."""
     target_y: float = 0.75
+    """|y| of the targets, m; the robots' paths cross: the first robot's target is on the left."""
     rewards: GateRewards = GateRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,13 +69,10 @@ class GateParams(TaskParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GateState:
-    """The task's own state.
-
-    Attributes:
-        distance: of each robot to its target after the last step (2,), m.
-    """
+    """The task's own state."""
 
     distance: jax.Array
+    """Distance of each robot to its target after the last step (2,), m."""
 
 
 class Go1Gate(QuadrupedEnv):

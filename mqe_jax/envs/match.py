@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS
 
@@ -35,12 +36,10 @@ class Match(QuadrupedEnv):
     team wins, and it is a draw if both or neither lead.
     Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended in this step; they are
     evaluated at its end. `success` is a win of team 0. Diverged physics is a draw.
-
-    Attributes:
-        symmetry: 'turn' or 'reflect'.
     """
 
     symmetry: ClassVar[str] = "turn"
+    """Symmetry that maps one team's frame to the other's: 'turn' or 'reflect'."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
 
     @property

@@ -13,30 +13,24 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """One block of an observation.
-
-    Attributes:
-        name: unique in the layout.
-        width: number of entries.
-        meaning: with unit and frame.
-        categorical: whether the entries encode a category, such as a one-hot, and get no observation noise.
-    """
+    """One block of an observation."""
 
     name: str
+    """Name, unique in the layout."""
     width: int
+    """Number of entries."""
     meaning: str = ""
+    """Meaning, with unit and frame."""
     categorical: bool = False
+    """Whether the entries encode a category, such as a one-hot, and get no observation noise."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ObservationLayout:
-    """Ordered blocks of an observation vector.
-
-    Attributes:
-        blocks: in the order in which they are packed.
-    """
+    """Ordered blocks of an observation vector."""
 
     blocks: tuple[Block, ...]
+    """Blocks in the order in which they are packed."""
 
     @property
     def size(self) -> int:

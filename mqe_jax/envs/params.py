@@ -13,66 +13,68 @@ from mqe_jax.settings import NonNegative, Positive, PositiveInt, Range, fail, re
 
 @record
 class TaskParams:
-    """Parameters that all tasks have; a task adds its own.
-
-    Attributes:
-        num_agents: number of controlled robots.
-        robot: name of the robot, such as go1 or go2 (`mqe_jax.robots`).
-        episode_length: time limit, s.
-        spawn_height: of the trunks, m.
-        spawn_noise: half-width of the uniform noise on the spawn position in x and y, m.
-        spawn_joint_scale: range of the factor on the default joint angles at reset.
-        spawn_velocity: half-width of the uniform noise on all six base velocities, m/s and rad/s.
-        max_roll: an episode ends when any |roll| is greater, rad.
-        max_pitch: likewise |pitch|, rad. Pitch is an arcsine, so a limit above pi / 2, as in the released system, is
-            never reached: a robot that turns over by pitching shows a roll of pi.
-        min_height: an episode ends when any trunk is lower, m.
-        max_height: an episode ends when any trunk is higher, m.
-        end_on_collision: whether a contact force on an agent's trunk above `collision_force` ends the episode.
-        collision_force: threshold, N, on the forces of the last physics step of an environment step.
-        gait: of the walk policy: trot, pronk, bound or pace.
-        commands: walk commands that the action sets, in order.
-        walk_policy: weights file of the walk policy; the package's own if None.
-        actuator_network: weights file of an actuator network that replaces PD control; PD control if None.
-        friction: sliding friction of robots and ground.
-        solver_iterations: maximum solver iterations per physics step.
-        contacts: set of the robots' collision shapes: full, or minimal (trunk and feet), which is several times faster
-            on MJX-JAX and disables limb collisions.
-        contacts_per_robot: contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest
-            contacts, and on average over all environments on Warp.
-        constraints_per_robot: constraint buffer size per robot on Warp, per environment.
-        privileged_contact_forces: whether the privileged observation includes the contact forces on trunks and feet;
-            their sensors cost about 8% of the throughput.
-        randomization: domain randomisation.
-        frozen_time: curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s,
-            so that agents first learn sequential subtasks one at a time. Off unless a trainer sets assistance.
-    """
+    """Parameters that all tasks have; a task adds its own."""
 
     num_agents: PositiveInt = 2
+    """Number of controlled robots."""
     robot: str = "go1"
+    """Name of the robot, such as go1 or go2 (`mqe_jax.robots`)."""
     episode_length: Positive = 10.0
+    """Time limit, s."""
     spawn_height: Positive = 0.42
+    """Spawn height of the trunks, m."""
     spawn_noise: NonNegative = 0.1
+    """Half-width of the uniform noise on the spawn position in x and y, m."""
     spawn_joint_scale: Range = (0.7, 1.3)
+    """Range of the factor on the default joint angles at reset."""
     spawn_velocity: NonNegative = 0.5
+    """Half-width of the uniform noise on all six base velocities, m/s and rad/s."""
     max_roll: Positive = 0.8
+    """An episode ends when any |roll| is greater, rad."""
     max_pitch: Positive = 1.6
+    """An episode ends when any |pitch| is greater, rad. Pitch is an arcsine, so a limit above pi / 2, as in the
+    released system, is never reached: a robot that turns over by pitching shows a roll of pi.
+    """
     min_height: float = -1.0
+    """An episode ends when any trunk is lower, m."""
     max_height: float = 100.0
+    """An episode ends when any trunk is higher, m."""
     end_on_collision: bool = False
+    """Whether a contact force on an agent's trunk above `collision_force` ends the episode."""
     collision_force: Positive = 1.0
+    """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
     gait: str = "trot"
+    """Gait of the walk policy: trot, pronk, bound or pace."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
+    """Walk commands that the action sets, in order."""
     walk_policy: str | None = None
+    """Weights file of the walk policy; the package's own if None."""
     actuator_network: str | None = None
+    """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: Positive = 1.0
+    """Sliding friction of robots and ground."""
     solver_iterations: PositiveInt = 4
+    """Maximum solver iterations per physics step."""
     contacts: Literal["full", "minimal"] = "full"
+    """Set of the robots' collision shapes: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
+    and disables limb collisions.
+    """
     contacts_per_robot: PositiveInt = 12
+    """Contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest contacts, and on average over
+    all environments on Warp.
+    """
     constraints_per_robot: PositiveInt = 64
+    """Constraint buffer size per robot on Warp, per environment."""
     privileged_contact_forces: bool = False
+    """Whether the privileged observation includes the contact forces on trunks and feet; their sensors cost about 8% of
+    the throughput.
+    """
     randomization: Randomization = Randomization()
+    """Domain randomisation."""
     frozen_time: NonNegative = 4.0
+    """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
+    first learn sequential subtasks one at a time. Off unless a trainer sets assistance.
+    """
 
     def __post_init__(self) -> None:
         check_commands(self.commands)

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import Positive, record
@@ -20,38 +21,29 @@ from mqe_jax.terrain import Plane, SpawnArea, Track
 
 @record
 class PlaneRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        forward: per m of the robots' summed displacement along x.
-    """
+    """Weights of the reward terms."""
 
     forward: float = 1.0
+    """Per m of the robots' summed displacement along x."""
 
 
 @record
 class PlaneParams(TaskParams):
-    """Parameters of Plane.
-
-    Attributes:
-        width: of the strip across which the robots are spawned side by side, m.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Plane."""
 
     width: Positive = 3.0
+    """Width of the strip across which the robots are spawned side by side, m."""
     rewards: PlaneRewards = PlaneRewards()
+    """Weights of the reward terms."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PlaneState:
-    """The task's own state.
-
-    Attributes:
-        x: of the robots after the last step (A,), m.
-    """
+    """The task's own state."""
 
     x: jax.Array
+    """X of the robots after the last step (A,), m."""
 
 
 class Go1Plane(QuadrupedEnv):

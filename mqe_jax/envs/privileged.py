@@ -37,10 +37,10 @@ class PrivilegedObservation:
         num_anchors: G.
         gait: whether the robots walk by the walk policy, whose gait phases are then included.
         contact_forces: whether the scene measures the feet's contact forces, which are then included with the trunks'.
-
-    Attributes:
-        layout: its blocks, in order; physical units, not normalised.
     """
+
+    layout: ObservationLayout
+    """Blocks in order; physical units, not normalised."""
 
     def __init__(
         self,

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Box
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -24,46 +25,40 @@ from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
 
 @record
 class PushBoxRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        progress: per m of the box's displacement along x.
-        success: while the box is past the gate.
-    """
+    """Weights of the reward terms."""
 
     progress: float = 10.0
+    """Per m of the box's displacement along x."""
     success: float = 1.0
+    """Paid while the box is past the gate."""
 
 
 @record
 class PushBoxParams(TaskParams):
-    """Parameters of Push Box.
-
-    Attributes:
-        track_width: m.
-        gate_width: of the gap, m.
-        gate_random: half-widths of the range of the gap's centre in x and y, m.
-        past_gate: distance of the box's centre behind the gate's at which it counts as through, m.
-        box_size: full extents, m.
-        box_mass: kg.
-        box_friction: sliding friction between box and ground.
-        box_x: of the box's centre at reset, m.
-        box_noise: half-width of the uniform noise on the box's position, m.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Push Box."""
 
     episode_length: Positive = 15.0
     track_width: Positive = 5.0
+    """Width of the track, m."""
     gate_width: Positive = 1.5
+    """Width of the gap, m."""
     gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
+    """Half-widths of the range of the gap's centre in x and y, m."""
     past_gate: float = 0.0
+    """Distance of the box's centre behind the gate's at which it counts as through, m."""
     box_size: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    """Full extents of the box, m."""
     box_mass: Positive = 6.0
+    """Mass of the box, kg."""
     box_friction: NonNegative = 1.0
+    """Sliding friction between box and ground."""
     box_x: float = 2.5
+    """X of the box's centre at reset, m."""
     box_noise: NonNegative = 0.5
+    """Half-width of the uniform noise on the box's position, m."""
     contacts_per_robot: PositiveInt = 16
     rewards: PushBoxRewards = PushBoxRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,15 +68,12 @@ class PushBoxParams(TaskParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PushBoxState:
-    """The task's own state.
-
-    Attributes:
-        x: of the box after the last step (), m.
-        start: x of the box at the reset (), m.
-    """
+    """The task's own state."""
 
     x: jax.Array
+    """X of the box after the last step (), m."""
     start: jax.Array
+    """X of the box at the reset (), m."""
 
 
 class Go1PushBox(QuadrupedEnv):

@@ -15,27 +15,24 @@ from mqe_jax.settings import NonNegative, NonNegativeInt, Positive, Range, fail,
 
 @record
 class Randomization:
-    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables.
-
-    Attributes:
-        friction: sliding friction of the robots' collision shapes (lowest, highest).
-        payload: additional mass of the trunk, kg; its inertia is scaled by the same factor as its mass.
-        center_of_mass: shift of the trunk's centre of mass along each axis, m.
-        motor_strength: factor on all torques.
-        action_lag: maximum delay of the actuator targets, environment steps; one sample per environment.
-        push: maximum sudden change of a trunk's horizontal velocity, m/s.
-        push_period: mean time between pushes, s.
-        observation_noise: standard deviation of the noise on observations, except on one-hot blocks.
-    """
+    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables."""
 
     friction: Range | None = None
+    """Sliding friction of the robots' collision shapes (lowest, highest)."""
     payload: Range | None = None
+    """Additional mass of the trunk, kg; its inertia is scaled by the same factor as its mass."""
     center_of_mass: Range | None = None
+    """Shift of the trunk's centre of mass along each axis, m."""
     motor_strength: Range | None = None
+    """Factor on all torques."""
     action_lag: NonNegativeInt = 0
+    """Maximum delay of the actuator targets, environment steps; one sample per environment."""
     push: NonNegative = 0.0
+    """Maximum sudden change of a trunk's horizontal velocity, m/s."""
     push_period: Positive = 5.0
+    """Mean time between pushes, s."""
     observation_noise: NonNegative = 0.0
+    """Standard deviation of the noise on observations, except on one-hot blocks."""
 
     def __post_init__(self) -> None:
         for name in ("friction", "motor_strength"):
@@ -47,21 +44,18 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RandomizedParams:
-    """Randomised physics parameters of one environment (R robots); the model's values where not randomised.
-
-    Attributes:
-        friction: sliding friction (R,).
-        payload: additional mass of the trunk (R,), kg.
-        center_of_mass: shift of the trunk's centre of mass (R, 3), m.
-        motor_strength: factor on all torques (R,).
-        action_lag: () int32, environment steps.
-    """
+    """Randomised physics parameters of one environment (R robots); the model's values where not randomised."""
 
     friction: jax.Array
+    """Sliding friction (R,)."""
     payload: jax.Array
+    """Additional mass of the trunk (R,), kg."""
     center_of_mass: jax.Array
+    """Shift of the trunk's centre of mass (R, 3), m."""
     motor_strength: jax.Array
+    """Factor on all torques (R,)."""
     action_lag: jax.Array
+    """Delay of the actuator targets, environment steps () int32."""
 
 
 class Randomizer:

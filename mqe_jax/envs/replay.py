@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.physics import STATE_FIELDS
@@ -26,23 +27,20 @@ _FIELDS = ("step", "anchors", "control", "randomized", "task", "assistance", "fr
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Consecutive states of one environment within an episode, and the actions per state.
-
-    Attributes:
-        task: id of the task.
-        params: its parameters as nested mappings.
-        impl: physics engine.
-        control: action mode.
-        states: the fields of `State` on which a step depends, before each action, by path (T, ...).
-        actions: (T, A, D).
-    """
+    """Consecutive states of one environment within an episode, and the actions per state."""
 
     task: str
+    """Id of the task."""
     params: dict[str, Any]
+    """The task's parameters as nested mappings."""
     impl: str
+    """Physics engine."""
     control: str
+    """Action mode."""
     states: dict[str, np.ndarray]
+    """The fields of `State` on which a step depends, before each action, by path (T, ...)."""
     actions: np.ndarray
+    """Actions (T, A, D)."""
 
     def make_env(self, impl: str | None = None) -> QuadrupedEnv:
         """Creates the recorded environment, on the recorded engine if `impl` is None."""

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mqe_jax.envs import reward
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -22,70 +23,64 @@ from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 @record
 class SeesawRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        success: per robot on the platform.
-        height: per m of the robots' summed heights above `height_base`.
-        progress: per m of the robots' summed displacement along x.
-        aside: per m^2 of the robots' summed squared distances from the centre line above `aside_base`.
-        collision: in steps with any trunk contact.
-        fall: in steps in which any robot exceeds the roll or pitch limit.
-        crowding: per 1 / d^2 while the distance d between the robots is below 0.5 m, once for the pair.
-    """
+    """Weights of the reward terms."""
 
     success: float = 10.0
+    """Per robot on the platform."""
     height: float = 1.0
+    """Per m of the robots' summed heights above `height_base`."""
     progress: float = 5.0
+    """Per m of the robots' summed displacement along x."""
     aside: float = -0.5
+    """Per m^2 of the robots' summed squared distances from the centre line above `aside_base`."""
     collision: float = -2.0
+    """Paid in steps with any trunk contact."""
     fall: float = -2.0
+    """In steps in which any robot exceeds the roll or pitch limit."""
     crowding: float = -0.25
+    """Per 1 / d^2 while the distance d between the robots is below 0.5 m, once for the pair."""
 
 
 @record
 class SeesawParams(TaskParams):
-    """Parameters of Climb on Seesaw.
-
-    Attributes:
-        track_width: m.
-        hinge: position of the plank's hinge (x, y, z), m.
-        plank_size: length, width and thickness, m.
-        plank_behind: distance of the plank's centre from the hinge towards the near end, m.
-        plank_mass: kg.
-        plank_inertia: about the hinge, kg m^2.
-        plank_limit: maximum |angle|, rad.
-        plank_damping: of the hinge, N m s/rad.
-        plank_start: angle at reset, rad; negative with the near end down.
-        platform: centre of the platform's top face (x, y, z), m.
-        platform_size: full extents, m.
-        platform_column: radius of the column under the platform, m.
-        on_platform: x and z beyond which a robot counts as on the platform, m.
-        height_base: summed height of the robots at which the height term is zero, m.
-        aside_base: summed squared distance from the centre line at which the aside term is zero, m^2.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Climb on Seesaw."""
 
     episode_length: Positive = 10.0
     min_height: float = 0.08
     end_on_collision: bool = True
     gait: str = "pace"
     track_width: Positive = 3.0
+    """Track width, m."""
     hinge: tuple[float, float, float] = (5.6, 0.0, 0.545)
+    """Position of the plank's hinge (x, y, z), m."""
     plank_size: tuple[Positive, Positive, Positive] = (4.123, 1.0, 0.03)
+    """Length, width and thickness, m."""
     plank_behind: float = 0.103
+    """Distance of the plank's centre from the hinge towards the near end, m."""
     plank_mass: Positive = 100.0
+    """Plank mass, kg."""
     plank_inertia: Positive = 100.0
+    """About the hinge, kg m^2."""
     plank_limit: Positive = 0.254
+    """Maximum |angle|, rad."""
     plank_damping: NonNegative = 1000.0
+    """Plank damping of the hinge, N m s/rad."""
     plank_start: float = -0.25
+    """Angle at reset, rad; negative with the near end down."""
     platform: tuple[float, float, float] = (8.0, 0.0, 1.0)
+    """Centre of the platform's top face (x, y, z), m."""
     platform_size: tuple[Positive, Positive, Positive] = (1.0, 1.0, 0.03)
+    """Full extents, m."""
     platform_column: NonNegative = 0.2
+    """Radius of the column under the platform, m."""
     on_platform: tuple[float, float] = (7.7, 1.2)
+    """X and z beyond which a robot counts as on the platform, m."""
     height_base: float = 0.56
+    """Summed height of the robots at which the height term is zero, m."""
     aside_base: float = 0.5
+    """Summed squared distance from the centre line at which the aside term is zero, m^2."""
     rewards: SeesawRewards = SeesawRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,13 +91,10 @@ class SeesawParams(TaskParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SeesawState:
-    """The task's own state.
-
-    Attributes:
-        x: of each robot after the last step (2,), m.
-    """
+    """The task's own state."""
 
     x: jax.Array
+    """X of each robot after the last step (2,), m."""
 
 
 class Go1Seesaw(QuadrupedEnv):

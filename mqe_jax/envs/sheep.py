@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import QuadrupedEnv, State
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.state import State
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
 from mqe_jax.robots.index import RobotState
@@ -23,57 +24,52 @@ from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 @record
 class SheepRewards:
-    """Weights of the reward terms.
-
-    Attributes:
-        success: per sheep past the gate.
-        progress: per m of the sheep's summed displacement along x.
-        nearness: sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the gate.
-    """
+    """Weights of the reward terms."""
 
     success: float = 1.0
+    """Per sheep past the gate."""
     progress: float = 2.0
+    """Per m of the sheep's summed displacement along x."""
     nearness: float = 0.0
+    """Sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the gate."""
 
 
 @record
 class SheepEasyParams(TaskParams):
-    """Parameters of both tasks, with the defaults of the easy one.
-
-    Attributes:
-        track_width: m.
-        lengths: of the spawn area and of the free ground in front of and behind the gate, m.
-        spawn_x: of the robots, m.
-        spawn_apart: distance between the robots, m.
-        gate_width: of the gap, m.
-        gate_random: half-widths of the range of the gap's centre in x and y, m.
-        past_gate: distance behind the gate's centre at which a sheep counts as through, m.
-        flock: number of sheep along x and along y.
-        flock_center: centre of the flock at reset, m.
-        flock_spacing: distance between neighbouring sheep at reset, m.
-        flock_noise: half-width of the uniform noise on each sheep's position, m.
-        restlessness: scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep of
-            the released system; in the paper sheep always move.
-        sheep_friction: sliding friction between sheep and ground.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of both tasks, with the defaults of the easy one."""
 
     episode_length: Positive = 15.0
     end_on_collision: bool = True
     track_width: Positive = 4.0
+    """Track width, m."""
     lengths: tuple[Positive, Positive, Positive] = (1.5, 3.0, 3.0)
+    """Lengths of the spawn area and of the free ground in front of and behind the gate, m."""
     spawn_x: float = 1.25
+    """Spawn x of the robots, m."""
     spawn_apart: NonNegative = 1.95
+    """Distance between the robots, m."""
     gate_width: Positive = 0.8
+    """Gate width of the gap, m."""
     gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
+    """Half-widths of the range of the gap's centre in x and y, m."""
     past_gate: float = 0.0
+    """Distance behind the gate's centre at which a sheep counts as through, m."""
     flock: tuple[PositiveInt, PositiveInt] = (1, 1)
+    """Number of sheep along x and along y."""
     flock_center: tuple[float, float] = (3.0, 0.0)
+    """Centre of the flock at reset, m."""
     flock_spacing: NonNegative = 1.5
+    """Distance between neighbouring sheep at reset, m."""
     flock_noise: NonNegative = 0.3
+    """Half-width of the uniform noise on each sheep's position, m."""
     restlessness: NonNegative = 0.08
+    """Scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep of the released
+    system; in the paper sheep always move.
+    """
     sheep_friction: NonNegative = 1.0
+    """Sliding friction between sheep and ground."""
     rewards: SheepRewards = SheepRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,13 +97,10 @@ class SheepHardParams(SheepEasyParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SheepState:
-    """The task's own state.
-
-    Attributes:
-        x: of the sheep after the last step (S,), m.
-    """
+    """The task's own state."""
 
     x: jax.Array
+    """X of the sheep after the last step (S,), m."""
 
 
 class Go1SheepEasy(QuadrupedEnv):

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Cylinder
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -26,46 +26,40 @@ _START_X = 0.1  # m, x of the arena's near wall
 
 @record
 class TugRewards:
-    """Weights of the reward terms; each is a robot's own term minus the opponent's.
-
-    Attributes:
-        push: per m of the cylinder's position on the opponent's half, in every step; halved in steps in which it
-            moves back.
-        approach: per m of decrease of the distance to the cylinder's axis.
-    """
+    """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     push: float = 10.0
+    """Per m of the cylinder's position on the opponent's half, in every step; halved in steps in which it moves back.
+    """
     approach: float = 2.0
+    """Per m of decrease of the distance to the cylinder's axis."""
 
 
 @record
 class TugParams(TaskParams):
-    """Parameters of Push Cylinder.
-
-    Attributes:
-        arena: extents along x and y, m; its near wall is at x 0.1.
-        radius: of the cylinder, m.
-        height: of the cylinder, m.
-        mass: of the cylinder, kg.
-        cylinder_friction: sliding friction between cylinder and ground.
-        spawn_x: half-width of the range of the robots' initial x about the arena's centre, m.
-        spawn_y: distance of the robots from the centre line, m; the first robot is on the side of negative y.
-        win_by: distance of the cylinder on the opponent's half at the end of the episode that wins, m.
-        rewards: weights of the reward terms.
-    """
+    """Parameters of Push Cylinder."""
 
     episode_length: Positive = 15.0
     spawn_height: Positive = 0.34
     spawn_noise: NonNegative = 0.0
     arena: tuple[Positive, Positive] = (3.0, 6.0)
+    """Extents of the arena along x and y, m; its near wall is at x 0.1."""
     radius: Positive = 1.2
+    """Radius of the cylinder, m."""
     height: Positive = 0.5
+    """Height of the cylinder, m."""
     mass: Positive = 3.0
+    """Mass of the cylinder, kg."""
     cylinder_friction: NonNegative = 1.0
+    """Sliding friction between cylinder and ground."""
     spawn_x: NonNegative = 1.0
+    """Half-width of the range of the robots' initial x about the arena's centre, m."""
     spawn_y: NonNegative = 2.5
+    """Distance of the robots from the centre line, m; the first robot is on the side of negative y."""
     win_by: NonNegative = 0.1
+    """Distance of the cylinder on the opponent's half at the end of the episode that wins, m."""
     rewards: TugRewards = TugRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,17 +70,14 @@ class TugParams(TaskParams):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TugState:
-    """The task's own state.
-
-    Attributes:
-        y: of the cylinder after the last step (), m.
-        previous_y: of the cylinder one step earlier (), m.
-        distance: of each robot to the cylinder's axis after the last step (2,), m.
-    """
+    """The task's own state."""
 
     y: jax.Array
+    """Y of the cylinder after the last step (), m."""
     previous_y: jax.Array
+    """Y of the cylinder one step earlier (), m."""
     distance: jax.Array
+    """Distance of each robot to the cylinder's axis after the last step (2,), m."""
 
 
 class Go1Tug(Duel):

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.base import State
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
+from mqe_jax.envs.state import State
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -21,13 +21,10 @@ from mqe_jax.terrain import Plane, SpawnArea, Track
 
 @record
 class WrestlingRewards:
-    """Weights of the reward terms; each is a robot's own term minus the opponent's.
-
-    Attributes:
-        win: when the opponent falls or leaves the ring.
-    """
+    """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     win: float = 10.0
+    """Paid when the opponent falls or leaves the ring."""
 
 
 @record
@@ -35,27 +32,25 @@ class WrestlingParams(TaskParams):
     """Parameters of Sumo Wrestling.
 
     A robot is eliminated when its |roll| or |pitch| exceeds the limit, or its trunk is outside the ring or too low.
-
-    Attributes:
-        center: of platform and ring (x, y), m.
-        platform: extents of the platform, m; its lower part is below the ground.
-        platform_top: height of its top face, m; robots dropped from the spawn height land on their feet.
-        ring_radius: m.
-        ring_depth: distance of a trunk below the platform's top at which the robot counts as out, m.
-        spawn_y: distance of the robots from the ring's centre, m; the first robot is on the side of negative y.
-        rewards: weights of the reward terms.
     """
 
     episode_length: Positive = 15.0
     spawn_height: Positive = 0.74
     max_roll: Positive = 0.4 * np.pi
     center: tuple[float, float] = (3.1, 0.0)
+    """Centre of platform and ring (x, y), m."""
     platform: tuple[Positive, Positive, Positive] = (4.37, 4.37, 0.5)
+    """Extents of the platform, m; its lower part is below the ground."""
     platform_top: Positive = 0.4
+    """Height of the platform's top face, m; robots dropped from the spawn height land on their feet."""
     ring_radius: Positive = 1.7
+    """Radius of the ring, m."""
     ring_depth: NonNegative = 0.2
+    """Distance of a trunk below the platform's top at which the robot counts as out, m."""
     spawn_y: NonNegative = 1.0
+    """Distance of the robots from the ring's centre, m; the first robot is on the side of negative y."""
     rewards: WrestlingRewards = WrestlingRewards()
+    """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

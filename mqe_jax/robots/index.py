@@ -17,35 +17,34 @@ from mqe_jax.rotation import quaternion_to_euler, rotate_inverse
 
 @dataclasses.dataclass(frozen=True)
 class RobotIndex:
-    """Index tables of the R robots of a compiled model, as host integers.
-
-    Attributes:
-        base_qpos: addresses of (position 3, quaternion wxyz 4) in qpos (R, 7).
-        base_qvel: addresses of (linear 3 world, angular 3 body) in qvel (R, 6).
-        joint_qpos: joint angles in qpos (R, 12).
-        joint_qvel: joint velocities in qvel (R, 12).
-        actuator: rows of ctrl (R, 12).
-        trunk_body: trunk body ids (R,).
-        bodies: all body ids of each robot (R, 13).
-        foot_geom: foot shape ids (R, 4).
-        geoms: collision shape ids of each robot (R, G).
-        trunk_force: addresses in sensordata of the strongest contact force on each of the trunk's T shapes
-            (R, T, 3), contact frame, N.
-        foot_force: addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless
-            the scene has foot sensors.
-    """
+    """Index tables of the R robots of a compiled model, as host integers."""
 
     base_qpos: np.ndarray
+    """Addresses of (position 3, quaternion wxyz 4) in qpos (R, 7)."""
     base_qvel: np.ndarray
+    """Addresses of (linear 3 world, angular 3 body) in qvel (R, 6)."""
     joint_qpos: np.ndarray
+    """Joint angles in qpos (R, 12)."""
     joint_qvel: np.ndarray
+    """Joint velocities in qvel (R, 12)."""
     actuator: np.ndarray
+    """Rows of ctrl (R, 12)."""
     trunk_body: np.ndarray
+    """Trunk body ids (R,)."""
     bodies: np.ndarray
+    """All body ids of each robot (R, 13)."""
     foot_geom: np.ndarray
+    """Foot shape ids (R, 4)."""
     geoms: np.ndarray
+    """Collision shape ids of each robot (R, G)."""
     trunk_force: np.ndarray
+    """Addresses in sensordata of the strongest contact force on each of the trunk's T shapes (R, T, 3), contact frame,
+    N.
+    """
     foot_force: np.ndarray
+    """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless the scene has foot
+    sensors.
+    """
 
     @property
     def num_robots(self) -> int:
@@ -111,25 +110,22 @@ def index_robots(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RobotState:
-    """Backend-independent robot state after a step (R robots, NPC robots included).
-
-    Attributes:
-        position_w: trunk origin in the environment frame (R, 3), m.
-        quaternion: trunk orientation, wxyz (R, 4).
-        linear_velocity_w: of the trunk origin (R, 3), m/s.
-        angular_velocity_b: body frame (R, 3), rad/s.
-        joint_position: (R, 12), rad.
-        joint_velocity: (R, 12), rad/s.
-        trunk_force: strongest contact force on the trunk (R,), N.
-    """
+    """Backend-independent robot state after a step (R robots, NPC robots included)."""
 
     position_w: jax.Array
+    """Trunk origin in the environment frame (R, 3), m."""
     quaternion: jax.Array
+    """Trunk orientation, wxyz (R, 4)."""
     linear_velocity_w: jax.Array
+    """Velocity of the trunk origin in the environment frame (R, 3), m/s."""
     angular_velocity_b: jax.Array
+    """Angular velocity of the trunk in its own frame (R, 3), rad/s."""
     joint_position: jax.Array
+    """Joint angles (R, 12), rad."""
     joint_velocity: jax.Array
+    """Joint velocities (R, 12), rad/s."""
     trunk_force: jax.Array
+    """Strongest contact force on the trunk (R,), N."""
 
     @property
     def euler(self) -> jax.Array:

@@ -34,17 +34,14 @@ Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """Inertial parameters of one rigid link.
-
-    Attributes:
-        mass: kg.
-        com: centre of mass in the link frame (3,), m.
-        inertia: (xx, yy, zz, xy, xz, yz) about the centre of mass, in the axes of the link frame, kg m^2.
-    """
+    """Inertial parameters of one rigid link."""
 
     mass: float
+    """Mass, kg."""
     com: Vector
+    """Centre of mass in the link frame (3,), m."""
     inertia: tuple[float, float, float, float, float, float]
+    """Inertia (xx, yy, zz, xy, xz, yz) about the centre of mass, in the axes of the link frame, kg m^2."""
 
     @classmethod
     def from_principal(cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]) -> Link:
@@ -89,19 +86,16 @@ def _six(tensor: np.ndarray) -> tuple[float, float, float, float, float, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """A primitive in a link frame; on the right legs y is negated.
-
-    Attributes:
-        kind: sphere, capsule, cylinder, box or ellipsoid.
-        size: radius (1,) of a sphere, capsule or cylinder; half-lengths (3,) of a box or ellipsoid, m.
-        position: centre, or first end of a capsule's or cylinder's axis, m.
-        end: second end of the axis, m; None for the other kinds.
-    """
+    """A primitive in a link frame; on the right legs y is negated."""
 
     kind: Literal["sphere", "capsule", "cylinder", "box", "ellipsoid"]
+    """Kind: sphere, capsule, cylinder, box or ellipsoid."""
     size: tuple[float, ...]
+    """Radius (1,) of a sphere, capsule or cylinder; half-lengths (3,) of a box or ellipsoid, m."""
     position: Vector = (0.0, 0.0, 0.0)
+    """Centre, or first end of a capsule's or cylinder's axis, m."""
     end: Vector | None = None
+    """Second end of the axis, m; None for the other kinds."""
 
 
 def sphere(radius: float, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
@@ -131,17 +125,14 @@ def ellipsoid(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitiv
 
 @dataclasses.dataclass(frozen=True)
 class CollisionShape:
-    """Collision geometry; a leg's shape exists once on each leg.
-
-    Attributes:
-        part: one of `PARTS`.
-        primitive: its geometry, in the frame of `link`.
-        name: unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so on.
-    """
+    """Collision geometry; a leg's shape exists once on each leg."""
 
     part: str
+    """Part that the shape belongs to: one of `PARTS`."""
     primitive: Primitive
+    """Its geometry, in the frame of `link`."""
     name: str = ""
+    """Unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so on."""
 
     def __post_init__(self) -> None:
         if self.part not in PARTS:
@@ -162,19 +153,16 @@ class CollisionShape:
 
 @dataclasses.dataclass(frozen=True)
 class VisualShape:
-    """A massless shape without contacts, for rendering only.
-
-    Attributes:
-        link: trunk, hip, thigh or calf.
-        primitive: its geometry, in the frame of `link`.
-        color: own colour.
-        tint: fraction of the agent's colour mixed into it, in [0, 1].
-    """
+    """A massless shape without contacts, for rendering only."""
 
     link: str
+    """Link that the shape is fixed to: trunk, hip, thigh or calf."""
     primitive: Primitive
+    """Its geometry, in the frame of `link`."""
     color: Color = (0.0, 0.0, 0.0, 1.0)
+    """Own colour."""
     tint: float = 0.0
+    """Fraction of the agent's colour mixed into it, in [0, 1]."""
 
     def __post_init__(self) -> None:
         if self.link not in LINKS:
@@ -189,21 +177,18 @@ class VisualShape:
 
 @dataclasses.dataclass(frozen=True)
 class WalkSettings:
-    """Settings of the walk policy and its training that depend on the robot.
-
-    Attributes:
-        weights: file name of the trained weights in `mqe_jax/assets`.
-        stance_width: default distance between left and right feet, m.
-        stance_length: default distance between front and rear feet, m.
-        min_knee_height: a knee below it counts as thigh and calf touching the ground, m.
-        min_trunk_height: a trunk origin below it counts as a fall, m.
-    """
+    """Settings of the walk policy and its training that depend on the robot."""
 
     weights: str
+    """File name of the trained weights in `mqe_jax/assets`."""
     stance_width: float
+    """Default distance between left and right feet, m."""
     stance_length: float
+    """Default distance between front and rear feet, m."""
     min_knee_height: float
+    """A knee below it counts as thigh and calf touching the ground, m."""
     min_trunk_height: float
+    """A trunk origin below it counts as a fall, m."""
 
 
 _JOINT_FIELDS = ("default_joints", "joint_lower", "joint_upper", "joint_speed_limit", "torque_limit", "action_scale")
@@ -211,58 +196,56 @@ _JOINT_FIELDS = ("default_joints", "joint_lower", "joint_upper", "joint_speed_li
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
-    """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`.
-
-    Attributes:
-        name: short name, as in the registry.
-        title: full name.
-        trunk: inertial parameters of the trunk.
-        hip: of the left front hip; y is mirrored for the right legs, x for the rear ones.
-        thigh: of the left front thigh; y is mirrored for the right legs.
-        calf: of the left front calf with its foot; y is mirrored for the right legs.
-        leg_root: hip joint of the left front leg in the trunk frame (x, y), m.
-        hip_length: hip joint to thigh joint, outward, m.
-        thigh_length: thigh joint to calf joint, downward, m.
-        foot_position: centre of the foot in the calf frame (x, z), m.
-        foot_radius: m.
-        default_joints: angles around which position control and the walk policy act (12,), rad.
-        joint_lower: lower limits (12,), rad.
-        joint_upper: upper limits (12,), rad.
-        joint_speed_limit: of the motors (12,), rad/s; data for users, not enforced by the physics.
-        torque_limit: of the controller (12,), N m.
-        kp: proportional gain, N m/rad.
-        kd: derivative gain, N m s/rad.
-        action_scale: joint target = default + scale x action (12,), rad.
-        stand_height: trunk origin above the ground when standing at the default angles, m: the walk policy's
-            height at a zero height command.
-        collision: collision geometry.
-        visuals: shapes for rendering.
-        walk: walk-policy settings.
-    """
+    """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`."""
 
     name: str
+    """Short name, as in the registry."""
     title: str
+    """Full name."""
     trunk: Link
+    """Inertial parameters of the trunk."""
     hip: Link
+    """Inertial parameters of the left front hip; y is mirrored for the right legs, x for the rear ones."""
     thigh: Link
+    """Inertial parameters of the left front thigh; y is mirrored for the right legs."""
     calf: Link
+    """Inertial parameters of the left front calf with its foot; y is mirrored for the right legs."""
     leg_root: tuple[float, float]
+    """Hip joint of the left front leg in the trunk frame (x, y), m."""
     hip_length: float
+    """Distance from hip joint to thigh joint, outward, m."""
     thigh_length: float
+    """Distance from thigh joint to calf joint, downward, m."""
     foot_position: tuple[float, float]
+    """Centre of the foot in the calf frame (x, z), m."""
     foot_radius: float
+    """Radius of the foot, m."""
     default_joints: np.ndarray
+    """Angles around which position control and the walk policy act (12,), rad."""
     joint_lower: np.ndarray
+    """Lower joint limits (12,), rad."""
     joint_upper: np.ndarray
+    """Upper joint limits (12,), rad."""
     joint_speed_limit: np.ndarray
+    """Speed limits of the motors (12,), rad/s; data for users, not enforced by the physics."""
     torque_limit: np.ndarray
+    """Torque limits of the controller (12,), N m."""
     kp: float
+    """Proportional gain, N m/rad."""
     kd: float
+    """Derivative gain, N m s/rad."""
     action_scale: np.ndarray
+    """Scale of joint actions (12,), rad: joint target = default + scale x action."""
     stand_height: float
+    """Trunk origin above the ground when standing at the default angles, m: the walk policy's height at a zero height
+    command.
+    """
     collision: tuple[CollisionShape, ...]
+    """Collision geometry."""
     visuals: tuple[VisualShape, ...]
+    """Shapes for rendering."""
     walk: WalkSettings
+    """Walk-policy settings."""
 
     def __post_init__(self) -> None:
         for name in _JOINT_FIELDS:

@@ -71,7 +71,8 @@ class Job:
     cell: Cell
     configs: tuple[TrainConfig, ...]
     folders: tuple[Path, ...]
-    steps_done: int  # environment steps of the slowest seed's newest checkpoint
+    steps_done: int
+    """Environment steps of the slowest seed's newest checkpoint."""
 
     @property
     def steps_left(self) -> int:

@@ -12,8 +12,9 @@ from annotated_types import MinLen
 
 from mqe_jax.settings import Positive, PositiveInt, fail
 from mqe_jax.train import nn
+from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
+from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -24,7 +25,7 @@ _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 
 
 @register_network("actor_critic")
-class ActorCritic(NetworkSettings):
+class ActorCritic(GaussianSettings):
     """Settings of actor and critic: hidden layers, an optional recurrent unit, a Gaussian policy."""
 
     critic_input: Literal["privileged", "observations", "own"] = "privileged"
@@ -45,18 +46,6 @@ class ActorCritic(NetworkSettings):
     """Gain of the orthogonal initialisation of the action layer."""
     action_mean: Literal["linear", "tanh"] = "linear"
     """Output of the mean action: unbounded, or within -1 and 1."""
-    log_std_init: float = 0.0
-    """Initial log standard deviation of the actions."""
-    log_std_max: float | None = None
-    """Upper bound on the log standard deviation; none sets no bound."""
-    log_std_min: float | None = None
-    """Lower bound on the log standard deviation, which maintains exploration; none sets no bound."""
-
-    def __post_init__(self) -> None:
-        if self.log_std_max is not None and self.log_std_init > self.log_std_max:
-            fail("log_std_init", self.log_std_init, f"at most log_std_max ({self.log_std_max})")
-        if self.log_std_min is not None and self.log_std_init < self.log_std_min:
-            fail("log_std_init", self.log_std_init, f"at least log_std_min ({self.log_std_min})")
 
     def build(self, dims: EnvDims) -> Network:
         """Returns the network; see `Network`."""
@@ -120,9 +109,6 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
     critic_out = 1 if own else dims.values
     critic_shared = share or not own
 
-    low = -math.inf if settings.log_std_min is None else settings.log_std_min
-    high = math.inf if settings.log_std_max is None else settings.log_std_max
-
     def init(key: jax.Array) -> Params:
         actor_key, critic_key = jax.random.split(key)
 
@@ -167,7 +153,7 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
         mean, memory = run(params["actor"], share, memory, is_first, obs)
         if settings.action_mean == "tanh":
             mean = jnp.tanh(mean)
-        log_std = nn.bounded(params["log_std"], low, high)
+        log_std = settings.bounded_log_std(params["log_std"])
         return mean, jnp.broadcast_to(log_std, mean.shape), memory
 
     def act(

@@ -27,15 +27,24 @@ class EvalResult:
 
     task: str
     episodes: int
-    success_rate: float  # fraction of episodes
-    average_step_reward: float  # mean over steps of the sum of reward terms
-    terms: dict[str, float]  # mean over steps of each reward term
-    episode_return: float  # undiscounted, mean over the agents of team 0
-    episode_length: float  # steps
-    overflow: int  # counted steps in which the engine dropped contacts
-    diverged: int  # episodes that ended because the physics diverged
-    success: dict[str, float]  # other outcomes by name, mean over episodes, from metrics `success/<name>`
-    match: dict[str, float]  # win_rate, draw_rate, loss_rate of team 0; empty without an opponent
+    success_rate: float
+    """Fraction of episodes with success."""
+    average_step_reward: float
+    """Mean over steps of the sum of reward terms."""
+    terms: dict[str, float]
+    """Mean over steps of each reward term."""
+    episode_return: float
+    """Undiscounted return, mean over the agents of team 0."""
+    episode_length: float
+    """Mean length of an episode, steps."""
+    overflow: int
+    """Number of counted steps in which the engine dropped contacts."""
+    diverged: int
+    """Number of episodes that ended because the physics diverged."""
+    success: dict[str, float]
+    """Other outcomes by name, mean over episodes, from metrics `success/<name>`."""
+    match: dict[str, float]
+    """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON; the entries of `success` and `match` become top-level keys."""
@@ -46,11 +55,16 @@ class EvalResult:
 class _Progress(NamedTuple):
     env_state: Any
     memory: Memory
-    finished: jax.Array  # (N,) int32, finished episodes
-    steps: jax.Array  # (N,) int32, counted steps
-    returns: jax.Array  # (N,), rewards of team 0 over counted steps
-    step_sums: dict[str, jax.Array]  # (N,) each, over counted steps
-    end_sums: dict[str, jax.Array]  # (N,) each, over the last steps of counted episodes
+    finished: jax.Array
+    """Finished episodes (N,) int32."""
+    steps: jax.Array
+    """Counted steps (N,) int32."""
+    returns: jax.Array
+    """Rewards of team 0 summed over counted steps (N,)."""
+    step_sums: dict[str, jax.Array]
+    """Sums over counted steps (N,) each."""
+    end_sums: dict[str, jax.Array]
+    """Sums over the last steps of counted episodes (N,) each."""
 
 
 def evaluate(

@@ -50,10 +50,13 @@ class TrainState:
     optimizer: AdamState
     obs_normalizer: ObservationNormalizer
     value_normalizer: ValueStatistics
-    learning_rate: jax.Array  # () float32, before the schedule
+    learning_rate: jax.Array
+    """Learning rate before the schedule () float32."""
     rollout: RolloutState
-    key: jax.Array  # raw uint32 random key
-    updates: jax.Array  # () int32, updates done
+    key: jax.Array
+    """Raw uint32 random key."""
+    updates: jax.Array
+    """Updates done () int32."""
 
 
 class Learner(NamedTuple):

@@ -18,13 +18,14 @@ import numpy as np
 
 from mqe_jax.settings import Positive, PositiveInt, fail
 from mqe_jax.train import nn
+from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
+from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 
 @register_network("mat")
-class Mat(NetworkSettings):
+class Mat(GaussianSettings):
     """Settings of the multi-agent transformer."""
 
     blocks: PositiveInt = 1
@@ -36,15 +37,12 @@ class Mat(NetworkSettings):
     gain: Positive = 0.01
     """Orthogonal gain of attention, of residual branches' last layers, and of the output layers."""
     deviation: Literal["sigmoid", "free"] = "sigmoid"
-    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 at first (OpenRL), or an unconstrained log."""
-    log_std_init: float = 0.0
-    """Initial log standard deviation, with deviation `free`."""
-    log_std_max: float | None = None
-    """Upper bound on the log standard deviation, with deviation `free`; none sets no bound."""
-    log_std_min: float | None = None
-    """Lower bound on the log standard deviation, with deviation `free`; none sets no bound."""
+    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 at first (OpenRL), or an unconstrained log,
+    which alone uses the settings log_std_*.
+    """
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.width % self.heads:
             fail("heads", self.heads, f"a divisor of width ({self.width})")
 
@@ -56,10 +54,14 @@ class Mat(NetworkSettings):
 class Order(NamedTuple):
     """Attention masks and sequence positions within teams; agents act in the order in which their team lists them."""
 
-    team: np.ndarray  # (A, A) bool, both are of one team: what the encoder attends to
-    causal: np.ndarray  # (A, A) bool, of one team and not after: what the decoder attends to
-    rank: np.ndarray  # (A,) place in the team's sequence
-    previous: np.ndarray  # (A,) the agent before, itself where there is none
+    team: np.ndarray
+    """Whether both agents are of one team (A, A) bool: what the encoder attends to."""
+    causal: np.ndarray
+    """Whether the second is of the same team and not after the first (A, A) bool: what the decoder attends to."""
+    rank: np.ndarray
+    """Place in the team's sequence (A,)."""
+    previous: np.ndarray
+    """The agent before, itself where there is none (A,)."""
 
 
 def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:
@@ -192,9 +194,7 @@ def log_std_of(params: Params, settings: Mat) -> jax.Array:
     parameter = params["deviation"]
     if settings.deviation == "sigmoid":
         return math.log(0.5) + jax.nn.log_sigmoid(parameter)
-    low = -jnp.inf if settings.log_std_min is None else settings.log_std_min
-    high = jnp.inf if settings.log_std_max is None else settings.log_std_max
-    return jnp.clip(parameter, low, high)
+    return settings.bounded_log_std(parameter)
 
 
 def _build(settings: Mat, dims: EnvDims) -> Network:

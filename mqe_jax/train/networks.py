@@ -33,16 +33,21 @@ class EnvDims(NamedTuple):
     observation: int
     privileged: int
     action: int
-    teams: Teams  # one team where all cooperate
-    values: int  # V: one value per agent, or one per team
+    teams: Teams
+    """Agents of each team; one team where all cooperate."""
+    values: int
+    """Number of values V: one per agent, or one per team."""
 
 
 class Evaluation(NamedTuple):
     """Log-probabilities, entropies and values of a chunk under the current parameters."""
 
-    log_prob: jax.Array  # (L, C, A, D)
-    entropy: jax.Array  # (L, C, A)
-    value: jax.Array  # (L, C, V), normalised
+    log_prob: jax.Array
+    """Log-probabilities of the actions (L, C, A, D)."""
+    entropy: jax.Array
+    """Entropies of the policy (L, C, A)."""
+    value: jax.Array
+    """Normalised values (L, C, V)."""
 
 
 class Network(NamedTuple):

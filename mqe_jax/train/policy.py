@@ -27,11 +27,13 @@ POLICY_FILE = "policy.safetensors"
 class Policy:
     """A team's policy: the acting part of a network, and the statistics that normalise its observations."""
 
-    params: Params  # as `Network.acting` returns them
+    params: Params
+    """Parameters as `Network.acting` returns them."""
     normalizer: RunningStatistics
     dims: EnvDims
     config: TrainConfig
-    metadata: Mapping[str, Any]  # task, env_steps
+    metadata: Mapping[str, Any]
+    """Further entries of the file: task, env_steps."""
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the memory at an episode's start: leading axis N, or none for a single environment."""

@@ -19,9 +19,12 @@ class RolloutState(NamedTuple):
 
     env_state: Any
     memory: NetworkMemory
-    is_first: jax.Array  # (N,) bool, the next step is the first of an episode
-    episode_steps: jax.Array  # (N,) int32, steps since the episode began
-    episode_return: jax.Array  # (N,) sum of rewards since then, mean over the agents of team 0
+    is_first: jax.Array
+    """Whether the next step is the first of an episode (N,) bool."""
+    episode_steps: jax.Array
+    """Steps since the episode began (N,) int32."""
+    episode_return: jax.Array
+    """Sum of rewards since then, mean over the agents of team 0 (N,)."""
 
 
 class ObservationNormalizer(NamedTuple):

@@ -77,9 +77,12 @@ class VectorEnv(Protocol):
 class Trace(NamedTuple):
     """Consecutive steps of all environments, kept where divergences are recorded (T, N, ...)."""
 
-    snapshot: PyTree  # of the states before the actions
-    action: jax.Array  # (T, N, A, D), as the environment received it
-    diverged: jax.Array  # (T, N), the metric after the action
+    snapshot: PyTree
+    """Snapshots of the states before the actions."""
+    action: jax.Array
+    """Actions as the environment received them (T, N, A, D)."""
+    diverged: jax.Array
+    """Metric `diverged` after the action (T, N)."""
 
 
 class Recorder(Protocol):
@@ -135,17 +138,28 @@ class NetworkMemory(NamedTuple):
 class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
-    memory: NetworkMemory  # before this step, zeroed at an episode's first step
-    is_first: jax.Array  # (N,) bool, the step is the first of its episode
-    obs: jax.Array  # (N, A, O)
-    privileged_obs: jax.Array  # (N, P)
-    final_obs: jax.Array  # (N, A, O), of the state reached
-    final_privileged_obs: jax.Array  # (N, P)
-    action: jax.Array  # (N, A, D), as sampled: unscaled and unclipped
-    log_prob: jax.Array  # (N, A, D)
-    reward: jax.Array  # (N, A)
-    terminated: jax.Array  # (N,) bool
-    done: jax.Array  # (N,) bool, terminated or truncated
+    memory: NetworkMemory
+    """Memory before this step, zeroed at an episode's first step."""
+    is_first: jax.Array
+    """Whether the step is the first of its episode (N,) bool."""
+    obs: jax.Array
+    """Observations (N, A, O)."""
+    privileged_obs: jax.Array
+    """Privileged observations (N, P)."""
+    final_obs: jax.Array
+    """Observations of the state reached (N, A, O)."""
+    final_privileged_obs: jax.Array
+    """Privileged observations of the state reached (N, P)."""
+    action: jax.Array
+    """Actions as sampled: unscaled and unclipped (N, A, D)."""
+    log_prob: jax.Array
+    """Log-probabilities of the actions (N, A, D)."""
+    reward: jax.Array
+    """Rewards (N, A)."""
+    terminated: jax.Array
+    """Whether the episode ended by its rules (N,) bool."""
+    done: jax.Array
+    """Whether it was terminated or truncated (N,) bool."""
 
 
 class Batch(NamedTuple):
@@ -157,6 +171,9 @@ class Batch(NamedTuple):
     privileged_obs: jax.Array
     action: jax.Array
     log_prob: jax.Array
-    advantage: jax.Array  # (L, C, V)
-    target: jax.Array  # (L, C, V), in units of reward
-    old_value: jax.Array  # (L, C, V), normalised
+    advantage: jax.Array
+    """Advantages (L, C, V)."""
+    target: jax.Array
+    """Value targets in units of reward (L, C, V)."""
+    old_value: jax.Array
+    """Normalised values at collection (L, C, V)."""

@@ -15,10 +15,14 @@ from mqe_jax.viz.recording import Episode
 class Camera:
     """A free camera, in MuJoCo's convention; angles in degrees."""
 
-    lookat: tuple[float, float, float]  # m
-    distance: float  # m
-    azimuth: float = 60.0  # 0 looks along +x, 90 along +y
-    elevation: float = -46.0  # -90 looks straight down
+    lookat: tuple[float, float, float]
+    """Point in the centre of the view, m."""
+    distance: float
+    """Distance from that point, m."""
+    azimuth: float = 60.0
+    """Azimuth, degrees: 0 looks along +x, 90 along +y."""
+    elevation: float = -46.0
+    """Elevation, degrees: -90 looks straight down."""
 
 
 VIEWS = ("follow", "scene", "side")

@@ -14,12 +14,18 @@ from mqe_jax.train.evaluate import Act
 class Episode:
     """Frames of one episode with all that rendering needs."""
 
-    qpos: np.ndarray  # (T, nq)
-    mocap_pos: np.ndarray  # (T, n_mocap, 3), m, world frame
-    mocap_quat: np.ndarray  # (T, n_mocap, 4) wxyz
-    dt: float  # s between frames
-    success: float = 0.0  # `success` on the last step, 0 where the time limit of the recording came first
-    reward: float = 0.0  # mean over steps of the sum of the reward terms
+    qpos: np.ndarray
+    """Generalised coordinates (T, nq)."""
+    mocap_pos: np.ndarray
+    """Positions of the mocap bodies (T, n_mocap, 3), m, world frame."""
+    mocap_quat: np.ndarray
+    """Orientations of the mocap bodies, wxyz (T, n_mocap, 4)."""
+    dt: float
+    """Time between frames, s."""
+    success: float = 0.0
+    """`success` on the last step; 0 where the time limit of the recording came first."""
+    reward: float = 0.0
+    """Mean over steps of the sum of the reward terms."""
 
     def __len__(self) -> int:
         return len(self.qpos)

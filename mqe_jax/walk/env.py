@@ -25,125 +25,54 @@ from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, r
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
+from mqe_jax.walk.task import EpisodeSpec, RandomizedBody, WalkTask, sample_body, sample_spec
 from mqe_jax.walk_policy import WalkMemory
 
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
 
 
-@dataclasses.dataclass(frozen=True)
-class WalkTask:
-    """Parameters of the walking task.
-
-    Attributes:
-        rewards: weights.
-        episode_length: time limit, s.
-        command_period: interval at which commands, slope and force are resampled, s; 0 never resamples.
-        max_vx, max_vy, max_yaw: ranges of the velocity commands, m/s, m/s, rad/s.
-        slope: maximum slope, rad.
-        force: maximum sustained horizontal force on the trunk, N.
-        kick: maximum instantaneous change of the trunk's velocity, m/s.
-        kick_period: mean time between kicks, s.
-        randomize: whether friction, payload, centre of mass, motors and observations are randomised.
-        solver_iterations: of the physics.
-    """
-
-    rewards: WalkRewards = WalkRewards()
-    episode_length: float = 20.0
-    command_period: float = 8.0
-    max_vx: float = 1.2
-    max_vy: float = 0.7
-    max_yaw: float = 1.2
-    slope: float = 0.32
-    force: float = 40.0
-    kick: float = 0.9
-    kick_period: float = 4.0
-    randomize: bool = True
-    solver_iterations: int = 4
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class EpisodeSpec:
-    """Commands and disturbances sampled for one episode.
-
-    Attributes:
-        commands: of the walk policy (15,).
-        slope: inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x.
-        force: sustained force on the trunk (2,), N, along its heading and to its left, horizontal.
-        kick: instantaneous change of the trunk's velocity at each kick (), m/s.
-    """
-
-    commands: jax.Array
-    slope: jax.Array
-    force: jax.Array
-    kick: jax.Array
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class RandomizedBody:
-    """Randomised physical parameters of one environment's robot.
-
-    Attributes:
-        friction: sliding friction of its shapes ().
-        payload: extra mass of the trunk (), kg.
-        com: shift of the trunk's centre of mass (3,), m.
-        strength: factor on the motors' torques ().
-        motor_offset: offset added to the joint targets (12,), rad.
-    """
-
-    friction: jax.Array
-    payload: jax.Array
-    com: jax.Array
-    strength: jax.Array
-    motor_offset: jax.Array
-
-
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkState:
-    """State of one environment.
-
-    Attributes:
-        data: physics state.
-        obs: the walk policy's observation (70,), noisy if randomised.
-        privileged_obs: for the critic (P,).
-        latent_target: regression target of the adaptation network (2,): friction and payload, scaled.
-        reward: ().
-        terminated: () bool, fallen.
-        truncated: () bool, time limit.
-        metrics: reward terms and tracking errors, () each.
-        spec: commands and disturbances.
-        slope: current slope, rate-limited towards the spec's (2,), rad.
-        force: current force, likewise (2,), N.
-        body: randomised parameters of the robot.
-        memory: gait phase and last actions; its history is empty.
-        mean_error: exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s.
-        step: steps counted towards the time limit () int32; starts at any offset.
-        age: steps since the reset () int32.
-        difficulty: curriculum level () in [0, 1], which scales slopes, forces and kicks.
-        key: random key.
-    """
+    """State of one environment."""
 
     data: mjx.Data
+    """Physics state."""
     obs: jax.Array
+    """The walk policy's observation (70,), noisy if randomised."""
     privileged_obs: jax.Array
+    """Observation of the critic (P,)."""
     latent_target: jax.Array
+    """Regression target of the adaptation network (2,): friction and payload, scaled."""
     reward: jax.Array
+    """Reward ()."""
     terminated: jax.Array
+    """Whether the robot has fallen () bool."""
     truncated: jax.Array
+    """Whether the episode ended by the time limit () bool."""
     metrics: dict[str, jax.Array]
+    """Reward terms and tracking errors, () each."""
     spec: EpisodeSpec
+    """Commands and disturbances."""
     slope: jax.Array
+    """Current slope, rate-limited towards the spec's (2,), rad."""
     force: jax.Array
+    """Current force, rate-limited towards the spec's (2,), N."""
     body: RandomizedBody
+    """Randomised parameters of the robot."""
     memory: WalkMemory
+    """Gait phase and last actions; its history is empty."""
     mean_error: jax.Array
+    """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
     step: jax.Array
+    """Steps counted towards the time limit () int32; starts at any offset."""
     age: jax.Array
+    """Steps since the reset () int32."""
     difficulty: jax.Array
+    """Curriculum level () in [0, 1], which scales slopes, forces and kicks."""
     key: jax.Array
+    """Random key."""
 
 
 class WalkEnv:
@@ -171,66 +100,6 @@ class WalkEnv:
         """Length of the critic's observation."""
         return jax.eval_shape(self.reset, jax.random.PRNGKey(0)).privileged_obs.shape[0]
 
-    # -- sampling ------------------------------------------------------------------------------------------------
-
-    def sample_spec(self, key: jax.Array, difficulty: jax.Array) -> EpisodeSpec:
-        """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and kicks."""
-        task = self.task
-        keys = iter(jax.random.split(key, 24))
-        uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
-        chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
-        velocity = jnp.stack(
-            [
-                uniform(-task.max_vx, task.max_vx),
-                uniform(-task.max_vy, task.max_vy),
-                uniform(-task.max_yaw, task.max_yaw),
-            ]
-        )
-        velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
-        velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
-        gaits = np.array([walk_policy.GAITS[name] for name in ("trot", "pace", "bound", "pronk")], np.float32)
-        gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.64, 0.28, 0.04, 0.04])))]
-        varied = chance(0.35)
-        vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
-        default = walk_policy.default_commands(self.robot)
-        width, length = self.robot.walk.stance_width, self.robot.walk.stance_length
-        rest = [
-            vary(-0.12, 0.06, default[3]),
-            vary(2.0, 4.0, default[4]),
-            *gait,
-            default[8],
-            vary(0.03, 0.16, default[9]),
-            vary(-0.25, 0.25, default[10]),
-            vary(-0.1, 0.1, default[11]),
-            vary(width - 0.05, width + 0.1, default[12]),
-            vary(length - 0.068, length + 0.012, default[13]),
-            default[14],
-        ]
-        angle = uniform(-jnp.pi, jnp.pi)
-        slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * difficulty
-        direction = uniform(-jnp.pi, jnp.pi)
-        force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * difficulty
-        return EpisodeSpec(
-            commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
-            slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
-            force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
-            kick=task.kick * difficulty,
-        )
-
-    def sample_body(self, key: jax.Array) -> RandomizedBody:
-        """Samples the robot's parameters; the nominal ones without randomisation."""
-        if not self.task.randomize:
-            one, zero = jnp.ones(()), jnp.zeros(())
-            return RandomizedBody(one, zero, jnp.zeros(3), one, jnp.zeros(NUM_JOINTS))
-        f, p, c, s, o = jax.random.split(key, 5)
-        return RandomizedBody(
-            friction=jax.random.uniform(f, (), minval=0.35, maxval=1.8),
-            payload=jax.random.uniform(p, (), minval=-1.0, maxval=2.5),
-            com=jax.random.uniform(c, (3,), minval=-1.0, maxval=1.0) * jnp.array([0.03, 0.02, 0.02]),
-            strength=jax.random.uniform(s, (), minval=0.9, maxval=1.1),
-            motor_offset=jax.random.uniform(o, (NUM_JOINTS,), minval=-0.02, maxval=0.02),
-        )
-
     # -- reset and step -----------------------------------------------------------------------------------------
 
     def reset(
@@ -244,8 +113,8 @@ class WalkEnv:
         next_key, spec_key, body_key, pose_key, noise_key = jax.random.split(key, 5)
         difficulty = jnp.asarray(difficulty, jnp.float32)
         if spec is None:
-            spec = self.sample_spec(spec_key, difficulty)
-        body = self.sample_body(body_key)
+            spec = sample_spec(spec_key, self.task, self.robot, difficulty)
+        body = sample_body(body_key, self.task)
         a, b, c, d = jax.random.split(pose_key, 4)
         model, index = self.compiled.model, self.index
         yaw = jax.random.uniform(a, (), minval=-jnp.pi, maxval=jnp.pi)
@@ -351,7 +220,7 @@ class WalkEnv:
         spec = state.spec
         if task.command_period > 0:
             renewed = step % round(task.command_period / DT) == 0
-            fresh = self.sample_spec(spec_key, state.difficulty)
+            fresh = sample_spec(spec_key, task, self.robot, state.difficulty)
             spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, spec)
             mean_error = jnp.where(renewed, 0.0, mean_error)
         state = dataclasses.replace(

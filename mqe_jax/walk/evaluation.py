@@ -14,34 +14,32 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
-from mqe_jax.walk.env import EpisodeSpec, WalkEnv, WalkTask
+from mqe_jax.walk.env import WalkEnv
+from mqe_jax.walk.task import EpisodeSpec, WalkTask
 
 WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """Settings of one measurement.
-
-    Attributes:
-        duration: of an episode, s.
-        velocity: commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from +-1, +-0.6, +-1.
-        gait: name of the gait.
-        frequency: commanded gait frequency, Hz.
-        slope: inclination of the ground along x, rad.
-        force: sustained force along and to the left of the heading, N.
-        kick: instantaneous change of velocity every 5 s, m/s.
-        meaning: one-line description.
-    """
+    """Settings of one measurement."""
 
     duration: float = 20.0
+    """Duration of an episode, s."""
     velocity: tuple[float, float, float] | None = None
+    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from +-1, +-0.6, +-1."""
     gait: str = "trot"
+    """Name of the gait."""
     frequency: float = 3.0
+    """Commanded gait frequency, Hz."""
     slope: float = 0.0
+    """Inclination of the ground along x, rad."""
     force: tuple[float, float] = (0.0, 0.0)
+    """Sustained force along and to the left of the heading, N."""
     kick: float = 0.0
+    """Instantaneous change of velocity every 5 s, m/s."""
     meaning: str = ""
+    """Description in one line."""
 
 
 SCENARIOS = {

@@ -40,69 +40,63 @@ class WalkEnvironment(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class WalkConfig:
-    """Settings of the walk policy's training; defaults as in walk-these-ways where it has them.
-
-    Attributes:
-        num_envs: number of parallel environments.
-        rollout_length: steps per environment and update.
-        iterations: total number of updates.
-        epochs: passes over each rollout.
-        minibatches: per epoch.
-        learning_rate: initial value; adapted to `target_kl`.
-        target_kl: target KL divergence per minibatch.
-        clip: of the policy ratio.
-        gamma: discount.
-        gae_lambda: of generalised advantage estimation.
-        entropy: coefficient of the entropy bonus.
-        value: coefficient of the value loss.
-        adaptation: coefficient of the adaptation network's regression loss.
-        max_grad_norm: global gradient-norm clip.
-        initial_std: standard deviation of the actions at the start.
-        curriculum: iterations over which slopes, forces and kicks grow to their maxima.
-        critic_warmup: first iterations in which only critic and adaptation network learn, for given policy weights.
-        anneal: last fraction of the training over which learning rate and entropy bonus fall linearly to zero.
-        seed: of all random numbers.
-    """
+    """Settings of the walk policy's training; defaults as in walk-these-ways where it has them."""
 
     num_envs: int = 8192
+    """Number of parallel environments."""
     rollout_length: int = 24
+    """Steps per environment and update."""
     iterations: int = 1200
+    """Total number of updates."""
     epochs: int = 5
+    """Passes over each rollout."""
     minibatches: int = 6
+    """Minibatches per epoch."""
     learning_rate: float = 1e-3
+    """Initial learning rate; adapted to `target_kl`."""
     target_kl: float = 0.01
+    """Target KL divergence per minibatch."""
     clip: float = 0.2
+    """Half width of the clipping interval of the policy ratio."""
     gamma: float = 0.99
+    """Discount factor."""
     gae_lambda: float = 0.95
+    """Trace decay of generalised advantage estimation."""
     entropy: float = 0.01
+    """Coefficient of the entropy bonus."""
     value: float = 1.0
+    """Coefficient of the value loss."""
     adaptation: float = 1.0
+    """Coefficient of the adaptation network's regression loss."""
     max_grad_norm: float = 1.0
+    """Global gradient-norm clip."""
     initial_std: float = 1.0
+    """Standard deviation of the actions at the start."""
     curriculum: int = 400
+    """Iterations over which slopes, forces and kicks grow to their maxima."""
     critic_warmup: int = 0
+    """First iterations in which only critic and adaptation network learn, for given policy weights."""
     anneal: float = 0.0
+    """Last fraction of the training over which learning rate and entropy bonus fall linearly to zero."""
     seed: int = 1
+    """Seed of all random numbers."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkLearner:
-    """Learner state.
-
-    Attributes:
-        params: {"policy": walk policy weights, "log_std": (12,), "critic": layers}.
-        optimizer: Adam's state.
-        learning_rate: ().
-        iteration: () int32.
-        key: random key.
-    """
+    """Learner state."""
 
     params: dict[str, Any]
+    """Parameters: {"policy": walk policy weights, "log_std": (12,), "critic": layers}."""
     optimizer: Any
+    """Adam's state."""
     learning_rate: jax.Array
+    """Learning rate ()."""
     iteration: jax.Array
+    """Updates done () int32."""
     key: jax.Array
+    """Random key."""
 
 
 def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index: jax.Array) -> jax.Array:

@@ -1,0 +1,70 @@
+"""The tasks by id, with their scripted policies: a new task is one line of `_SHIPPED`."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.errors import InputError
+
+Planner = Callable[[dict[str, jax.Array]], jax.Array]
+"""Scripted policy: one environment's observation blocks by name -> actions (A, 3) in the `command` mode."""
+
+# The task, as MODULE:CLASS of mqe_jax.envs, and its scripted policy, as MODULE:FUNCTION of mqe_jax.planners or none.
+_SHIPPED: tuple[tuple[str, str | None], ...] = (
+    ("plane:Go1Plane", None),
+    ("gate:Go1Gate", "gate:plan_gate"),
+    ("seesaw:Go1Seesaw", "seesaw:plan_seesaw"),
+    ("sheep:Go1SheepEasy", "sheep:plan_sheep_easy"),
+    ("sheep:Go1SheepHard", "sheep:plan_sheep_hard"),
+    ("pushbox:Go1PushBox", "pushbox:plan_pushbox"),
+    ("football_defender:Go1FootballDefender", "football:plan_defender"),
+    ("tug:Go1Tug", "tug:plan_tug"),
+    ("door:Go1RevolvingDoor", "door:plan_revolving_door"),
+    ("wrestling:Go1Wrestling", "wrestling:plan_wrestling"),
+    ("bridge:Go1Bridge", "bridge:plan_bridge"),
+    ("football:Go1Football1vs1", "football:plan_1vs1"),
+    ("football:Go1Football2vs2", "football:plan_2vs2"),
+)
+
+# Alternative ids, from the released system.
+ALIASES = {"go1bridgewrestling": "go1wrestling"}
+
+TASKS: dict[str, type[QuadrupedEnv]] = {}
+"""Task classes by id."""
+
+PLANNERS: dict[str, Planner | str] = {}
+"""Scripted policies by the id of their task; a shipped one by name, as this package imports no planner."""
+
+
+def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
+    """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
+
+    Also a decorator of a task without a scripted policy.
+
+    Raises:
+        InputError: if the class has no name, or another class is registered under it.
+    """
+    if not task.name:
+        raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
+    known = TASKS.get(task.name)
+    if known is not None and (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
+        raise InputError(f"task {task.__name__}: the id {task.name!r} is taken by {known.__name__}")
+    TASKS[task.name] = task
+    if planner is not None:
+        PLANNERS[task.name] = planner
+    return task
+
+
+def load(package: str, path: str) -> Any:
+    """Returns what MODULE:NAME below a package names."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(f"{package}.{module}"), name)
+
+
+for _task, _planner in _SHIPPED:
+    register_task(load("mqe_jax.envs", _task), _planner)

@@ -1,0 +1,55 @@
+"""The state of an environment, which `reset` and `step` return."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+from mujoco import mjx
+
+from mqe_jax.control import ControlState
+from mqe_jax.envs.randomization import RandomizedParams
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """State of one environment with A agents, R robots and G anchors; a batch has leading axes."""
+
+    data: mjx.Data
+    """Physics state."""
+    obs: jax.Array
+    """The agents' observations (A, O); after an auto-reset, those of the new episode."""
+    privileged_obs: jax.Array
+    """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new episode."""
+    final_obs: jax.Array
+    """Observations at the end of the last step (A, O); differs from `obs` only after an auto-reset."""
+    final_privileged_obs: jax.Array
+    """Privileged observation at the end of the last step (P,)."""
+    reward: jax.Array
+    """Reward (A,)."""
+    terminated: jax.Array
+    """Whether the episode ended by its rules () bool."""
+    truncated: jax.Array
+    """Whether the episode ended by the time limit () bool."""
+    metrics: dict[str, jax.Array]
+    """`reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the physics
+    engine dropped contacts or constraints in this step) and the task's own, () each.
+    """
+    step: jax.Array
+    """Environment steps since the reset () int32."""
+    anchors: jax.Array
+    """Positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame."""
+    control: ControlState
+    """Controller state."""
+    randomized: RandomizedParams
+    """Randomised physics parameters."""
+    task: Any
+    """The task's own fields."""
+    assistance: jax.Array
+    """Curriculum level () in [0, 1]; 0 is the unmodified task."""
+    frozen_steps: jax.Array
+    """Initial steps during which each agent's action is replaced by zero (A,) int32."""
+    key: jax.Array
+    """Random key."""

@@ -1,0 +1,129 @@
+"""What a task defines, in this order: parameters, scene, initial state, observation, reward terms, ending."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+
+from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.state import State
+from mqe_jax.objects import ObjectIndex
+from mqe_jax.robots.index import RobotIndex, RobotState
+from mqe_jax.robots.robot import Robot
+from mqe_jax.scene import CompiledScene, Scene
+
+
+class Task:
+    """Interface of a task and its defaults; `QuadrupedEnv` steps it.
+
+    A task overrides `scene`, `observation_layout`, `observe`, `rewards`, and of the rest what it needs. All methods are
+    functions of one environment.
+    """
+
+    name: ClassVar[str] = ""
+    """Id of the task."""
+    title: ClassVar[str] = ""
+    """Name of the task in the paper."""
+    Params: ClassVar[type[TaskParams]] = TaskParams
+    """Class of the task's parameters."""
+    metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
+    """Metrics that are not 0 in a step in which the physics diverged."""
+    variable_num_agents: ClassVar[bool] = False
+    """Whether `num_agents` may differ from the task's default."""
+
+    params: Any
+    """The task's parameters."""
+    impl: str
+    """Physics engine: 'jax', 'warp' or 'c'."""
+    control: str
+    """Action mode: 'command', 'position' or 'torque'."""
+    num_agents: int
+    """Number of controlled robots A."""
+    robot: Robot
+    """Robot type of all robots of the task."""
+    dt: float
+    """Environment step, s: the physics step times the substeps."""
+    compiled: CompiledScene
+    """The compiled scene."""
+    index: RobotIndex
+    """Index tables of the robots."""
+    objects: Mapping[str, ObjectIndex]
+    """Index tables of the objects by name."""
+
+    def scene(self) -> Scene:
+        """Returns the scene: track, robots and objects."""
+        raise NotImplementedError(f"{type(self).__name__}: scene() is not defined")
+
+    def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
+        """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the track's blocks."""
+        return self.compiled.layout.spawn
+
+    def spawn(self, key: jax.Array) -> jax.Array:
+        """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
+        params = self.params
+        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32)
+        noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        return jnp.asarray(pose).at[:, :2].add(noise)
+
+    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,)."""
+        return qpos, qvel
+
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> Any:
+        """Returns the task's own state fields at the start of an episode."""
+        return None
+
+    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array | None:
+        """Returns the walk commands (R - A, 15) of the NPC robots, or None if there are none."""
+        return None
+
+    def unmirror_action(self, action: jax.Array) -> jax.Array:
+        """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the robots' frame."""
+        return action
+
+    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+        """Applies scripted NPC behaviour: sets NPC velocities for the next physics step."""
+        return data
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """The blocks of an agent's observation, in order."""
+        raise NotImplementedError(f"{type(self).__name__}: observation_layout is not defined")
+
+    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+        """Returns the observation's blocks by name (A, width)."""
+        raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
+
+    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the unweighted reward terms, () or (A,), and the task's own fields after the step.
+
+        Args:
+            state: the state before the step, with the physics state after it.
+            robot_state: after the step.
+            collision: whether there is any trunk contact of an agent () bool.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
+
+    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
+        """Returns whether the task's own rules end the episode () bool."""
+        return jnp.zeros((), bool)
+
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Returns `success` () and further `success/...` metrics, which are evaluated at the end of an episode.
+
+        Args:
+            state: after the step.
+            robot_state: after the step.
+            failed: whether a fall, a collision or diverged physics ended the episode () bool.
+        """
+        return {"success": jnp.zeros(())}
+
+    def external_forces(self, state: State) -> jax.Array | None:
+        """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
+        return None

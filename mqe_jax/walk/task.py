@@ -1,0 +1,134 @@
+"""The walking task: its parameters, and what is sampled for one episode."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax import walk_policy
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.walk.rewards import WalkRewards
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkTask:
+    """Parameters of the walking task."""
+
+    rewards: WalkRewards = WalkRewards()
+    """Weights of the reward terms."""
+    episode_length: float = 20.0
+    """Time limit, s."""
+    command_period: float = 8.0
+    """Interval at which commands, slope and force are resampled, s; 0 never resamples."""
+    max_vx: float = 1.2
+    """Largest commanded forward velocity, m/s."""
+    max_vy: float = 0.7
+    """Largest commanded lateral velocity, m/s."""
+    max_yaw: float = 1.2
+    """Largest commanded yaw rate, rad/s."""
+    slope: float = 0.32
+    """Maximum slope, rad."""
+    force: float = 40.0
+    """Maximum sustained horizontal force on the trunk, N."""
+    kick: float = 0.9
+    """Maximum instantaneous change of the trunk's velocity, m/s."""
+    kick_period: float = 4.0
+    """Mean time between kicks, s."""
+    randomize: bool = True
+    """Whether friction, payload, centre of mass, motors and observations are randomised."""
+    solver_iterations: int = 4
+    """Solver iterations per physics step."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class EpisodeSpec:
+    """Commands and disturbances sampled for one episode."""
+
+    commands: jax.Array
+    """Commands of the walk policy (15,)."""
+    slope: jax.Array
+    """Inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x."""
+    force: jax.Array
+    """Sustained force on the trunk (2,), N, along its heading and to its left, horizontal."""
+    kick: jax.Array
+    """Instantaneous change of the trunk's velocity at each kick (), m/s."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RandomizedBody:
+    """Randomised physical parameters of one environment's robot."""
+
+    friction: jax.Array
+    """Sliding friction of its shapes ()."""
+    payload: jax.Array
+    """Extra mass of the trunk (), kg."""
+    com: jax.Array
+    """Shift of the trunk's centre of mass (3,), m."""
+    strength: jax.Array
+    """Factor on the motors' torques ()."""
+    motor_offset: jax.Array
+    """Offset added to the joint targets (12,), rad."""
+
+
+def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Array) -> EpisodeSpec:
+    """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and kicks."""
+    keys = iter(jax.random.split(key, 24))
+    uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
+    chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
+    velocity = jnp.stack(
+        [
+            uniform(-task.max_vx, task.max_vx),
+            uniform(-task.max_vy, task.max_vy),
+            uniform(-task.max_yaw, task.max_yaw),
+        ]
+    )
+    velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
+    velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
+    gaits = np.array([walk_policy.GAITS[name] for name in ("trot", "pace", "bound", "pronk")], np.float32)
+    gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.64, 0.28, 0.04, 0.04])))]
+    varied = chance(0.35)
+    vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
+    default = walk_policy.default_commands(robot)
+    width, length = robot.walk.stance_width, robot.walk.stance_length
+    rest = [
+        vary(-0.12, 0.06, default[3]),
+        vary(2.0, 4.0, default[4]),
+        *gait,
+        default[8],
+        vary(0.03, 0.16, default[9]),
+        vary(-0.25, 0.25, default[10]),
+        vary(-0.1, 0.1, default[11]),
+        vary(width - 0.05, width + 0.1, default[12]),
+        vary(length - 0.068, length + 0.012, default[13]),
+        default[14],
+    ]
+    angle = uniform(-jnp.pi, jnp.pi)
+    slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * difficulty
+    direction = uniform(-jnp.pi, jnp.pi)
+    force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * difficulty
+    return EpisodeSpec(
+        commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
+        slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
+        force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
+        kick=task.kick * difficulty,
+    )
+
+
+def sample_body(key: jax.Array, task: WalkTask) -> RandomizedBody:
+    """Samples the robot's parameters; the nominal ones without randomisation."""
+    if not task.randomize:
+        one, zero = jnp.ones(()), jnp.zeros(())
+        return RandomizedBody(one, zero, jnp.zeros(3), one, jnp.zeros(NUM_JOINTS))
+    f, p, c, s, o = jax.random.split(key, 5)
+    return RandomizedBody(
+        friction=jax.random.uniform(f, (), minval=0.35, maxval=1.8),
+        payload=jax.random.uniform(p, (), minval=-1.0, maxval=2.5),
+        com=jax.random.uniform(c, (3,), minval=-1.0, maxval=1.0) * jnp.array([0.03, 0.02, 0.02]),
+        strength=jax.random.uniform(s, (), minval=0.9, maxval=1.1),
+        motor_offset=jax.random.uniform(o, (NUM_JOINTS,), minval=-0.02, maxval=0.02),
+    )
