@@ -9,8 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 from fake_env import FakeEnv
+from PIL import Image, ImageSequence
 
 from mqe_jax.cli.players import planner
+from mqe_jax.errors import InputError
 from mqe_jax.viz import cameras, clips, geometry, gl, recording, render
 
 
@@ -41,23 +43,59 @@ def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv
     assert own == pytest.approx(2.4)  # the environment's own model is as it was
 
 
+def in_image(model: Any, camera: cameras.Camera, point: np.ndarray, aspect: float) -> float:
+    """How far from the image's centre a point is drawn: 1 is its edge."""
+    a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([np.sin(a), -np.cos(a), 0.0])
+    tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
+    offset = point - camera.lookat
+    depth = camera.distance + offset @ forward
+    x, y = offset @ right / depth / tangent / aspect, offset @ np.cross(right, forward) / depth / tangent
+    return float(max(abs(x), abs(y)))
+
+
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9])
 def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: recording.Episode, aspect: float) -> None:
     model = geometry.drawn_model(env.mj_model, episode)
     camera = cameras.default_camera(model, episode, aspect)
-    a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
-    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    right = np.array([np.sin(a), -np.cos(a), 0.0])
     low, high = geometry.extent(model, episode)
-    tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
-    reach = []
-    for corner in np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T:
-        offset = corner - camera.lookat
-        depth = camera.distance + offset @ forward
-        x, y = offset @ right / depth / tangent / aspect, offset @ np.cross(right, forward) / depth / tangent
-        reach.append(max(abs(x), abs(y)))
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+    reach = [in_image(model, camera, corner, aspect) for corner in corners]
     assert max(reach) <= 1.0
     assert max(reach) > 0.85  # and no farther away than it must be
+
+
+def test_following_cameras_hold_all_robots_in_every_frame(env: FakeEnv, episode: recording.Episode) -> None:
+    model, data = env.mj_model, mujoco.MjData(env.mj_model)
+    whole = cameras.cameras(model, episode, "scene", 1.5)[0]
+    followed = cameras.cameras(model, episode, "follow", 1.5)
+    assert len(followed) == len(episode)
+    for index, camera in enumerate(followed):
+        geometry.pose(model, data, episode, index)
+        reach = [in_image(model, camera, data.xpos[body], 1.5) for body in geometry.robot_bases(model)]
+        assert max(reach) < 1.0
+    assert followed[0].distance < 0.8 * whole.distance  # nearer, so that legs are seen
+    assert followed[-1].lookat[0] > followed[0].lookat[0] + 0.05  # the robots walk along +x
+
+
+def test_the_side_view_follows_the_first_robot(env: FakeEnv, episode: recording.Episode) -> None:
+    model, data = env.mj_model, mujoco.MjData(env.mj_model)
+    camera = cameras.cameras(model, episode, "side", 1.5)[-1]
+    geometry.pose(model, data, episode, len(episode) - 1)
+    assert camera.lookat[:2] == pytest.approx(data.xpos[geometry.robot_bases(model)[0]][:2], abs=0.1)
+    with pytest.raises(InputError, match=r"view: unknown name .*side"):
+        cameras.cameras(model, episode, "sid", 1.5)
+
+
+def test_slow_motion_lasts_longer(env: FakeEnv, episode: recording.Episode, tmp_path: Path) -> None:
+    seconds = {}
+    for speed in (1.0, 0.5):
+        file = tmp_path / f"{speed}.gif"
+        render.render_episode(env, episode, file, size=(64, 36), backend=None, fps=10.0, speed=speed)
+        with Image.open(file) as clip:
+            seconds[speed] = sum(frame.info["duration"] for frame in ImageSequence.Iterator(clip)) / 1000
+    assert seconds[0.5] > 1.4 * seconds[1.0]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".mp4"])

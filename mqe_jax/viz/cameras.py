@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.viz.geometry import extent, moving_bodies, pose, robot_bases
+from mqe_jax.viz.geometry import box_corners, extent, moving_bodies, pose, robot_bases, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
 
@@ -28,9 +28,10 @@ class Camera:
 VIEWS = ("follow", "scene", "side")
 """Names of the views: following robots and objects, the whole scene, from the side of the first robot."""
 
-_MARGIN = np.array([0.35, 0.35, 0.3])  # around a followed body, m
-_REACH = 2.2  # distance from the ball within which robots are followed, m
-_SMOOTHING = 1.2  # duration over which a following camera is averaged, s
+_MARGIN = np.array([0.45, 0.45, 0.3])  # around a followed body, m
+_REACH = 3.0  # distance from the ball within which robots are followed, m
+_TALL = 0.4  # height of walls above the trunks from which the view is from above, m
+_SMOOTHING = 0.8  # duration over which a following camera is averaged, s
 
 
 def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 / 9) -> Camera:
@@ -50,8 +51,13 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
         raise InputError(f"view: unknown name {view!r}{nearest(view, VIEWS)}; allowed: {', '.join(VIEWS)}")
     if view == "scene":
         return [default_camera(model, episode, aspect)] * len(episode)
-    data, start = mujoco.MjData(model), Camera((0.0, 0.0, 0.0), 1.0, elevation=-30.0)
+    data = mujoco.MjData(model)
+    pose(model, data, episode, 0)
     robots, objects = robot_bases(model), moving_bodies(model, episode)
+    # Walls well above the robots would hide them from a low camera.
+    tops = [box_corners(model, data, geom)[:, 2].max() for geom in scenery_geoms(model)]
+    tall = max(tops, default=0.0) > min(data.xpos[body][2] for body in robots) + _TALL
+    start = Camera((0.0, 0.0, 0.0), 1.0, elevation=-50.0 if tall else -30.0)
     fitted = []
     for index in range(len(episode)):
         pose(model, data, episode, index)
