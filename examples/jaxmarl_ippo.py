@@ -27,12 +27,12 @@ from mqe_jax.train.optim import adam
 
 # Names and meaning as in JaxMARL's baselines/IPPO/config/ippo_ff_mabrax.yaml.
 CONFIG: dict[str, Any] = {
-    "LR": 1e-3,
+    "LR": 5e-4,
     "NUM_ENVS": 64,
     "NUM_STEPS": 100,
-    "TOTAL_TIMESTEPS": 1_000_000,
+    "TOTAL_TIMESTEPS": 800_000,
     "UPDATE_EPOCHS": 4,
-    "NUM_MINIBATCHES": 4,
+    "NUM_MINIBATCHES": 8,
     "GAMMA": 0.99,
     "GAE_LAMBDA": 0.95,
     "CLIP_EPS": 0.2,
@@ -43,6 +43,8 @@ CONFIG: dict[str, Any] = {
     "ANNEAL_LR": True,
     "SEED": 0,
 }
+# Factor on the rewards that the learner sees, so that the critic's gradients do not drown those of the policy.
+REWARD_SCALE = 0.1
 HIDDEN = (64, 64)
 # While training, progress counts more than in the task itself, as in configs/demo.yaml.
 TRAINING_REWARDS = {"approach": 10.0}
@@ -113,7 +115,7 @@ def make_train(config: dict[str, Any], env: Env):
             value=value_of(params, obs),
             # The observation before an automatic reset, so that a truncated episode keeps its own last value.
             next_value=value_of(params, per_agent(state.env_state.final_obs)),
-            reward=stack(reward),
+            reward=REWARD_SCALE * stack(reward),
             done=stack(done),
             truncated=per_agent(info["truncation"]) > 0,
         )
@@ -202,8 +204,8 @@ def plot(rows: np.ndarray, path: Path, title: str) -> None:
 
     figure = Figure(figsize=(5, 3), dpi=90, layout="constrained")
     axes = figure.add_subplot()
-    axes.plot(rows[:, 0], rows[:, 1], color="#2a5fa5")
-    axes.set(xlabel="environment steps", ylabel="mean return of an agent's episodes", title=title)
+    axes.plot(rows[:, 0] / 1000, rows[:, 1], color="#2a5fa5")
+    axes.set(xlabel="environment steps, thousands", ylabel="mean return of an agent's episodes", title=title)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 

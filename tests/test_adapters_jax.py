@@ -192,6 +192,28 @@ def test_jaxmarl_ippo_example_trains(tmp_path: Path) -> None:
     assert (tmp_path / "curve.png").stat().st_size > 1000
 
 
+def test_a_checkout_gets_our_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The baseline of a checkout makes our environment by JaxMARL's own `make`; its metrics become the curve."""
+    jaxmarl = pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
+    monkeypatch.setattr(jaxmarl, "make", jaxmarl.make)
+    monkeypatch.delitem(sys.modules, "ippo_ff_mabrax", raising=False)
+    folder = tmp_path / "baselines" / "IPPO"
+    folder.mkdir(parents=True)
+    (folder / "ippo_ff_mabrax.py").write_text(
+        "import types, jax.numpy as jnp, jaxmarl\n"
+        "wandb = types.SimpleNamespace(init=lambda mode: None)\n"
+        "def make_train(config):\n"
+        "    env = jaxmarl.make(config['ENV_NAME'], **config['ENV_KWARGS'])\n"
+        "    values = jnp.full((3, 1), float(env.num_agents))\n"
+        "    metrics = {'returned_episode_returns': values, 'returned_episode_lengths': 5 * values}\n"
+        "    return lambda key: {'metrics': metrics}\n"
+    )
+    config = {**jaxmarl_ippo.CONFIG, "NUM_ENVS": 2, "NUM_STEPS": 10}
+    rows = jaxmarl_ippo.baseline_ippo(tmp_path, config, jaxmarl_ippo.Env(task_env("go1gate")))
+    np.testing.assert_array_equal(rows, [[20, 2, 10], [40, 2, 10], [60, 2, 10]])
+
+
 def test_a_missing_checkout_is_named(tmp_path: Path) -> None:
     """With the file that was looked for."""
     pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import pickle
 import sys
 import types
 import warnings
@@ -74,6 +75,14 @@ def test_teams_and_zero_sum_rewards_of_a_match() -> None:
     """A match has two teams, by name."""
     env = adapter.parallel_env("go1tug", impl="c")
     assert env.teams == (("robot_0",), ("robot_1",)) and env.metadata["name"] == "go1tug"
+
+
+def test_a_copy_is_a_new_environment_with_the_same_settings() -> None:
+    """Vectorisers copy environments by pickling them."""
+    env = adapter.parallel_env("go1gate", **SHORT)
+    copy = pickle.loads(pickle.dumps(env))
+    assert copy.task is not env.task and copy.task.params == env.task.params
+    np.testing.assert_array_equal(copy.reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"])
 
 
 def test_render() -> None:

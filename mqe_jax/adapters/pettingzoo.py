@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils import EzPickle
 
 from mqe_jax.adapters import missing, task_env
 from mqe_jax.adapters.host import RENDER_SIZE, HostEnvs
@@ -35,8 +36,10 @@ def env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> AECEnv[str, np
     return OrderEnforcingWrapper(parallel_to_aec(parallel_env(task, **settings)))
 
 
-class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any]):
+class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     """One environment as a parallel environment; all agents end together.
+
+    A copy or pickle is a new environment with the same settings, as vectorisers such as SuperSuit make them.
 
     Attributes:
         teams: agents of each team.
@@ -68,6 +71,9 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any]):
             render_size: width and height, pixels.
             overrides: arguments of `mqe_jax.make`.
         """
+        EzPickle.__init__(
+            self, task, max_cycles=max_cycles, render_mode=render_mode, render_size=render_size, **overrides
+        )
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise InputError(f"render_mode: {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
         self.task = task_env(task, max_steps=max_cycles, **overrides)
