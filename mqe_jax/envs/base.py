@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import jax
@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.core import Tracer
-from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.control import Controller, ControlState, check_mode, load_actuator_network
@@ -33,6 +32,9 @@ from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import Scene, build_model, compile_scene
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 
 @jax.tree_util.register_dataclass
