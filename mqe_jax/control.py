@@ -16,11 +16,11 @@ import functools
 import os
 import pathlib
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from mqe_jax import walk_policy
 from mqe_jax.errors import InputError, nearest
@@ -28,6 +28,9 @@ from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.walk_policy import WalkMemory
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 MODES = ("command", "position", "torque")
 

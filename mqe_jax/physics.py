@@ -13,17 +13,20 @@ environments (friction, masses, motor strength) are passed to `Physics.step` as 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import threading
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from mqe_jax.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 IMPLS = ("auto", "jax", "warp", "c")
 
@@ -111,8 +114,10 @@ class Physics:
         self.max_constraints_per_env = max_constraints_per_env
         if self.impl == "c":
             self._engine = _CEngine(model, num_substeps)
-            self._template = _without_pointers(mjx.make_data(model, impl="cpp"))
-        elif self.impl == "warp":
+            return
+        from mujoco import mjx
+
+        if self.impl == "warp":
             self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
             self._template = mjx.make_data(
                 model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=max_constraints_per_env
@@ -120,6 +125,14 @@ class Physics:
         else:
             self._mjx_model = mjx.put_model(model, impl="jax")
             self._template = mjx.make_data(model, impl="jax")
+
+    @functools.cached_property
+    def _template(self) -> mjx.Data:
+        """Template of the C engine, made on first use: importing MJX takes a second, which `mqe tasks` does without."""
+        from mujoco import mjx
+
+        with jax.ensure_compile_time_eval():
+            return _without_pointers(mjx.make_data(self.model, impl="cpp"))
 
     def init(self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array) -> mjx.Data:
         """Returns the initial state of one environment, without a forward pass.
@@ -166,6 +179,8 @@ class Physics:
             data = data.replace(xfrc_applied=xfrc_applied.astype(jnp.float32))
         if self.impl == "c":
             return self._engine.step(data, dict(fields or {}), xfrc_applied is not None, substeps)
+        from mujoco import mjx
+
         model = self._mjx_model.replace(**fields) if fields else self._mjx_model
         return jax.lax.scan(lambda state, _: (mjx.step(model, state), None), data, None, substeps)[0]
 

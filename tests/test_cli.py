@@ -1,6 +1,8 @@
 """The command line: what it prints, where, and how it refuses bad input."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -216,3 +218,10 @@ def test_defects_keep_their_traceback(error: Exception, monkeypatch: pytest.Monk
     monkeypatch.setattr(commands, "make_env", lambda *arguments: wrong(1))
     with pytest.raises(type(error)):
         cli.main(["bench", "fake"])
+
+
+def test_tasks_are_listed_without_importing_mjx() -> None:
+    """MJX takes a second to import, which `mqe tasks` would spend for nothing."""
+    code = "import sys; from mqe_jax.cli import main; print(main(['tasks']), 'mujoco.mjx' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "go1football-2vs2" in out and out.splitlines()[-1] == "0 False"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import TYPE_CHECKING
 
 import gymnasium
 import jax
@@ -17,7 +18,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.core import Tracer
-from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.control import Controller, check_mode, load_actuator_network
@@ -33,6 +33,9 @@ from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 
 class QuadrupedEnv(Task):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from annotated_types import Gt
-from mujoco import mjx
 
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
@@ -19,6 +18,9 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import DoorGap, EndWall, Plane, SpawnArea, Track
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 _WALL_LENGTH = 1.0  # m along x, of the block whose middle holds the door
 

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
@@ -24,6 +23,9 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 # Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)

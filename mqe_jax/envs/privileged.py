@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.randomization import RandomizedParams
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
 from mqe_jax.walk_policy import WalkMemory
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 _ROBOT = (
     Block("position", 3, "m"),

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.settings import NonNegative, NonNegativeInt, Positive, Range, fail, record
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 
 @record

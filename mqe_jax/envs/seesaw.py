@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
 
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
@@ -19,6 +18,9 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 
 @record

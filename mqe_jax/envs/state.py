@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
-from mujoco import mjx
 
 from mqe_jax.control import ControlState
 from mqe_jax.envs.randomization import RandomizedParams
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 
 @jax.tree_util.register_dataclass

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
@@ -17,6 +16,9 @@ from mqe_jax.objects import ObjectIndex
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
 from mqe_jax.scene import CompiledScene, Scene
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 
 class Task:

@@ -167,6 +167,9 @@ class TrainConfig:
     curriculum: Curriculum = Curriculum()
     normalization: Normalization = Normalization()
     checkpoint: Checkpointing = Checkpointing()
+    loggers: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
+    """Loggers besides metrics.csv: tensorboard (where tensorboardX is installed), wandb (offline unless
+    WANDB_MODE=online is set)."""
     evaluation: EvaluationSettings = EvaluationSettings()
 
     def __post_init__(self) -> None:

@@ -1,25 +1,41 @@
-"""Training loggers: a CSV file, TensorBoard events, progress on the terminal."""
+"""Training loggers: a CSV file, TensorBoard events, Weights & Biases, progress on the terminal."""
 
 from __future__ import annotations
 
 import csv
 import importlib
+import importlib.util
 import io
 import math
+import os
 import sys
 import time
-from collections.abc import Mapping
+import uuid
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, Protocol, Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
+
+
+class MetricsLog(Protocol):
+    """Receives one row of numbers per update; a row has `env_steps`, which only increases."""
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Logs one row."""
+        ...
+
+    def close(self) -> None:
+        """Flushes and closes."""
+        ...
 
 
 class CsvLog:
@@ -112,6 +128,49 @@ class TensorBoardLog:
         """Flushes and closes the file."""
         if self._writer is not None:
             self._writer.close()
+
+
+class WandbLog:
+    """A Weights & Biases run, written to `run_dir/wandb` without a network unless WANDB_MODE=online is set.
+
+    `wandb sync` uploads it later. A resumed training continues the same run id.
+    """
+
+    def __init__(self, run_dir: Path, env_steps: int) -> None:
+        check_loggers(("wandb",))
+        wandb: Any = importlib.import_module("wandb")
+        id_file = run_dir / "wandb" / "run_id"
+        id_file.parent.mkdir(parents=True, exist_ok=True)
+        if not (env_steps and id_file.is_file()):
+            write_atomically(id_file, uuid.uuid4().hex[:8].encode())
+        self._run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "mqe_jax"),
+            name=run_dir.name,
+            id=id_file.read_text(encoding="utf-8"),
+            dir=str(run_dir),
+            mode=os.environ.get("WANDB_MODE", "offline"),
+            resume="allow",
+            reinit="create_new",  # several seeds in one program are runs of their own
+            settings=wandb.Settings(console="off", silent=True),
+        )
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Logs every finite number of the row at its `env_steps`."""
+        values = {name: value for name, value in row.items() if math.isfinite(value)}
+        self._run.log(values, step=int(row["env_steps"]))
+
+    def close(self) -> None:
+        """Finishes the run."""
+        self._run.finish()
+
+
+LOGGERS: dict[str, Callable[[Path, int], MetricsLog]] = {"tensorboard": TensorBoardLog, "wandb": WandbLog}
+
+
+def check_loggers(names: tuple[str, ...]) -> None:
+    """Raises an InputError where a logger needs a package that is not installed; TensorBoard is optional."""
+    if "wandb" in names and importlib.util.find_spec("wandb") is None:
+        raise InputError("loggers: 'wandb' needs the package wandb; pip install 'mqe-jax[log]'")
 
 
 class ProgressLog:

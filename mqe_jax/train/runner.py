@@ -30,7 +30,7 @@ from mqe_jax.train.checkpoint import (
 )
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
-from mqe_jax.train.logs import CSV_FILE, CsvLog, ProgressLog, TensorBoardLog
+from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
 from mqe_jax.train.seeds import shared_leaves, stack, take, with_shared, without_shared
@@ -41,7 +41,7 @@ CONFIG_FILE = "config.yaml"
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
 _FINITE_METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
-_MAY_CHANGE = ("total_steps", "checkpoint", "evaluation")
+_MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 
 
 def train(
@@ -58,7 +58,7 @@ def train(
     Args:
         env: the environments.
         config: settings.
-        run_dir: folder for config.yaml, metrics.csv, tensorboard/, checkpoints/ and policy.safetensors.
+        run_dir: folder for config.yaml, metrics.csv, logs of other loggers, checkpoints/ and policy.safetensors.
         resume: continues a run in the folder exactly from its newest checkpoint; an empty folder starts a new run.
         on_update: called after every update with the state and its row of metrics.csv.
         eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
@@ -92,6 +92,7 @@ def train_seeds(
         raise InputError("seeds: the settings of seeds trained together may differ in the seed alone")
     if configs[0].evaluation.every is not None and eval_env is None:
         fail("evaluation.every", configs[0].evaluation.every, "none where no environments are given to evaluate on")
+    check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
     learner = make_learner(env, configs[0], None if recorder is None else recorder.snapshot)
     left_by_a_run = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
@@ -156,9 +157,12 @@ class _Training:
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
         total_steps = config.num_updates * config.steps_per_update
         with contextlib.ExitStack() as logs:
-            files = [[log(folder, self._env_steps) for log in (CsvLog, TensorBoardLog)] for folder in self._folders]
-            for log in (log for pair in files for log in pair):
-                logs.callback(log.close)
+            makers = (CsvLog, *(LOGGERS[name] for name in config.loggers))
+            files: list[list[MetricsLog]] = [[] for _ in self._folders]
+            for folder, own_logs in zip(self._folders, files, strict=True):
+                for make_log in makers:
+                    own_logs.append(make_log(folder, self._env_steps))
+                    logs.callback(own_logs[-1].close)
             try:
                 with ProgressLog(config.task or self._env.name, self._env_steps, total_steps) as progress_log:
                     while self._env_steps < total_steps:
@@ -185,7 +189,7 @@ class _Training:
         states = self._state if state is None else state
         return states if self._single else take(states, self._shared, i)
 
-    def _step(self, files: Sequence[Sequence[Any]]) -> list[dict[str, float]]:
+    def _step(self, files: Sequence[Sequence[MetricsLog]]) -> list[dict[str, float]]:
         """Makes one update of every seed and logs it; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)

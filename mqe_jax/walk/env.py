@@ -10,12 +10,11 @@ Randomisation and rewards (`mqe_jax.walk.rewards`) follow walk-these-ways (Margo
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.physics import Physics
@@ -27,6 +26,9 @@ from mqe_jax.terrain import Plane, Track
 from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
 from mqe_jax.walk.task import EpisodeSpec, RandomizedBody, WalkTask, sample_body, sample_spec
 from mqe_jax.walk_policy import WalkMemory
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP

@@ -1,0 +1,110 @@
+"""Trains Narrow Gate with Brax's own PPO through the Brax adapter; prints and writes its evaluations.
+
+    python examples/brax_ppo.py --seeds 0 1 2 --csv brax_ppo.csv
+
+needs `pip install 'mqe-jax[brax]'`. Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 and later no longer
+have; `device_put_replicated` below replaces it.
+"""
+
+import argparse
+import csv
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as ppo
+
+from mqe_jax.adapters.brax import Env, wrap
+
+NUM_ENVS, EVAL_ENVS = 64, 512
+# While training, progress counts more than in the task itself, as in configs/demo.yaml; evaluations are on the task.
+TRAINING_REWARDS = {"approach": 10.0}
+
+
+def device_put_replicated(tree, devices):
+    """Returns the tree with every leaf repeated along a new leading axis, one entry per device."""
+    return jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree)
+
+
+def train(
+    env: Env,
+    eval_env: Env,
+    seed: int,
+    steps: int,
+    evaluations: int,
+    num_envs: int = NUM_ENVS,
+    eval_envs: int = EVAL_ENVS,
+) -> list[dict[str, float]]:
+    """Trains once; returns rows of seed, environment steps, mean and standard error of the return, length."""
+    rows = []
+
+    def evaluated(env_steps: int, metrics: Mapping[str, Any]) -> None:
+        spread = float(metrics["eval/episode_reward_std"]) / eval_envs**0.5
+        row = {
+            "seed": seed,
+            "env_steps": int(env_steps),
+            "return": round(float(metrics["eval/episode_reward"]), 4),
+            "return_standard_error": round(spread, 4),
+            "episode_length": round(float(metrics["eval/avg_episode_length"]), 1),
+        }
+        print(row, flush=True)
+        rows.append(row)
+
+    networks = functools.partial(
+        ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=(64, 64), value_hidden_layer_sizes=(64, 64)
+    )
+    if not hasattr(jax, "device_put_replicated"):
+        jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
+    ppo.train(
+        environment=env,
+        eval_env=eval_env,
+        num_timesteps=steps,
+        wrap_env_fn=wrap,
+        episode_length=env.episode_length,
+        num_envs=num_envs,
+        num_eval_envs=eval_envs,
+        num_evals=evaluations,
+        batch_size=num_envs,
+        num_minibatches=4,
+        num_updates_per_batch=4,
+        unroll_length=20,
+        learning_rate=5e-4,
+        entropy_cost=3e-3,
+        discounting=0.99,
+        normalize_observations=True,
+        max_grad_norm=1.0,
+        network_factory=networks,
+        progress_fn=evaluated,
+        seed=seed,
+    )
+    return rows
+
+
+def main() -> None:
+    """Runs the example."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--task", default="go1gate")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--steps", type=int, default=600_000)
+    parser.add_argument("--evaluations", type=int, default=3)
+    parser.add_argument("--csv", type=Path)
+    arguments = parser.parse_args()
+    shaping = {"rewards": TRAINING_REWARDS} if arguments.task == "go1gate" else {}
+    env, eval_env = Env(arguments.task, **shaping), Env(arguments.task)
+    rows = []
+    for seed in arguments.seeds:
+        rows += train(env, eval_env, seed, arguments.steps, arguments.evaluations)
+        if arguments.csv is not None:
+            arguments.csv.parent.mkdir(parents=True, exist_ok=True)
+            with arguments.csv.open("w", encoding="utf-8", newline="") as file:
+                writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

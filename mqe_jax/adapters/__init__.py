@@ -1,0 +1,46 @@
+"""Adapters to the interfaces of other libraries: Gymnasium, PettingZoo, Brax, JaxMARL.
+
+Each is a module of its own and needs the library that it is named after; importing it without that library raises an
+InputError that names the extra to install.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mqe_jax import envs
+from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.errors import InputError
+
+
+def missing(library: str, error: ImportError) -> InputError:
+    """Returns the error for an adapter whose library cannot be imported."""
+    return InputError(
+        f"mqe_jax.adapters.{library}: needs the package {library} ({error}); pip install 'mqe-jax[{library}]'"
+    )
+
+
+def task_env(task: str | QuadrupedEnv, *, max_steps: int | None = None, **overrides: Any) -> QuadrupedEnv:
+    """Returns the environment of a task, or the one given, which takes no overrides.
+
+    Args:
+        task: id, or an environment.
+        max_steps: time limit in environment steps, instead of the task's.
+        overrides: arguments of `mqe_jax.make`.
+
+    Raises:
+        InputError: from `mqe_jax.make`; for overrides of a given environment; for a time limit below one step.
+    """
+    if isinstance(task, QuadrupedEnv):
+        if overrides or max_steps is not None:
+            names = ", ".join([*overrides, *(["max_steps"] if max_steps is not None else [])])
+            raise InputError(f"task: overrides ({names}) need the id of a task, not an environment")
+        return task
+    if max_steps is None:
+        return envs.make(task, **overrides)
+    if max_steps < 1:
+        raise InputError(f"max_steps: {max_steps} must be at least 1")
+    if "episode_length" in overrides:
+        raise InputError("episode_length: give either this or the time limit in steps, not both")
+    dt = envs.make(task, **overrides).dt
+    return envs.make(task, **overrides, episode_length=max_steps * dt)

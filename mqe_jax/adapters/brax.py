@@ -1,0 +1,133 @@
+"""Brax: `Env` over the joint observations and actions of all agents, flattened, and a wrapper for training.
+
+`ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length)` trains with automatic resets to new
+episodes. Brax's own wrapper works too, except on Warp, but starts every episode of an environment from one state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.adapters import missing, task_env
+from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs import State as TaskState
+from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.errors import InputError
+
+try:
+    from brax.envs.base import Env as BraxEnv
+    from brax.envs.base import State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+except ImportError as error:
+    raise missing("brax", error) from None
+
+# Named as Playground's users ask for it (google-deepmind/mujoco_playground, issue 305).
+FINAL_OBS = "AutoResetWrapper_final_obs"
+
+
+class Env(BraxEnv):
+    """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after agent.
+
+    The reward is the mean over the agents of team 0: all agents in cooperative tasks. `done` is 1 where the task's
+    rules end the episode. The time limit is left to Brax's EpisodeWrapper, which otherwise took it for a termination:
+    pass it `episode_length`. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is
+    the observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's own state.
+
+    Attributes:
+        env: the task.
+        episode_length: time limit, environment steps.
+    """
+
+    def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
+        """Makes the environment of a task, from its id or given; `overrides` are those of `mqe_jax.make`."""
+        self.env = task_env(task, **overrides)
+        self.episode_length = self.env.max_steps
+
+    def reset(self, rng: jax.Array) -> State:
+        """Starts an episode."""
+        state = self.env.reset(rng)
+        obs = state.obs.reshape(-1)
+        info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
+        pipeline: Any = state  # any pytree, whatever Brax's annotation
+        zero = jnp.zeros(())
+        return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=state.metrics, info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances by one environment step."""
+        after = self.env.step(_task_state(state), action.reshape(self.env.num_agents, self.env.action_size))
+        obs = after.obs.reshape(-1)
+        info = {**state.info, "truncation": after.truncated.astype(jnp.float32), FINAL_OBS: obs}
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline_state=after,
+            obs=obs,
+            reward=jnp.mean(after.reward[jnp.array(self.env.teams[0])]),
+            done=after.terminated.astype(jnp.float32),
+            # Wrappers may have added entries.
+            metrics={**state.metrics, **after.metrics},
+            info=info,
+        )
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the joint observation."""
+        return self.env.num_agents * self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Length of the joint action."""
+        return self.env.num_agents * self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """The physics engine: 'jax', 'warp' or 'c'."""
+        return self.env.impl
+
+
+class AutoReset(Wrapper):
+    """Resets ended environments to new episodes; wraps a batch of `Env` with EpisodeWrapper.
+
+    `info["truncation"]` and `info[FINAL_OBS]` belong to the step, `obs` and `pipeline_state` to the new episode.
+    """
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Steps the batch, then resets the environments whose episodes ended."""
+        info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}
+        cleared = state.replace(done=jnp.zeros_like(state.done), info=info)  # pyright: ignore[reportAttributeAccessIssue]
+        after = self.env.step(cleared, action)
+        task: QuadrupedEnv = self.env.unwrapped.env  # pyright: ignore[reportAttributeAccessIssue]
+
+        def restart(own: TaskState, done: jax.Array) -> TaskState:
+            # EpisodeWrapper may end an episode earlier than the task's time limit.
+            return autoreset(task, dataclasses.replace(own, truncated=done.astype(bool) & ~own.terminated))
+
+        own = jax.vmap(restart)(_task_state(after), after.done)
+        obs = own.obs.reshape(*after.done.shape, -1)
+        return after.replace(pipeline_state=own, obs=obs)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def wrap(
+    env: BraxEnv,
+    episode_length: int = 1000,
+    action_repeat: int = 1,
+    randomization_fn: Callable[..., Any] | None = None,
+) -> Wrapper:
+    """Wraps an `Env` for Brax's trainers: batch, time limit, automatic reset to new episodes; pass it as `wrap_env_fn`.
+
+    Raises:
+        InputError: for a `randomization_fn`; the task's parameter `randomization` is its place here.
+    """
+    if not isinstance(env.unwrapped, Env):
+        raise InputError(f"env: {type(env.unwrapped).__name__} is not a mqe_jax.adapters.brax.Env")
+    if randomization_fn is not None:
+        raise InputError("randomization_fn: not supported; pass randomization=... to the Env instead")
+    return AutoReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+
+
+def _task_state(state: State) -> TaskState:
+    own: Any = state.pipeline_state
+    return own

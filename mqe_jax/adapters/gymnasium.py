@@ -1,0 +1,235 @@
+"""Gymnasium: `Env` and `VectorEnv` over the joint observations and actions of all agents.
+
+Importing this module registers every task as `mqe/TASK-v0`, for `gymnasium.make` and `gymnasium.make_vec`. Gymnasium
+1.x loads no plug-ins by itself; `gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1gate-v0")` imports it too.
+
+The reward is the mean over the agents of team 0: all agents in cooperative tasks. `info["agent_rewards"]` has those of
+all agents (A,), and `info` the metrics of the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import registry
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from mqe_jax import envs
+from mqe_jax.adapters import task_env
+from mqe_jax.adapters.host import RENDER_SIZE, HostEnvs, Step
+from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.errors import InputError
+
+RENDER_MODES = ("rgb_array",)
+
+
+def register() -> None:
+    """Registers every task as `mqe/TASK-v0`; call it again after `mqe_jax.envs.register_task`."""
+    for task in envs.tasks():
+        if f"mqe/{task}-v0" not in registry:
+            gymnasium.register(
+                f"mqe/{task}-v0",
+                entry_point=f"{__name__}:SingleEnv",
+                vector_entry_point=f"{__name__}:VectorEnv",
+                kwargs={"task": task},
+            )
+
+
+class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment: observations (A, O), actions (A, action_size) in [-1, 1].
+
+    The task's own time limit truncates. The first reset with seed s is `env.reset(jax.random.PRNGKey(s))`.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str | QuadrupedEnv,
+        *,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = RENDER_SIZE,
+        **overrides: Any,
+    ) -> None:
+        """Makes the environment.
+
+        Args:
+            task: id, or an environment.
+            render_mode: None or 'rgb_array'.
+            render_size: width and height, pixels.
+            overrides: arguments of `mqe_jax.make`.
+        """
+        self.render_mode = _checked_mode(render_mode)
+        self.env = task_env(task, **overrides)
+        self.action_space = self.env.action_space
+        self.observation_space = self.env.observation_space
+        self._size = render_size
+        self._host = HostEnvs(self.env, 1)
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode; without a seed it continues the random numbers of the one before."""
+        super().reset(seed=seed)
+        if seed is None and self._host.state is None:
+            seed = _drawn_seed(self.np_random)
+        return self._host.reset([seed])[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advances by one environment step; actions are clipped to [-1, 1]."""
+        out = self._host.step(np.asarray(action)[None])
+        info: dict[str, Any] = {name: value[0] for name, value in out.metrics.items()}
+        info["agent_rewards"] = out.reward[0]
+        reward = float(_team_reward(self.env, out)[0])
+        return out.obs[0], reward, bool(out.terminated[0]), bool(out.truncated[0]), info
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Returns an image (H, W, 3) uint8, or None without a render mode."""
+        return self._host.render(0, self._size) if self.render_mode else None
+
+
+class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """N environments stepped in one compiled call: observations (N, A, O), actions (N, A, action_size).
+
+    Environment i of `reset(seed=s)` equals the single environment reset with seed s + i, through automatic resets too.
+    """
+
+    def __init__(
+        self,
+        task: str | QuadrupedEnv,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = RENDER_SIZE,
+        **overrides: Any,
+    ) -> None:
+        """Makes the environments.
+
+        Args:
+            task: id, or an environment.
+            num_envs: N.
+            autoreset_mode: Gymnasium's convention for environments whose episodes have ended: NEXT_STEP (Gymnasium's
+                default), SAME_STEP, which has the last observation in `infos["final_obs"]`, or DISABLED.
+            max_episode_steps: time limit, instead of the task's.
+            render_mode: None or 'rgb_array'.
+            render_size: width and height, pixels.
+            overrides: arguments of `mqe_jax.make`.
+        """
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            allowed = ", ".join(mode.value for mode in AutoresetMode)
+            raise InputError(f"autoreset_mode: {autoreset_mode!r}; allowed: {allowed}") from None
+        self.render_mode = _checked_mode(render_mode)
+        if not isinstance(task, QuadrupedEnv):
+            overrides = {"num_envs": num_envs, **overrides}
+        self.env = task_env(task, max_steps=max_episode_steps, **overrides)
+        self.num_envs = num_envs
+        self.metadata = {**SingleEnv.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_action_space = self.env.action_space
+        self.single_observation_space = self.env.observation_space
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._size = render_size
+        self._host = HostEnvs(self.env, num_envs)
+        self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
+
+    def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts episodes.
+
+        Args:
+            seed: of environment 0, others count up; or one per environment. Without one, the random numbers continue.
+            options: `reset_mask` (N,) bool selects the environments to reset.
+        """
+        super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
+        mask = _reset_mask(options, self.num_envs)
+        seeds: list[int | None]
+        if isinstance(seed, int | np.integer):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        elif seed is not None:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise InputError(f"seed: {len(seeds)} seeds for {self.num_envs} environments")
+        else:
+            seeds = [None] * self.num_envs
+        if self._host.state is None:
+            seeds = [_drawn_seed(self.np_random) if one is None else one for one in seeds]
+        self._ended &= ~mask
+        return self._host.reset(seeds, mask), {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advances all environments by one step; actions are clipped to [-1, 1]."""
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            if self._ended.any():
+                raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, by options reset_mask")
+            out = self._host.step(actions)
+        else:
+            same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
+            out = self._host.step_and_reset(actions, same_step=same_step)
+        ended = out.terminated | out.truncated
+        metrics = {**out.metrics, "agent_rewards": out.reward}
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            infos = _masked(metrics, ~ended)
+            if ended.any():
+                final = np.full(self.num_envs, None, object)
+                for i in np.flatnonzero(ended):
+                    final[i] = out.final_obs[i]
+                infos |= {"final_obs": final, "_final_obs": ended.copy()}
+                infos |= {"final_info": _masked(metrics, ended), "_final_info": ended.copy()}
+        else:
+            infos = _masked(metrics, ~self._ended)
+        self._ended = ended.copy()
+        return out.obs, _team_reward(self.env, out), out.terminated, out.truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Returns an image (H, W, 3) uint8 of each environment, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._host.render(i, self._size) for i in range(self.num_envs))
+
+
+def _masked(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
+    """Returns infos in Gymnasium's form: arrays, zero outside of the mask, and the mask under `_name`."""
+    if not mask.any():
+        return {}
+    infos: dict[str, Any] = {}
+    everywhere = mask.all()
+    for name, value in values.items():
+        keep = mask.reshape(-1, *[1] * (value.ndim - 1))
+        infos[name] = value if everywhere else np.where(keep, value, 0).astype(value.dtype)
+        infos[f"_{name}"] = mask.copy()
+    return infos
+
+
+def _team_reward(env: QuadrupedEnv, out: Step) -> np.ndarray:
+    return out.reward[:, list(env.teams[0])].mean(-1, dtype=np.float64)
+
+
+def _drawn_seed(generator: np.random.Generator) -> int:
+    return int(generator.integers(2**31))
+
+
+def _checked_mode(mode: str | None) -> str | None:
+    if mode is not None and mode not in RENDER_MODES:
+        raise InputError(f"render_mode: {mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
+    return mode
+
+
+def _reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray:
+    if options is None or "reset_mask" not in options:
+        return np.ones(num_envs, bool)
+    mask = np.asarray(options["reset_mask"])
+    if mask.shape != (num_envs,) or mask.dtype != bool or not mask.any():
+        raise InputError(f"reset_mask: needs {num_envs} booleans, at least one of them true")
+    return mask
+
+
+register()

@@ -1,0 +1,157 @@
+"""PettingZoo: `ParallelEnv` over the agents `robot_0`, `robot_1`, ...
+
+`parallel_env(task)` makes the parallel environment, `env(task)` the same one agent after another (AEC).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import EzPickle
+
+from mqe_jax.adapters import missing, task_env
+from mqe_jax.adapters.host import RENDER_SIZE, HostEnvs
+from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.errors import InputError
+
+try:
+    from pettingzoo import AECEnv, ParallelEnv
+    from pettingzoo.utils import OrderEnforcingWrapper, parallel_to_aec
+except ImportError as error:
+    raise missing("pettingzoo", error) from None
+
+RENDER_MODES = ("rgb_array",)
+
+
+def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> QuadrupedParallelEnv:
+    """Returns the parallel environment of a task; the settings are those of `QuadrupedParallelEnv`."""
+    return QuadrupedParallelEnv(task, **settings)
+
+
+def env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> AECEnv[str, np.ndarray, Any]:
+    """Returns the same environment with one agent acting after another; all of them move after the last one."""
+    return OrderEnforcingWrapper(parallel_to_aec(parallel_env(task, **settings)))
+
+
+class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
+    """One environment as a parallel environment; all agents end together.
+
+    A copy or pickle is a new environment with the same settings, as vectorisers such as SuperSuit make them.
+
+    Attributes:
+        teams: agents of each team.
+        state_space: of `state()`.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "name": "mqe",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 50,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        task: str | QuadrupedEnv = "go1gate",
+        *,
+        max_cycles: int | None = None,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = RENDER_SIZE,
+        **overrides: Any,
+    ) -> None:
+        """Makes the environment.
+
+        Args:
+            task: id, or an environment.
+            max_cycles: time limit in environment steps, instead of the task's.
+            render_mode: None or 'rgb_array'.
+            render_size: width and height, pixels.
+            overrides: arguments of `mqe_jax.make`.
+        """
+        EzPickle.__init__(
+            self, task, max_cycles=max_cycles, render_mode=render_mode, render_size=render_size, **overrides
+        )
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise InputError(f"render_mode: {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
+        self.task = task_env(task, max_steps=max_cycles, **overrides)
+        self.metadata = {**type(self).metadata, "name": self.task.name}
+        self.render_mode = render_mode
+        self.possible_agents = [f"robot_{i}" for i in range(self.task.num_agents)]
+        self.agents: list[str] = []
+        self.teams = tuple(tuple(self.possible_agents[i] for i in team) for team in self.task.teams)
+        box = gymnasium.spaces.Box
+        joint_obs, joint_action = self.task.observation_space, self.task.action_space
+        self._observation_spaces = {
+            agent: box(joint_obs.low[i], joint_obs.high[i], dtype=np.float32)
+            for i, agent in enumerate(self.possible_agents)
+        }
+        self._action_spaces = {
+            agent: box(joint_action.low[i], joint_action.high[i], dtype=np.float32)
+            for i, agent in enumerate(self.possible_agents)
+        }
+        self.state_space = box(-np.inf, np.inf, (self.task.privileged_observation_size,), np.float32)
+        self._size = render_size
+        self._generator = np.random.default_rng()
+        self._host = HostEnvs(self.task, 1)
+
+    def observation_space(self, agent: str) -> gymnasium.spaces.Box:
+        """Returns the space of an agent's observation (O,)."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.spaces.Box:
+        """Returns the space of an agent's action (action_size,), in [-1, 1]."""
+        return self._action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """Starts an episode; without a seed it continues the random numbers of the one before."""
+        if seed is None and self._host.state is None:
+            seed = int(self._generator.integers(2**31))
+        obs = self._host.reset([seed])[0]
+        self.agents = list(self.possible_agents)
+        return self._by_agent(obs), {agent: {} for agent in self.agents}
+
+    def step(self, actions: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Advances by one environment step; an agent's info has the metrics of the step.
+
+        Raises:
+            InputError: if an agent has no action, or an action belongs to no agent.
+        """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        if set(actions) != set(self.agents):
+            raise InputError(f"actions: of {sorted(actions)}; expected one of each of {', '.join(self.agents)}")
+        out = self._host.step(np.stack([np.asarray(actions[agent], np.float32) for agent in self.agents])[None])
+        terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
+        metrics = {name: float(value[0]) for name, value in out.metrics.items()}
+        agents = self.agents
+        result = (
+            self._by_agent(out.obs[0]),
+            {agent: float(reward) for agent, reward in zip(agents, out.reward[0], strict=True)},
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            {agent: dict(metrics) for agent in agents},
+        )
+        if terminated or truncated:
+            self.agents = []
+        return result
+
+    def state(self) -> np.ndarray:
+        """Returns the privileged observation (P,), for centralised critics."""
+        if self._host.state is None:
+            raise InputError("state: reset the environment first")
+        return np.array(self._host.state.privileged_obs[0])
+
+    def render(self) -> np.ndarray | None:
+        """Returns an image (H, W, 3) uint8, or None without a render mode."""
+        return self._host.render(0, self._size) if self.render_mode else None
+
+    def close(self) -> None:
+        """Does nothing: there is nothing to release."""
+
+    def _by_agent(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        return dict(zip(self.possible_agents, values, strict=True))

@@ -1,0 +1,191 @@
+"""The Gymnasium adapter against Gymnasium's own checks and vector environment."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode
+
+from mqe_jax.adapters.gymnasium import SingleEnv, VectorEnv, register
+from mqe_jax.envs import tasks
+from mqe_jax.errors import InputError
+
+COUNT, STEPS, LIMIT = 3, 14, 5
+SEED = 7
+# The time limit ends the episodes, at the same step under every version of the physics.
+SHORT: dict[str, Any] = {"episode_length": LIMIT * 0.02}
+TASKS = [
+    "go1gate",
+    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
+]
+
+
+def close(one: Any, other: Any) -> bool:
+    """Whether two nested infos agree, with a tolerance for the order of floating-point sums in batches."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(close(one[k], other[k]) for k in one)
+    if isinstance(one, np.ndarray) and one.dtype == object:
+        return all(close(a, b) for a, b in zip(one, other, strict=True))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and one.shape == other.shape and np.allclose(one, other, rtol=1e-3, atol=1e-3)
+    return data_equivalence(one, other)
+
+
+def actions(seed: int, *shape: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_environment_checker(task: str) -> None:
+    """check_env passes; it warns only of observations without bounds."""
+    env: Any = gymnasium.make(f"mqe/{task}-v0", impl="c", **SHORT)
+    assert isinstance(env.unwrapped, SingleEnv)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped, skip_render_check=True)
+    told = [str(w.message) for w in caught if "infinity" not in str(w.message)]
+    assert told == []
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_single_environment_is_the_task(task: str) -> None:
+    """A seeded reset and a step give what the task itself gives."""
+    env: Any = gymnasium.make(f"mqe/{task}-v0", impl="c", **SHORT).unwrapped
+    obs, info = env.reset(seed=SEED)
+    state = jax.jit(env.env.reset)(jax.random.PRNGKey(SEED))
+    np.testing.assert_allclose(obs, state.obs, atol=1e-5)
+    assert info == {}
+    action = actions(0, *env.action_space.shape)
+    obs, reward, terminated, truncated, info = env.step(action)
+    assert obs.shape == env.observation_space.shape and obs.flags.writeable
+    assert (terminated, truncated) == (False, False)
+    team = list(env.env.teams[0])
+    assert reward == pytest.approx(info["agent_rewards"][team].mean())
+    assert {"success", "average_step_reward"} <= set(info)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=["same", "next"])
+@pytest.mark.parametrize("task", TASKS)
+def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMode) -> None:
+    """Step by step, automatic resets included, it gives what SyncVectorEnv gives over single environments."""
+    name = f"mqe/{task}-v0"
+    ours: Any = gymnasium.make_vec(name, COUNT, impl="c", autoreset_mode=mode, **SHORT)
+    theirs = gymnasium.make_vec(
+        name, COUNT, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, impl="c", **SHORT
+    )
+    assert isinstance(ours.unwrapped, VectorEnv)
+    assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"] is mode
+    for attribute in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
+        assert getattr(ours, attribute) == getattr(theirs, attribute)
+    resets = ended = 0
+    first, second = ours.reset(seed=SEED), theirs.reset(seed=SEED)
+    assert close(first[0], second[0]) and first[1] == second[1] == {}
+    for step in range(STEPS):
+        if step == 2:  # so that the environments' episodes end at different times
+            mask = np.arange(COUNT) == 1
+            first = ours.reset(options={"reset_mask": mask.copy()})
+            second = theirs.reset(options={"reset_mask": mask.copy()})
+            assert close(first[0], second[0])
+        action = actions(step, *ours.action_space.shape)
+        first, second = ours.step(action), theirs.step(action)
+        for one, other in zip(first[:4], second[:4], strict=True):
+            assert one.dtype == other.dtype
+            assert close(one, other), step
+        assert close(first[4], second[4]), (step, first[4], second[4])
+        over = first[2] | first[3]
+        ended += int(over.any() and not over.all())
+        resets += int(over.sum())
+    assert resets >= 2 * COUNT - 1 and ended >= 2
+
+
+def test_environment_i_is_the_single_one_with_seed_s_plus_i() -> None:
+    """Also where only one seed of a list is given again."""
+    vector: Any = VectorEnv("go1gate", COUNT, impl="c", **SHORT)
+    single = SingleEnv("go1gate", impl="c", **SHORT)
+    obs, _ = vector.reset(seed=SEED)
+    for i in range(COUNT):
+        assert close(obs[i], single.reset(seed=SEED + i)[0])
+    again, _ = vector.reset(seed=[None, SEED, None])
+    assert close(again[1], obs[0]) and not close(again[0], obs[0])
+
+
+def test_disabled_autoreset_and_time_limit() -> None:
+    """max_episode_steps truncates; without automatic reset an ended environment must be reset before the next step."""
+    vector: Any = gymnasium.make_vec(
+        "mqe/go1gate-v0", COUNT, impl="c", autoreset_mode="Disabled", max_episode_steps=LIMIT
+    )
+    vector.reset(seed=SEED)
+    zero = np.zeros(vector.action_space.shape, np.float32)
+    for step in range(LIMIT):
+        truncated = vector.step(zero)[3]
+        assert truncated.all() == (step == LIMIT - 1)
+    with pytest.raises(InputError, match=r"reset environments \[0 1 2\]"):
+        vector.step(zero)
+    vector.reset()
+    assert not vector.step(zero)[3].any()
+
+
+def test_render_returns_images() -> None:
+    """One image for the single environment, one per environment for the vector; none without a render mode."""
+    settings: dict[str, Any] = {"impl": "c", "render_size": (96, 64), **SHORT}
+    single = SingleEnv("go1gate", render_mode="rgb_array", **settings)
+    single.reset(seed=SEED)
+    image = single.render()
+    assert image is not None and image.shape == (64, 96, 3) and image.dtype == np.uint8 and image.std() > 5
+    vector: Any = VectorEnv("go1gate", COUNT, render_mode="rgb_array", **settings)
+    vector.reset(seed=SEED)
+    images = vector.render()
+    assert images is not None and [i.shape for i in images] == [(64, 96, 3)] * COUNT
+    assert SingleEnv("go1gate", **settings).render() is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"autoreset_mode": "later"}, "autoreset_mode: 'later'; allowed: NextStep, SameStep, Disabled"),
+        ({"render_mode": "human"}, "render_mode: 'human'; allowed: None, rgb_array"),
+        ({"num_envs": 0}, "num_envs: 0 must be at least 1"),
+        ({"max_episode_steps": 0}, "max_steps: 0 must be at least 1"),
+        ({"gate": 1}, "gate"),
+    ],
+)
+def test_bad_settings_are_named(settings: dict[str, Any], told: str) -> None:
+    """With what is allowed."""
+    with pytest.raises(InputError, match=told):
+        VectorEnv("go1gate", **{"num_envs": 2, "impl": "c", **settings})
+
+
+def test_bad_calls_are_named() -> None:
+    """Steps before a reset, actions of a wrong shape or not finite, seeds and masks of a wrong length."""
+    vector: Any = VectorEnv("go1gate", COUNT, impl="c", **SHORT)
+    action = np.zeros(vector.action_space.shape, np.float32)
+    with pytest.raises(InputError, match="reset the environment first"):
+        vector.step(action)
+    vector.reset(seed=SEED)
+    with pytest.raises(InputError, match=r"action: shape \(2, 2, 3\); expected \(3, 2, 3\)"):
+        vector.step(action[:2])
+    with pytest.raises(InputError, match="NaN or infinity"):
+        vector.step(action * np.nan)
+    with pytest.raises(InputError, match="2 seeds for 3 environments"):
+        vector.reset(seed=[1, 2])
+    with pytest.raises(InputError, match=r"allowed: 0 to 2\^32 - 1"):
+        vector.reset(seed=2**32)
+    with pytest.raises(InputError, match="reset_mask"):
+        vector.reset(options={"reset_mask": np.zeros(COUNT, bool)})
+
+
+def test_every_task_is_registered() -> None:
+    """Once, however often the module registers; also through Gymnasium's module:id form in a fresh process."""
+    register()
+    assert {f"mqe/{task}-v0" for task in tasks()} <= set(gymnasium.registry)
+    code = "import gymnasium; print(gymnasium.make('mqe_jax.adapters.gymnasium:mqe/go1gate-v0', impl='c'))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "SingleEnv<mqe/go1gate-v0>" in out.stdout

@@ -1,0 +1,223 @@
+"""The Brax and JaxMARL adapters: their conventions, automatic resets and the two examples."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mqe_jax
+from mqe_jax.envs import tasks
+from mqe_jax.errors import InputError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+
+COUNT, LIMIT, STEPS = 3, 3, 7
+TASKS = [
+    "go1gate",
+    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
+]
+
+
+def task_env(task: str) -> Any:
+    return mqe_jax.make(task, impl="c", episode_length=LIMIT * 0.02)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_brax_rollout(task: str) -> None:
+    """Under our wrapper: shapes, truncation apart from done, final observations, new episodes after each reset."""
+    pytest.importorskip("brax", reason="needs the extra brax")
+    from mqe_jax.adapters.brax import FINAL_OBS, Env, wrap
+
+    env = Env(task_env(task))
+    assert env.episode_length == LIMIT and env.backend == "c"
+    wrapped = wrap(env, env.episode_length)
+    step, action_size = wrapped.step, env.action_size
+
+    @jax.jit
+    def play(key: jax.Array) -> Any:
+        def one(state: Any, _: None) -> Any:
+            state = step(state, jnp.zeros((COUNT, action_size)))
+            names = ("truncation", FINAL_OBS, "steps")
+            return state, (state.obs, state.reward, state.done, *(state.info[name] for name in names))
+
+        first = wrapped.reset(jax.random.split(key, COUNT))
+        rows = jax.lax.scan(one, first, None, STEPS)[1]
+        return first.obs, first.info[FINAL_OBS], rows
+
+    start, final, (obs, reward, done, truncation, final_obs, steps) = play(jax.random.PRNGKey(0))
+    np.testing.assert_array_equal(start, final)
+    assert obs.shape == (STEPS, COUNT, env.observation_size) and reward.shape == done.shape == (STEPS, COUNT)
+    ends = np.zeros((STEPS, COUNT))
+    ends[LIMIT - 1 :: LIMIT] = 1
+    np.testing.assert_array_equal(done, ends)
+    np.testing.assert_array_equal(truncation, ends)
+    np.testing.assert_array_equal(steps[:, 0], [1, 2, 3, 1, 2, 3, 1])
+    np.testing.assert_array_equal(np.abs(obs - final_obs).max(-1) > 1e-3, ends == 1)
+    # Each episode starts in a state of its own, unlike under Brax's wrapper.
+    assert np.abs(obs[LIMIT - 1] - start).max(-1).min() > 1e-3
+    assert np.abs(obs[LIMIT - 1] - obs[2 * LIMIT - 1]).max(-1).min() > 1e-3
+
+
+@pytest.mark.soak
+def test_brax_done_is_a_termination() -> None:
+    """Without EpisodeWrapper, the time limit shows in info alone; the metrics are the task's."""
+    pytest.importorskip("brax", reason="needs the extra brax")
+    from mqe_jax.adapters.brax import Env
+
+    env = Env(task_env("go1gate"))
+    state = env.reset(jax.random.PRNGKey(0))
+    own: Any = state.pipeline_state
+    late = own.__class__(**{**own.__dict__, "step": jnp.asarray(LIMIT - 1)})
+    shapes: Any = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+    assert set(shapes.metrics) == set(state.metrics) and shapes.obs.shape == (env.observation_size,)
+    after = env.step(state.replace(pipeline_state=late), jnp.zeros(env.action_size))  # type: ignore[attr-defined]
+    assert float(after.done) == 0.0 and float(after.info["truncation"]) == 1.0
+
+
+def test_brax_wrap_names_what_it_does_not_take() -> None:
+    """Foreign environments, and randomisation functions of Brax's kind."""
+    pytest.importorskip("brax", reason="needs the extra brax")
+    from brax.envs.wrappers.training import VmapWrapper
+
+    from mqe_jax.adapters.brax import Env, wrap
+
+    env = Env(task_env("go1gate"))
+    with pytest.raises(InputError, match="randomization_fn: not supported"):
+        wrap(VmapWrapper(env), randomization_fn=lambda system: system)
+    with pytest.raises(InputError, match="env: object is not"):
+        wrap(type("Foreign", (), {"unwrapped": object()})())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_jaxmarl_rollout(task: str) -> None:
+    """Under LogWrapper: dicts by agent, truncation in the infos, one value per agent, new episodes after a reset."""
+    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    pytest.importorskip("six", reason="gymnax, which JaxMARL imports, needs six")
+    from jaxmarl.wrappers.baselines import LogWrapper
+
+    from mqe_jax.adapters.jaxmarl import Env
+
+    env = Env(task_env(task))
+    agents: Any = env.agents
+    spaces: Any = env.observation_spaces
+    assert agents == [f"robot_{i}" for i in range(env.num_agents)] and env.name == task
+    assert [a for team in env.agent_classes.values() for a in team] == agents
+    wrapped = LogWrapper(env)
+    zero = {agent: jnp.zeros((COUNT, env.env.action_size)) for agent in agents}
+
+    @jax.jit
+    def play(key: jax.Array) -> Any:
+        def one(carry: Any, key: jax.Array) -> Any:
+            obs, state, reward, done, info = jax.vmap(wrapped.step)(jax.random.split(key, COUNT), carry, zero)
+            return state, (obs, state.env_state.final_obs, reward, done, info)
+
+        obs, state = jax.vmap(wrapped.reset)(jax.random.split(key, COUNT))
+        return obs, jax.lax.scan(one, state, jax.random.split(key, STEPS))[1]
+
+    start, (obs, final_obs, reward, done, info) = play(jax.random.PRNGKey(0))
+    ends = np.zeros((STEPS, COUNT), bool)
+    ends[LIMIT - 1 :: LIMIT] = True
+    assert set(obs) == set(reward) == set(agents) and set(done) == {*agents, "__all__"}
+    for agent in (*agents, "__all__"):
+        np.testing.assert_array_equal(done[agent], ends)
+    assert {value.shape for value in info.values()} == {(STEPS, COUNT, env.num_agents)}
+    np.testing.assert_array_equal(info["truncation"][..., 0], ends)
+    np.testing.assert_array_equal(info["returned_episode_lengths"][LIMIT - 1], LIMIT)
+    first = agents[0]
+    assert obs[first].shape == (STEPS, COUNT, *spaces[first].shape)
+    np.testing.assert_array_equal(np.abs(obs[first] - final_obs[:, :, 0]).max(-1) > 1e-3, ends)
+    assert np.abs(obs[first][LIMIT - 1] - start[first]).max(-1).min() > 1e-3
+
+
+@pytest.mark.soak
+def test_jaxmarl_resets_to_a_given_state() -> None:
+    """An ended episode continues from `reset_state`; a running one does not."""
+    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    from mqe_jax.adapters.jaxmarl import Env
+
+    env = Env(mqe_jax.make("go1gate", impl="c", episode_length=2 * 0.02))
+    obs, start = env.reset(jax.random.PRNGKey(1))
+    zero = {agent: jnp.zeros(3) for agent in env.agents}
+    running, state, *_ = env.step(jax.random.PRNGKey(2), start, zero, start)
+    assert np.abs(running["robot_0"] - obs["robot_0"]).max() > 1e-4
+    after, state, _, done, _ = env.step(jax.random.PRNGKey(3), state, zero, start)
+    assert bool(done["__all__"])
+    np.testing.assert_array_equal(after["robot_0"], obs["robot_0"])
+    np.testing.assert_array_equal(state.data.qpos, start.data.qpos)
+    assert np.abs(state.final_obs - state.obs).max() > 1e-4
+
+
+@pytest.mark.parametrize("library", ["brax", "jaxmarl"])
+def test_without_the_library_the_extra_is_named(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Importing the adapter tells what to install."""
+    for name in [name for name in sys.modules if name.split(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"mqe_jax.adapters.{library}", raising=False)
+    with pytest.raises(InputError, match=rf"pip install 'mqe-jax\[{library}\]'"):
+        importlib.import_module(f"mqe_jax.adapters.{library}")
+
+
+@pytest.mark.soak
+def test_brax_ppo_example_trains() -> None:
+    """Brax's own PPO runs through the adapter and reports evaluations."""
+    pytest.importorskip("brax", reason="needs the extra brax")
+    brax_ppo = importlib.import_module("brax_ppo")
+
+    env = brax_ppo.Env("go1gate", impl="c", episode_length=0.5)
+    rows = brax_ppo.train(env, env, 0, 2_000, 2, num_envs=8, eval_envs=8)
+    assert [row["env_steps"] > 0 for row in rows] == [False, True]
+    assert all(np.isfinite(row["return"]) and 0 < row["episode_length"] <= 25 for row in rows)
+
+
+@pytest.mark.soak
+def test_jaxmarl_ippo_example_trains(tmp_path: Path) -> None:
+    """The example's IPPO runs on JaxMARL's wrappers; its curve has a row per update and a picture."""
+    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
+
+    env = jaxmarl_ippo.Env("go1gate", impl="c", episode_length=0.5)
+    config = {**jaxmarl_ippo.CONFIG, "NUM_ENVS": 4, "NUM_STEPS": 50, "TOTAL_TIMESTEPS": 400}
+    rows = jaxmarl_ippo.own_ippo(config, env)
+    np.testing.assert_array_equal(rows[:, 0], [200, 400])
+    assert np.isfinite(rows).all() and (rows[:, 2] <= 25).all()
+    jaxmarl_ippo.plot(rows, tmp_path / "curve.png", "IPPO")
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
+def test_a_checkout_gets_our_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The baseline of a checkout makes our environment by JaxMARL's own `make`; its metrics become the curve."""
+    jaxmarl = pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
+    monkeypatch.setattr(jaxmarl, "make", jaxmarl.make)
+    monkeypatch.delitem(sys.modules, "ippo_ff_mabrax", raising=False)
+    folder = tmp_path / "baselines" / "IPPO"
+    folder.mkdir(parents=True)
+    (folder / "ippo_ff_mabrax.py").write_text(
+        "import types, jax.numpy as jnp, jaxmarl\n"
+        "wandb = types.SimpleNamespace(init=lambda mode: None)\n"
+        "def make_train(config):\n"
+        "    env = jaxmarl.make(config['ENV_NAME'], **config['ENV_KWARGS'])\n"
+        "    values = jnp.full((3, 1), float(env.num_agents))\n"
+        "    metrics = {'returned_episode_returns': values, 'returned_episode_lengths': 5 * values}\n"
+        "    return lambda key: {'metrics': metrics}\n"
+    )
+    config = {**jaxmarl_ippo.CONFIG, "NUM_ENVS": 2, "NUM_STEPS": 10}
+    rows = jaxmarl_ippo.baseline_ippo(tmp_path, config, jaxmarl_ippo.Env(task_env("go1gate")))
+    np.testing.assert_array_equal(rows, [[20, 2, 10], [40, 2, 10], [60, 2, 10]])
+
+
+def test_a_missing_checkout_is_named(tmp_path: Path) -> None:
+    """With the file that was looked for."""
+    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
+
+    with pytest.raises(SystemExit, match=r"ippo_ff_mabrax\.py does not exist"):
+        jaxmarl_ippo.baseline_ippo(tmp_path, jaxmarl_ippo.CONFIG, None)  # type: ignore[arg-type]

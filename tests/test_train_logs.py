@@ -1,0 +1,95 @@
+"""The loggers: what they write can be read back."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import math
+import struct
+from pathlib import Path
+
+import pytest
+
+from mqe_jax.errors import InputError
+from mqe_jax.train import logs
+from mqe_jax.train.config import TrainConfig
+
+ROWS = [
+    {"env_steps": 100, "average_step_reward": 0.25, "success": math.nan},
+    {"env_steps": 200, "average_step_reward": 0.5, "success": 0.75},
+]
+
+
+def write(log: logs.MetricsLog, rows: list[dict[str, float]] = ROWS) -> None:
+    for row in rows:
+        log.write(row)
+    log.close()
+
+
+def events(folder: Path) -> list[tuple[int, str, float]]:
+    """Reads step, name and value of TensorBoard's records: length, checksum, data, checksum."""
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2", reason="needs the extra log")
+    found = []
+    for path in sorted(folder.glob("events*")):
+        data = path.read_bytes()
+        while data:
+            (length,) = struct.unpack("<Q", data[:8])
+            event = event_pb2.Event.FromString(data[12 : 12 + length])
+            found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
+            data = data[16 + length :]
+    return found
+
+
+def test_csv(tmp_path: Path) -> None:
+    """One row per update, NaN where a number is missing; a resumed log drops what comes after its step."""
+    write(logs.CsvLog(tmp_path, 0))
+    write(logs.CsvLog(tmp_path, 100), [{"env_steps": 200, "average_step_reward": 1.0, "success": 1.0}])
+    with (tmp_path / logs.CSV_FILE).open() as file:
+        rows = list(csv.DictReader(file))
+    assert rows == [
+        {"env_steps": "100", "average_step_reward": "0.25", "success": "nan"},
+        {"env_steps": "200", "average_step_reward": "1", "success": "1"},
+    ]
+
+
+def test_tensorboard(tmp_path: Path) -> None:
+    """Finite numbers at their steps."""
+    pytest.importorskip("tensorboardX", reason="needs the extra log")
+    write(logs.LOGGERS["tensorboard"](tmp_path, 0))
+    assert events(tmp_path / "tensorboard") == [
+        (100, "average_step_reward", 0.25),
+        (200, "average_step_reward", 0.5),
+        (200, "success", 0.75),
+    ]
+
+
+def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run on disk, without a network or an account, with the numbers; a resumed one has the same id."""
+    pytest.importorskip("wandb", reason="needs the extra log")
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    first = tmp_path / "run"
+    write(logs.LOGGERS["wandb"](first, 0))
+    run_id = (first / "wandb" / "run_id").read_text()
+    (file,) = first.glob("wandb/offline-run-*/*.wandb")
+    assert file.name == f"run-{run_id}.wandb"
+    data = file.read_bytes()
+    assert all(text in data for text in (b"average_step_reward", b"0.25", b"success", b"0.75"))
+    write(logs.LOGGERS["wandb"](first, 200), [{"env_steps": 300, "average_step_reward": 1.0}])
+    assert (first / "wandb" / "run_id").read_text() == run_id
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before a training begins."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name))
+    with pytest.raises(InputError, match=r"'wandb' needs the package wandb; pip install 'mqe-jax\[log\]'"):
+        logs.check_loggers(("tensorboard", "wandb"))
+    logs.check_loggers(("tensorboard",))
+
+
+def test_loggers_are_a_setting() -> None:
+    """Chosen by name; an unknown one is refused."""
+    assert TrainConfig().loggers == ("tensorboard",)
+    assert set(TrainConfig(loggers=("tensorboard", "wandb")).loggers) == set(logs.LOGGERS)
+    with pytest.raises(InputError, match="loggers"):
+        TrainConfig(loggers=("mlflow",))  # type: ignore[arg-type]
