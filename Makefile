@@ -13,7 +13,7 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 pytho
 TEST_JOBS ?= 2
 SOURCES := $(wildcard mqe_jax tests examples tools)
 
-.PHONY: help install demo test soak check fmt clean system
+.PHONY: help install demo test soak check fmt clean system browser
 
 help: ## Say what the targets do
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -32,6 +32,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 system: ## Install the GL libraries for pictures, where that is possible
 	@bash tools/install_gl.sh
+
+browser: ## Install Debian's Chromium for the test of `mqe view`, where that is possible
+	@bash tools/install_chromium.sh
 
 demo: $(STAMP) system ## Train Narrow Gate on the CPU, print before and after, leave runs/demo
 	JAX_PLATFORMS=cpu $(BIN)/mqe demo
