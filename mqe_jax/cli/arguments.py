@@ -32,7 +32,7 @@ from mqe_jax.cli.options import (
     TaskRobot,
     implementation,
 )
-from mqe_jax.cli.view_arguments import View
+from mqe_jax.cli.view_arguments import Export, View
 from mqe_jax.errors import InputError, nearest
 
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
@@ -47,7 +47,7 @@ First steps:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "view", "replay", "bench", "demo", "walk", "sweep", "report")
+COMMANDS = ("tasks", "train", "eval", "render", "view", "export", "replay", "bench", "demo", "walk", "sweep", "report")
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
@@ -338,6 +338,7 @@ def _parser(wanted: Sequence[str]) -> Any:
         Annotated[Eval, subcommand("eval")],
         Annotated[Render, subcommand("render")],
         Annotated[View, subcommand("view")],
+        Annotated[Export, subcommand("export")],
         Annotated[Replay, subcommand("replay")],
         Annotated[Bench, subcommand("bench")],
         Annotated[Demo, subcommand("demo")],

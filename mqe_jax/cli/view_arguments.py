@@ -1,4 +1,4 @@
-"""Arguments of `mqe view`."""
+"""Arguments of `mqe view` and `mqe export`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Control, Impl, Seed, Set, TaskRobot, implementation
+from mqe_jax.cli.options import Control, Impl, Json, Seed, Set, TaskRobot, implementation
 
 
 @dataclass(frozen=True)
@@ -40,3 +40,17 @@ class View:
 
     def run(self) -> dict[str, Any] | None:
         return implementation("view").view(self)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a trained run's policy, with the walk policy under it, as one ONNX graph."""
+
+    run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Folder of the run, or its policy file."""
+    onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """File to write (.onnx)."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any] | None:
+        return implementation("export").export(self)
