@@ -110,7 +110,8 @@ def overview(tasks: Mapping[str, Any]) -> str:
     for name, task in tasks.items():
         env = _make(task)
         kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Collaborative"
-        image = f"[![{task.title}]({_image(name)}){{ style="min-width: 9em" }}]({name}.md)" if _image(name) else ""
+        style = '{ style="min-width: 9em" }'
+        image = f"[![{task.title}]({_image(name)}){style}]({name}.md)" if _image(name) else ""
         sizes = f"{env.num_agents} | {env.observation_size} | {env.privileged_observation_size}"
         limit = f"{env.params.episode_length:g}"
         kinds[kind].append(f"| [`{name}`]({name}.md) | {task.title} | {sizes} | {limit} | {image} |")
