@@ -43,7 +43,7 @@ test: $(STAMP) ## Run the tests
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
 
 docs: $(STAMP) ## Build the documentation site into build/site
-	JAX_PLATFORMS=cpu $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 JAX_PLATFORMS=cpu $(BIN)/mkdocs build --strict --quiet
 	@echo "docs: open build/site/index.html"
 
 soak: $(STAMP) ## Run the heavy tests too (about an hour)
