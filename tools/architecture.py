@@ -23,14 +23,15 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("walk_policy", "control"),
     ("envs", "train"),
     ("planners", "walk"),
-    ("study", "viz", "adapters"),
+    ("study", "viz", "view", "export", "adapters"),
     ("cli",),
 )
 # Where each room stands across the picture, from 0 (left) to 1 (right).
 ACROSS = {
     "errors": 0.3, "files": 0.86, "settings": 0.58, "rotation": 0.86, "collision": 0.3, "robots": 0.58, "terrain": 0.12,
     "objects": 0.33, "npc": 0.53, "scene": 0.36, "physics": 0.7, "walk_policy": 0.5, "control": 0.76, "envs": 0.25,
-    "train": 0.9, "planners": 0.34, "walk": 0.62, "study": 0.46, "viz": 0.14, "adapters": 0.8, "cli": 0.5,
+    "train": 0.9, "planners": 0.34, "walk": 0.62, "study": 0.08, "viz": 0.27, "view": 0.46, "export": 0.65,
+    "adapters": 0.84, "cli": 0.5,
 }  # fmt: skip
 # Exceptions to the rule above: these see less. The trainer knows no task, no robot and no physics.
 ONLY: dict[str, frozenset[str]] = {"train": frozenset({"errors", "files", "settings"})}

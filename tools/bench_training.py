@@ -2,7 +2,7 @@
 
 `python tools/bench_training.py --algorithms mappo jrpo mat --seeds 1 5 --json FILE` starts a process per algorithm and
 number of seeds. They compile side by side and are then timed in turn, with the paper's settings: the whole update, its
-rollout alone (the rest is the learner), and an evaluation of all seeds (32 episodes each with sampled and mean actions).
+rollout alone (the rest is the learner), and an evaluation of all (32 episodes each with sampled and mean actions).
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ class HostEnvs:
         if self._camera is None:
             model = drawn_model(self.env.mj_model, episode)
             self._camera = default_camera(model, episode, size[0] / size[1])
-        return np.array(next(iter(render_frames(self.env, episode, self._camera, size))))
+        return np.array(next(iter(render_frames(self.env, episode, [self._camera], size))))
 
     def _advance(self, function: Callable[..., Any], *arguments: Any) -> Step:
         if self.state is None:

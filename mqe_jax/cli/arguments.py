@@ -15,10 +15,24 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from mqe_jax.cli.options import (
+    Command,
+    Control,
+    DumpDiverged,
+    Impl,
+    Json,
+    Repeated,
+    Robot,
+    Seed,
+    Set,
+    TaskRobot,
+    implementation,
+)
+from mqe_jax.cli.view_arguments import Export, View
 from mqe_jax.errors import InputError, nearest
 
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
@@ -29,67 +43,12 @@ First steps:
   mqe train go1gate --config demo             train two robots to pass a gate (minutes on a CPU)
   mqe eval runs/go1gate                       evaluate the trained policy
   mqe render runs/go1gate -o gate.mp4         render the trained policy
+  mqe view go1gate                            watch and drive in the browser
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "replay", "bench", "demo", "walk", "sweep", "report")
-Repeated = tyro.conf.UseAppendAction
+COMMANDS = ("tasks", "train", "eval", "render", "view", "export", "replay", "bench", "demo", "walk", "sweep", "report")
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
-
-
-class Command(Protocol):
-    """A subcommand: a record of arguments that can be run."""
-
-    def run(self) -> dict[str, Any] | None:
-        """Runs the command; returns the object that `--json` prints, if any."""
-        ...
-
-
-def _commands(module: str = "commands") -> Any:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note about a missing warp-lang
-        return importlib.import_module(f"mqe_jax.cli.{module}")
-
-
-Impl = Annotated[
-    str,
-    tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
-]
-Set = Annotated[
-    list[str],
-    Repeated,
-    tyro.conf.arg(
-        name="set",
-        metavar="KEY=VALUE",
-        help="Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML.",
-    ),
-]
-Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
-Seed = Annotated[int, tyro.conf.arg(help="Random seed.")]
-Control = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="MODE",
-        help="Action mode: command (velocities for the walk policy), position (joint targets), torque. "
-        "Default: command, or what the run was trained with.",
-    ),
-]
-Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
-TaskRobot = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or what the run was trained with."
-    ),
-]
-
-
-DumpDiverged = Annotated[
-    Path | None,
-    tyro.conf.arg(
-        metavar="FOLDER",
-        help="Record the last 64 steps of environments whose physics diverges there (see `mqe replay`). "
-        "Keeps the states of two rollouts in memory.",
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -99,7 +58,7 @@ class Tasks:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().tasks(self)
+        return implementation().tasks(self)
 
 
 @dataclass(frozen=True)
@@ -128,7 +87,7 @@ class Train:
     settings: Annotated[Any, tyro.conf.Suppress] = None
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().train(self)
+        return implementation().train(self)
 
 
 @dataclass(frozen=True)
@@ -159,7 +118,7 @@ class Eval:
     dump_diverged: DumpDiverged = None
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().evaluate(self)
+        return implementation().evaluate(self)
 
 
 @dataclass(frozen=True)
@@ -201,7 +160,7 @@ class Render:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().render(self)
+        return implementation().render(self)
 
 
 @dataclass(frozen=True)
@@ -217,7 +176,7 @@ class Replay:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().replay(self)
+        return implementation().replay(self)
 
 
 @dataclass(frozen=True)
@@ -242,7 +201,7 @@ class Bench:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return _commands().bench(self)
+        return implementation().bench(self)
 
 
 @dataclass(frozen=True)
@@ -258,7 +217,7 @@ class Demo:
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return _commands("demo").demo(self)
+        return implementation("demo").demo(self)
 
 
 @dataclass(frozen=True)
@@ -275,7 +234,7 @@ class Sweep:
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return _commands("study_commands").sweep(self)
+        return implementation("study_commands").sweep(self)
 
 
 @dataclass(frozen=True)
@@ -287,7 +246,7 @@ class Report:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return _commands("study_commands").report(self)
+        return implementation("study_commands").report(self)
 
 
 @dataclass(frozen=True)
@@ -319,7 +278,7 @@ class WalkTrain:
     seed: Seed = 1
 
     def run(self) -> dict[str, Any] | None:
-        return _commands("walk_commands").walk_train(self)
+        return implementation("walk_commands").walk_train(self)
 
 
 @dataclass(frozen=True)
@@ -338,7 +297,7 @@ class WalkEval:
     seed: Seed = 0
 
     def run(self) -> dict[str, Any] | None:
-        return _commands("walk_commands").walk_eval(self)
+        return implementation("walk_commands").walk_eval(self)
 
 
 @dataclass(frozen=True)
@@ -354,7 +313,7 @@ class WalkConvert:
     robot: Robot = "go1"
 
     def run(self) -> dict[str, Any] | None:
-        return _commands("walk_commands").walk_convert(self)
+        return implementation("walk_commands").walk_convert(self)
 
 
 @dataclass(frozen=True)
@@ -385,6 +344,8 @@ def _parser(wanted: Sequence[str]) -> Any:
         Annotated[train, subcommand("train", description=Train.__doc__)],
         Annotated[Eval, subcommand("eval")],
         Annotated[Render, subcommand("render")],
+        Annotated[View, subcommand("view")],
+        Annotated[Export, subcommand("export")],
         Annotated[Replay, subcommand("replay")],
         Annotated[Bench, subcommand("bench")],
         Annotated[Demo, subcommand("demo")],

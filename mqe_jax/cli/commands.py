@@ -16,6 +16,7 @@ from mqe_jax.cli.output import print_table, say
 from mqe_jax.cli.players import PLANNER_NAMES, Player
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
+from mqe_jax.cli.view_arguments import View
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS
 from mqe_jax.envs import replay as recordings
 from mqe_jax.errors import InputError, nearest
@@ -33,7 +34,7 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
-def find_player(arguments: Eval | Render, default: str) -> Player:
+def find_player(arguments: Eval | Render | View, default: str) -> Player:
     """Returns the player of RUN|TASK, --policy and --planner; `default` is the planner of a task without either."""
     target = arguments.target
     if arguments.planner is not None and arguments.policy is not None:
@@ -56,7 +57,7 @@ def find_player(arguments: Eval | Render, default: str) -> Player:
     return Player(task, overrides, arguments.planner or default, arguments.opponent)
 
 
-def _overrides(arguments: Train | Eval | Render | Bench) -> dict[str, Any]:
+def _overrides(arguments: Train | Eval | Render | View | Bench) -> dict[str, Any]:
     """Returns the task parameters given by --set, --control and --robot."""
     flags = {"control": arguments.control, "robot": arguments.robot}
     return parse_overrides(arguments.set) | {name: value for name, value in flags.items() if value is not None}

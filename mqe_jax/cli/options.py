@@ -1,0 +1,69 @@
+"""Options that several commands share, and the protocol of a command."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import tyro
+
+Repeated = tyro.conf.UseAppendAction
+
+
+class Command(Protocol):
+    """A subcommand: a record of arguments that can be run."""
+
+    def run(self) -> dict[str, Any] | None:
+        """Runs the command; returns the object that `--json` prints, if any."""
+        ...
+
+
+def implementation(module: str = "commands") -> Any:
+    """Returns a module of `mqe_jax.cli`, imported only now."""
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note about a missing warp-lang
+        return importlib.import_module(f"mqe_jax.cli.{module}")
+
+
+Impl = Annotated[
+    str,
+    tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
+]
+Set = Annotated[
+    list[str],
+    Repeated,
+    tyro.conf.arg(
+        name="set",
+        metavar="KEY=VALUE",
+        help="Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML.",
+    ),
+]
+Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
+Seed = Annotated[int, tyro.conf.arg(help="Random seed.")]
+Control = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="MODE",
+        help="Action mode: command (velocities for the walk policy), position (joint targets), torque. "
+        "Default: command, or what the run was trained with.",
+    ),
+]
+Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
+TaskRobot = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or what the run was trained with."
+    ),
+]
+
+
+DumpDiverged = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="FOLDER",
+        help="Record the last 64 steps of environments whose physics diverges there (see `mqe replay`). "
+        "Keeps the states of two rollouts in memory.",
+    ),
+]

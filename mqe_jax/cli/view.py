@@ -1,0 +1,36 @@
+"""The command `view`."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from mqe_jax.cli.commands import find_player
+from mqe_jax.cli.output import say
+from mqe_jax.cli.setup import make_env
+from mqe_jax.cli.view_arguments import View
+from mqe_jax.errors import InputError
+from mqe_jax.settings import fail
+
+_LOCAL = ("127.0.0.1", "localhost", "::1")
+
+
+def view(arguments: View) -> None:
+    """Shows a task in the browser until Ctrl-C."""
+    if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
+        raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
+    if not 1 <= arguments.num_envs <= 16:
+        fail("num_envs", arguments.num_envs, "between 1 and 16")
+    if not 0 < arguments.port < 65536:
+        fail("port", arguments.port, "between 1 and 65535")
+    player = find_player(arguments, "scripted")
+    env, vector_env = make_env(player.task, arguments.impl, player.overrides, arguments.num_envs)
+    act, memory = player.act(env, deterministic=not arguments.sample), player.memory(arguments.num_envs)
+
+    from mqe_jax.view.session import Session
+    from mqe_jax.view.viewer import Viewer
+
+    viewer = Viewer(Session(env, vector_env, act, memory, arguments.seed), arguments.host, arguments.port)
+    if arguments.host not in _LOCAL:
+        say(f"mqe: warning: anyone who reaches {arguments.host} can open this page and drive the robots")
+    say(f"mqe: open {viewer.url} in a browser; Ctrl-C ends")
+    viewer.run()

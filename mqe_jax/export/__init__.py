@@ -1,0 +1,1 @@
+"""Trained policies as ONNX graphs, for use without JAX."""

@@ -1,0 +1,198 @@
+"""The panel in the browser: state, buttons, keys, live plots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from mqe_jax.view.session import DRIVEN, Session
+
+# Label, direction in fractions of the largest command (vx, vy, yaw rate), key that steps the command.
+# The browser's camera takes W, A, S, D, Q, E and the arrows.
+DIRECTIONS = (
+    ("Forward", (1.0, 0.0, 0.0), "I"),
+    ("Backward", (-1.0, 0.0, 0.0), "K"),
+    ("Turn left", (0.0, 0.0, 1.0), "J"),
+    ("Turn right", (0.0, 0.0, -1.0), "L"),
+    ("Step left", (0.0, 1.0, 0.0), "U"),
+    ("Step right", (0.0, -1.0, 0.0), "O"),
+)
+KEY_STEP = 0.25
+"""Fraction of the largest command that one key press adds."""
+FREE, NOBODY = "free", "nobody"
+_COLOURS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
+_POINTS = 200
+
+
+class Panel:
+    """The viewer's controls; changes go to the session, which the loop reads.
+
+    Attributes:
+        camera: label of the followed body, or `free`.
+        env: index of the environment that plots, state and camera show, and in which a robot is driven.
+    """
+
+    def __init__(self, server: Any, session: Session, bodies: Sequence[str], on_camera: Callable[[], None]) -> None:
+        self._session, self._gui = session, server.gui
+        self._on_camera = on_camera
+        self._wanted_steps, self._wants_reset = 0, False
+        self.camera, self.env = FREE, 0
+        self._state = self._gui.add_markdown("")
+        self._add_run()
+        self._add_view(bodies)
+        if session.drivable:
+            self._add_drive()
+        self._add_plots()
+
+    def take_steps(self) -> int:
+        """Returns how many single steps were asked for since the last call."""
+        steps, self._wanted_steps = self._wanted_steps, 0
+        return steps
+
+    def take_reset(self) -> bool:
+        """Returns whether a reset was asked for since the last call."""
+        wanted, self._wants_reset = self._wants_reset, False
+        return wanted
+
+    def show(self, positions: np.ndarray, real_time: float) -> None:
+        """Shows the state: robots' positions (A, 3), m, in the chosen environment, and simulated per real time."""
+        session = self._session
+        commands = session.commands[-1][self.env] if session.commands else np.zeros((len(positions), 3))
+        rows = []
+        for agent, (x, y, z) in enumerate(positions):
+            vx, vy, turn = commands[agent]
+            driven = (
+                " (you)" if (session.drive.env, session.drive.robot) == (self.env, agent) and session.drivable else ""
+            )
+            rows.append(f"| {agent + 1}{driven} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
+        pace = "paused" if session.paused else f"{real_time:.2f} x real time"
+        reward = float(session.rewards[-1][self.env, -1]) if session.rewards else 0.0
+        self._state.content = "\n".join(
+            [
+                f"**{session.env.name}** at {session.steps * session.env.dt:.2f} s, {pace}",
+                "",
+                f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step",
+                "",
+                "| robot | x | y | z | vx | vy | turn |",
+                "|---|---|---|---|---|---|---|",
+                *rows,
+            ]
+        )
+
+    def plot(self) -> None:
+        """Shows the last seconds of the chosen environment in the plots."""
+        session = self._session
+        if len(session.times) < 2:
+            return
+        every = max(1, len(session.times) // _POINTS)
+        times = np.array(session.times)[::every]
+        rewards = np.stack(list(session.rewards)[::every])[:, self.env]
+        self._reward_plot.data = (times, *rewards.T.astype(float))
+        if self._command_plot is not None:
+            agent = session.drive.robot if session.drive.robot is not None else 0
+            commands = np.stack(list(session.commands)[::every])[:, self.env, agent]
+            self._command_plot.data = (times, *commands.T.astype(float))
+
+    # -- controls -----------------------------------------------------------------------------------------------
+
+    def _add_run(self) -> None:
+        gui, session = self._gui, self._session
+        with gui.add_folder("Run"):
+            pause = gui.add_button("Pause")
+            step = gui.add_button("One step")
+            reset = gui.add_button("Reset")
+            speed = gui.add_slider(
+                "Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Simulated per real time"
+            )
+
+        def toggle(_: Any) -> None:
+            session.paused = not session.paused
+            pause.label = "Continue" if session.paused else "Pause"
+
+        def one(_: Any) -> None:
+            self._wanted_steps += 1
+
+        def start_over(_: Any) -> None:
+            self._wants_reset = True
+
+        def pace(_: Any) -> None:
+            session.speed = float(speed.value)
+
+        speed.on_update(pace)
+        for button, key, label, action in (
+            (pause, "P", "Pause or continue", toggle),
+            (step, "N", "One step", one),
+            (reset, "R", "Reset", start_over),
+        ):
+            button.on_click(action)
+            gui.add_command(label, hotkey=key).on_trigger(action)
+            button.hint = f"Key {key}"
+
+    def _add_view(self, bodies: Sequence[str]) -> None:
+        gui, session = self._gui, self._session
+        with gui.add_folder("View"):
+            camera = gui.add_dropdown(
+                "Camera", (FREE, *bodies), initial_value=FREE, hint="Body that the camera follows"
+            )
+            numbers = tuple(str(i + 1) for i in range(session.num_envs))
+            env = gui.add_dropdown("Environment", numbers, initial_value="1", visible=session.num_envs > 1)
+
+        def follow(_: Any) -> None:
+            self.camera = str(camera.value)
+            self._on_camera()
+
+        def choose(_: Any) -> None:
+            self.env = session.drive.env = int(env.value) - 1
+
+        camera.on_update(follow)
+        env.on_update(choose)
+
+    def _add_drive(self) -> None:
+        gui, drive = self._gui, self._session.drive
+        names = tuple(f"robot {i + 1}" for i in range(self._session.env.num_agents))
+        with gui.add_folder("Drive"):
+            robot = gui.add_dropdown("Driven", (NOBODY, *names), initial_value=NOBODY, hint="Robot driven by hand")
+            keys = " ".join(key for _, _, key in DIRECTIONS)
+            gui.add_markdown(f"Hold a button to drive; each press of {keys} changes the command by a quarter, X stops.")
+            buttons = [gui.add_button(label, hint=f"Hold, or key {key}") for label, _, key in DIRECTIONS]
+            stop = gui.add_button("Stop", hint="Key X")
+
+        def choose(_: Any) -> None:
+            drive.change((0.0, 0.0, 0.0))
+            drive.robot = None if robot.value == NOBODY else names.index(str(robot.value))
+
+        def halt(_: Any) -> None:
+            drive.change((0.0, 0.0, 0.0))
+
+        robot.on_update(choose)
+        stop.on_click(halt)
+        gui.add_command("Stop", hotkey="X").on_trigger(halt)
+        for button, (label, direction, key) in zip(buttons, DIRECTIONS, strict=True):
+            vx, vy, turn = direction
+            button.on_hold(lambda _, held=direction: drive.hold(held), callback_hz=10.0)
+            step = (KEY_STEP * vx, KEY_STEP * vy, KEY_STEP * turn)
+            gui.add_command(label, hotkey=key).on_trigger(lambda _, by=step: drive.change(by))
+
+    def _add_plots(self) -> None:
+        session = self._session
+        terms = tuple(name.removeprefix("reward/") for name in session.terms)
+        with self._gui.add_folder("Reward terms"):
+            self._reward_plot = self._uplot((*terms[:-1], "sum"))
+        self._command_plot = None
+        if session.drivable:
+            with self._gui.add_folder("Commands of the driven (else the first) robot"):
+                self._command_plot = self._uplot(DRIVEN)
+
+    def _uplot(self, names: Sequence[str]) -> Any:
+        lines = [{"label": name, "stroke": _COLOURS[i % len(_COLOURS)], "width": 1.5} for i, name in enumerate(names)]
+        empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.zeros(2) for i in range(len(names) + 1))
+        return self._gui.add_uplot(
+            empty,
+            ({"label": "s"}, *lines),
+            scales={"x": {"time": False}},
+            legend={"show": True},
+            padding=(12, 16, 0, 0),
+            aspect=1.3,
+        )

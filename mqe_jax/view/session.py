@@ -1,0 +1,156 @@
+"""The simulation behind the viewer: environments under policies, one robot driven by hand. Knows no browser."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.control import COMMAND_RANGES, commands_from_action
+from mqe_jax.train.evaluate import Act
+from mqe_jax.walk_policy import command_index
+
+DRIVEN = ("vx", "vy", "yaw_rate")
+"""Commands of a robot driven by hand: m/s, m/s, rad/s."""
+HOLD_TIME = 0.35
+"""s after its last message at which a held button counts as released; the browser sends ten per second."""
+
+
+class Frame(NamedTuple):
+    """What the scene draws of N environments, and the state of their episodes."""
+
+    qpos: np.ndarray  # (N, nq)
+    mocap_pos: np.ndarray  # (N, n_mocap, 3), m
+    mocap_quat: np.ndarray  # (N, n_mocap, 4) wxyz
+
+
+@dataclass
+class Drive:
+    """The robot driven by hand: a stepped command, and what buttons add while they are held.
+
+    Attributes:
+        env: index of its environment.
+        robot: index of the agent, or None where no robot is driven.
+        command: vx, vy, yaw_rate that the keys have set (3,), m/s and rad/s.
+        clock: time in s.
+    """
+
+    env: int = 0
+    robot: int | None = None
+    command: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        self.limit = np.array([COMMAND_RANGES[name][1] for name in DRIVEN])
+        self._held: dict[tuple[float, ...], float] = {}
+
+    def change(self, step: tuple[float, float, float]) -> None:
+        """Adds fractions of the largest command to the command; zeros stop the robot."""
+        self._held.clear()
+        moved = self.command + np.asarray(step) * self.limit
+        self.command = np.clip(moved, -self.limit, self.limit) if any(step) else np.zeros(3)
+
+    def hold(self, direction: tuple[float, float, float]) -> None:
+        """Adds fractions of the largest command until `HOLD_TIME` after the last call."""
+        self._held[direction] = self.clock() + HOLD_TIME
+
+    def now(self) -> np.ndarray:
+        """Returns the present command (3,), within its limits."""
+        held = [direction for direction, until in list(self._held.items()) if until > self.clock()]
+        total = self.command + np.sum([np.zeros(3), *(np.asarray(d) * self.limit for d in held)], axis=0)
+        return np.clip(total, -self.limit, self.limit)
+
+
+class Session:
+    """N environments that step under policies, with the record of their last steps.
+
+    Attributes:
+        env: the task.
+        num_envs: N.
+        paused: whether `advance` is to be called only on request.
+        speed: simulated per real time.
+        drive: the robot driven by hand.
+        terms: names of the logged rewards: the terms, then their sum.
+        steps: environment steps so far.
+        episodes: episodes that have ended, of each environment (N,).
+    """
+
+    def __init__(self, env: Any, vector_env: Any, act: Act, memory: Any, seed: int = 0, history: float = 10.0) -> None:
+        """Makes the environments; `history` is the length of the record, s."""
+        self.env, self.num_envs = env, vector_env.num_envs
+        self.paused, self.speed, self.drive = False, 1.0, Drive()
+        self._vector_env, self._act, self._first_memory = vector_env, act, memory
+        self._key = jax.random.PRNGKey(seed)
+        self._reset = jax.jit(vector_env.reset)
+        self._step = jax.jit(self._advance)
+        self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(env.params.commands)
+        if self.drivable:
+            self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
+            self._gain = np.array([COMMAND_RANGES[name][0] for name in DRIVEN])
+        self.steps = 0
+        self.episodes = np.zeros(self.num_envs, int)
+        self.reset()
+        rewards = [name for name in self.state.metrics if name.startswith("reward/")]
+        self.terms = (*rewards, "average_step_reward")
+        length = max(2, round(history / env.dt))
+        self.times: deque[float] = deque(maxlen=length)
+        self.rewards: deque[np.ndarray] = deque(maxlen=length)  # (N, terms)
+        self.commands: deque[np.ndarray] = deque(maxlen=length)  # (N, A, 3)
+
+    def reset(self) -> None:
+        """Resets all environments."""
+        self._key, key = jax.random.split(self._key)
+        self.state = self._reset(key)
+        self.memory = self._first_memory
+
+    def advance(self) -> None:
+        """Advances all environments by one step; those whose episodes end start over."""
+        self._key, key = jax.random.split(self._key)
+        mask = np.zeros((self.num_envs, self.env.num_agents), bool)
+        driven = np.zeros(self.env.action_size, np.float32)
+        if self.drivable and self.drive.robot is not None:
+            mask[self.drive.env, self.drive.robot] = True
+            driven[self._columns] = self.drive.now() / self._gain
+        self.state, self.memory, done, rewards, commands = self._step(self.state, self.memory, key, mask, driven)
+        self.steps += 1
+        self.episodes += np.asarray(done)
+        self.times.append(self.steps * self.env.dt)
+        self.rewards.append(np.asarray(rewards))
+        self.commands.append(np.asarray(commands))
+
+    def frame(self) -> Frame:
+        """Returns what the scene draws."""
+        data = self.state.data
+        return Frame(np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat))
+
+    def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
+        env = self.env
+        action, memory = self._act(state.obs, memory, key)
+        commands = jnp.zeros((*mask.shape, len(DRIVEN)))
+        if self.drivable:
+            # The environment maps the second side's actions to the robot's frame, in which the driver's are already.
+            own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, env.action_size)))
+            action = jnp.where(mask[..., None], own, action)
+            index = np.array([command_index(name) for name in DRIVEN])
+
+            def applied(action: jax.Array) -> jax.Array:
+                action = env.unmirror_action(jnp.clip(action, -1.0, 1.0))
+                return commands_from_action(action, env.params.commands, env.controller.default_commands)[:, index]
+
+            commands = jax.vmap(applied)(action)
+        state = self._vector_env.step(state, action)
+        done = state.terminated | state.truncated
+
+        def restart(now: jax.Array, first: jax.Array) -> jax.Array:
+            return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), first, now)
+
+        memory = jax.tree.map(restart, memory, self._first_memory)
+        names = [name for name in state.metrics if name.startswith("reward/")]
+        rewards = jnp.stack([state.metrics[name] for name in (*names, "average_step_reward")], axis=-1)
+        return state, memory, done, rewards, commands

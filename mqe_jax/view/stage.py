@@ -1,0 +1,185 @@
+"""The 3-D scene in the browser: environments side by side, one batch of meshes per shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import trimesh
+from mjviser.conversions import is_fixed_body, merge_geoms
+
+from mqe_jax.view.session import Frame
+from mqe_jax.viz.geometry import COLLISION_GROUP, drawn_model, extent, pose
+from mqe_jax.viz.recording import Episode
+
+_GAP = 0.6  # m between environments
+_FLOOR = (0.69, 0.69, 0.77)
+_PLANES = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Bodies that share one mesh, in all environments: N x len(bodies) instances."""
+
+    handle: Any
+    bodies: np.ndarray
+
+
+class Stage:
+    """Draws frames of N environments below one movable root, which keeps a followed body in place.
+
+    Attributes:
+        bodies: ids of the bodies that a camera can follow, by label.
+    """
+
+    def __init__(self, server: Any, env: Any, frame: Frame) -> None:
+        self._server, self._model = server, env.mj_model
+        self._data = mujoco.MjData(self._model)
+        self._count = len(frame.qpos)
+        first = _episode(frame, 0, env.dt)
+        low, high = extent(drawn_model(self._model, first), first)
+        self.centre, self.size = (low + high) / 2, high - low
+        shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
+        self._offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
+        self._dt, self._mocap = env.dt, None
+        self.bodies = followable(self._model)
+        self._root = server.scene.add_frame("/world", show_axes=False)
+        self._add_floor(low, high)
+        self._fixed, self._moving, self._walls = _sort_geoms(self._model)
+        self._add_fixed()
+        self._batches = [self._add_batch(index, bodies) for index, bodies in enumerate(self._grouped())]
+        self._wall_handles = [self._add_wall(geom) for geom in self._walls]
+        self.draw(frame)
+
+    def draw(self, frame: Frame, followed: tuple[int, int] | None = None) -> None:
+        """Draws a frame; `followed` (environment, body) is kept at the origin of the view."""
+        positions = np.zeros((self._count, self._model.nbody, 3))
+        turns = np.zeros((self._count, self._model.nbody, 4))
+        for i in range(self._count):
+            pose(self._model, self._data, _episode(frame, i, self._dt), 0)
+            positions[i], turns[i] = self._data.xpos + self._offset[i], self._data.xquat
+        with self._server.atomic():
+            if followed is not None:
+                x, y, _ = positions[followed]
+                self._root.position = (-x, -y, 0.0)
+            for batch in self._batches:
+                batch.handle.batched_positions = positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
+                batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
+            self._draw_walls(frame)
+
+    def release(self) -> None:
+        """Puts the scene back where it was before a body was followed."""
+        self._root.position = (0.0, 0.0, 0.0)
+
+    def _draw_walls(self, frame: Frame) -> None:
+        """Draws the sampled walls where they have moved, each ending at the side walls of its track."""
+        if not self._walls or (self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)):
+            return
+        self._mocap = frame.mocap_pos.copy()
+        boxes = [_wall_boxes(self._model, _episode(frame, i, self._dt), self._walls) for i in range(self._count)]
+        for index, handle in enumerate(self._wall_handles):
+            centre, turn, size = (np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3))
+            handle.batched_positions = centre + self._offset.astype(np.float32)
+            handle.batched_wxyzs, handle.batched_scales = turn, size
+
+    def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
+        side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self._offset[-1, 1]) + 4.0]
+        middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
+        colour = tuple(round(255 * c) for c in _FLOOR)
+        self._server.scene.add_box(
+            "/world/floor", color=colour, dimensions=(*side, 0.02), position=(*middle, -0.012), cast_shadow=False
+        )
+
+    def _add_fixed(self) -> None:
+        mujoco.mj_kinematics(self._model, self._data)
+        for body, geoms in self._fixed.items():
+            self._server.scene.add_batched_meshes_trimesh(
+                f"/world/fixed/{body}",
+                merge_geoms(self._model, geoms),
+                batched_wxyzs=np.tile(self._data.xquat[body], (self._count, 1)),
+                batched_positions=self._offset + self._data.xpos[body],
+                lod="off",
+            )
+
+    def _grouped(self) -> list[list[int]]:
+        """Returns the moving bodies, those with the same mesh together."""
+        groups: dict[bytes, list[int]] = {}
+        for body, geoms in self._moving.items():
+            mesh = merge_geoms(self._model, geoms)
+            look = np.round(mesh.vertices, 5).tobytes() + bytes(mesh.visual.vertex_colors)  # type: ignore[attr-defined]
+            groups.setdefault(look, []).append(body)
+        return list(groups.values())
+
+    def _add_batch(self, index: int, bodies: list[int]) -> _Batch:
+        count = self._count * len(bodies)
+        handle = self._server.scene.add_batched_meshes_trimesh(
+            f"/world/moving/{index}",
+            merge_geoms(self._model, self._moving[bodies[0]]),
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            batched_positions=np.zeros((count, 3)),
+            lod="off",
+        )
+        return _Batch(handle, np.array(bodies))
+
+    def _add_wall(self, geom: int) -> Any:
+        box = trimesh.creation.box((2.0, 2.0, 2.0))
+        return self._server.scene.add_batched_meshes_simple(
+            f"/world/walls/{geom}",
+            np.asarray(box.vertices),
+            np.asarray(box.faces),
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (self._count, 1)),
+            batched_positions=np.zeros((self._count, 3)),
+            batched_scales=np.ones((self._count, 3), np.float32),
+            batched_colors=tuple(int(255 * c) for c in self._model.geom_rgba[geom, :3]),
+            lod="off",
+            flat_shading=True,
+        )
+
+
+def followable(model: mujoco.MjModel) -> dict[str, int]:
+    """Returns the bodies that a camera can follow: robots and movable objects, by label."""
+    labels = {}
+    for joint in range(model.njnt):
+        body = int(model.jnt_bodyid[joint])
+        if int(model.body_rootid[body]) == body:
+            kind, _, name = model.body(body).name.partition("/")
+            labels[f"robot {int(kind[5:]) + 1}" if kind.startswith("robot") else name or kind] = body
+    return labels
+
+
+def _episode(frame: Frame, index: int, dt: float) -> Episode:
+    """Returns environment `index` of a frame as an episode of one frame."""
+    return Episode(frame.qpos[index][None], frame.mocap_pos[index][None], frame.mocap_quat[index][None], dt)
+
+
+def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, list[int]], list[int]]:
+    """Returns the visible geoms of fixed and of moving bodies, by body, and the boxes of mocap bodies."""
+    fixed: dict[int, list[int]] = {}
+    moving: dict[int, list[int]] = {}
+    walls = []
+    for geom in range(model.ngeom):
+        body = int(model.geom_bodyid[geom])
+        if int(model.geom_group[geom]) == COLLISION_GROUP or int(model.geom_type[geom]) in _PLANES:
+            continue
+        if model.geom_rgba[geom, 3] == 0:
+            continue
+        if model.body_mocapid[body] >= 0 and int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_BOX):
+            walls.append(geom)
+        elif is_fixed_body(model, body):
+            fixed.setdefault(body, []).append(geom)
+        else:
+            moving.setdefault(body, []).append(geom)
+    return fixed, moving, walls
+
+
+def _wall_boxes(model: mujoco.MjModel, episode: Episode, geoms: list[int]) -> tuple[np.ndarray, ...]:
+    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, cut at the side walls."""
+    drawn = drawn_model(model, episode)
+    data = mujoco.MjData(drawn)
+    pose(drawn, data, episode, 0)
+    turns = np.zeros((len(geoms), 4))
+    for row, geom in enumerate(geoms):
+        mujoco.mju_mat2Quat(turns[row], data.geom_xmat[geom])
+    return data.geom_xpos[geoms].copy(), turns, drawn.geom_size[geoms].copy()

@@ -1,0 +1,117 @@
+"""The viewer: a server on this machine, and the loop that steps, draws and keeps time."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+import time
+
+import numpy as np
+import viser
+
+from mqe_jax.view.panel import FREE, Panel
+from mqe_jax.view.session import Session
+from mqe_jax.view.stage import Stage
+
+DRAW_RATE = 25.0
+PANEL_RATE = 5.0
+"""Frames per second of the scene, and of state and plots."""
+_FIELD_OF_VIEW = 0.87  # rad, vertical
+_BEHIND = 0.25  # s of delay that the loop gives up catching up with
+
+
+class Viewer:
+    """Shows a session in the browser.
+
+    Attributes:
+        session: the simulation.
+        server: the server; nothing but `host` reaches it.
+        url: address of the page.
+    """
+
+    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.session = session
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its addresses in a frame
+            self.server = viser.ViserServer(host=host, port=port, label=f"mqe view {session.env.name}", verbose=False)
+        self.url = f"http://{self.server.get_host()}:{self.server.get_port()}"
+        self.server.gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False)
+        self._stage = Stage(self.server, session.env, session.frame())
+        self._panel = Panel(self.server, session, tuple(self._stage.bodies), self._aim)
+        camera = self.server.initial_camera
+        camera.position, camera.look_at = self._view()
+        camera.fov = _FIELD_OF_VIEW
+        self._real_time = 0.0
+
+    def run(self, stop: threading.Event | None = None) -> None:
+        """Steps and draws in the session's pace until `stop` is set, or Ctrl-C; then closes the server."""
+        stop = stop or threading.Event()
+        dt = self.session.env.dt
+        due = drawn = shown = time.monotonic()
+        self.session.advance()  # compiles the step
+        due, counted = time.monotonic(), self.session.steps
+        try:
+            while not stop.is_set():
+                now = time.monotonic()
+                stepped = self._step_if_due(now, due)
+                if stepped:
+                    due = max(due + dt / self.session.speed, now - _BEHIND)
+                elif self.session.paused:
+                    due = now
+                now = time.monotonic()
+                if now - drawn >= 1 / DRAW_RATE:
+                    drawn = now
+                    self._stage.draw(self.session.frame(), self._followed())
+                if now - shown >= 1 / PANEL_RATE:
+                    self._real_time = (self.session.steps - counted) * dt / (now - shown)
+                    shown, counted = now, self.session.steps
+                    self._panel.show(self._positions(), self._real_time)
+                    self._panel.plot()
+                if not stepped:
+                    time.sleep(max(0.001, min(due - now, 0.01)))
+        finally:
+            self.server.stop()
+
+    def _step_if_due(self, now: float, due: float) -> bool:
+        """Resets and steps as asked, and where the next step is due; returns whether it was a step of the pace."""
+        if self._panel.take_reset():
+            self.session.reset()
+        for _ in range(self._panel.take_steps()):
+            self.session.advance()
+        if self.session.paused or now < due:
+            return False
+        self.session.advance()
+        return True
+
+    def _positions(self) -> np.ndarray:
+        """Returns the agents' positions (A, 3), m, in the chosen environment."""
+        qpos = self.session.frame().qpos[self._panel.env]
+        return np.stack([qpos[index[:3]] for index in self._bases()])
+
+    def _bases(self) -> np.ndarray:
+        model = self.session.env.mj_model
+        robots = [body for label, body in self._stage.bodies.items() if label.startswith("robot ")]
+        start = model.jnt_qposadr[model.body_jntadr[robots[: self.session.env.num_agents]]]
+        return start[:, None] + np.arange(7)
+
+    def _followed(self) -> tuple[int, int] | None:
+        if self._panel.camera == FREE:
+            return None
+        return self._panel.env, self._stage.bodies[self._panel.camera]
+
+    def _view(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns camera position and the point looked at (3,), m: the whole scene, or closely the followed body."""
+        if self._followed() is not None:
+            centre, distance = np.array([0.0, 0.0, 0.2]), 3.0
+        else:
+            centre = self._stage.centre * [1.0, 0.0, 0.0]
+            distance = 1.4 * float(np.hypot(self._stage.size[0], self._stage.size[1] * self.session.num_envs))
+        return centre + distance * np.array([-0.62, -0.28, 0.73]), centre
+
+    def _aim(self) -> None:
+        """Points the cameras of all pages anew, after another body was chosen."""
+        if self._followed() is None:
+            self._stage.release()
+        position, look_at = self._view()
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = position, look_at

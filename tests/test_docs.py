@@ -1,0 +1,133 @@
+"""The documentation: its site is built without a warning, its code runs, its commands are ones that exist."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mqe_jax.cli.arguments import parse
+from mqe_jax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+
+# Blocks that are not run, by page and first line, with the reason.
+NOT_RUN = {
+    ("docs/evaluation.md", "import jax"): "needs the folder of a training",
+}
+# First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
+SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The fenced blocks of a language on a page."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def run_blocks(page: str) -> list[str]:
+    """The Python blocks of a page but the exceptions."""
+    return [block for block in blocks(page, "python") if (page, block.splitlines()[0]) not in NOT_RUN]
+
+
+@pytest.mark.parametrize("page", [name for name in NAMES if run_blocks(name)])
+def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Blocks of one page run in order in one namespace, as a reader types them."""
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    for block in run_blocks(page):
+        exec(compile(block, page, "exec"), namespace)
+
+
+def commands(page: str) -> list[list[str]]:
+    """The words of every line of the shell blocks of a page, without comments."""
+    lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
+    found = [shlex.split(line, comments=True) for line in lines]
+    return [words for words in found if words]
+
+
+@pytest.mark.parametrize("page", [name for name in NAMES if commands(name)])
+def test_shell_blocks_are_commands_that_exist(page: str) -> None:
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    for words in commands(page):
+        while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
+            words = words[1:]
+        if words[0] in ("|", ">"):
+            continue
+        program = words[0].rsplit("/", 1)[-1]
+        if program == "mqe":
+            end = next((i for i, word in enumerate(words) if word in ("|", "&&", ">", "&")), len(words))
+            assert parse(words[1:end]), words
+        elif program == "make":
+            assert words[1] in targets, words
+        elif program == "python" and words[1].endswith(".py"):
+            assert (ROOT / words[1]).is_file(), words
+        else:
+            assert program in SHELL, words
+
+
+def test_a_wrong_command_would_be_found() -> None:
+    for wrong in (["trian", "go1gate"], ["train", "go1gate", "--confg", "demo"], ["view"]):
+        with pytest.raises(InputError):
+            parse(wrong)
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    """Every task has a page with its picture, observation and rewards; formulas and links need no other host."""
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocstrings")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1", "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert built.returncode == 0, built.stderr[-3000:]
+    assert "WARNING" not in built.stderr
+    from mqe_jax.envs import TASKS, make
+
+    overview = (tmp_path / "tasks" / "index.html").read_text(encoding="utf-8")
+    for name in TASKS:
+        page = (tmp_path / "tasks" / f"{name}.html").read_text(encoding="utf-8")
+        env = make(name, impl="c", num_envs=1)
+        for block in env.observation_layout.blocks:
+            assert f"<code>{block.name}</code>" in page
+        for term in vars(env.params.rewards):
+            assert f"<code>{term}</code>" in page
+        assert f'src="../{name}.png"' in page
+        assert f'src="../{name}.png"' in overview
+    assert "<math" in (tmp_path / "algorithms.html").read_text(encoding="utf-8")
+    reference = (tmp_path / "reference" / "base.html").read_text(encoding="utf-8")
+    assert "final_obs" in reference and "Advances one environment" in reference
+
+
+def test_tables_of_tasks_say_what_the_docstrings_say() -> None:
+    pytest.importorskip("mkdocs")
+    import docs_pages
+
+    from mqe_jax.envs.gate import Go1Gate
+
+    page = docs_pages.task_page(Go1Gate)
+    assert "| `collision` | -2 | in steps with any trunk contact. |" in page
+    assert "| `gate` | 2 | centre of the gap, m |" in page
+    assert "| `gate_width` | 0.6 | of the gap, m. |" in page
+    assert "| `robot` | `go1` | name of the robot" in page
+
+
+def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:
+    pytest.importorskip("mkdocs")
+    import docs_pages
+
+    assert docs_pages.links("[the task](../mqe_jax/npc.py), [b](b.md)") == "the task (`mqe_jax/npc.py`), [b](b.md)"
+    assert docs_pages.links("[mqe_jax/npc.py](../mqe_jax/npc.py)") == "mqe_jax/npc.py"
+    assert docs_pages.links("[![a](../a.png)](a.md)") == "[![a](../a.png)](a.md)"
+    assert docs_pages.formulas("`$HOME` and $x^2$").startswith("`$HOME` and <math")

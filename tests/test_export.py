@@ -1,0 +1,124 @@
+"""Exported graphs: the same numbers in onnxruntime as in JAX, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import cli, load_policy, make
+from mqe_jax.errors import InputError
+from mqe_jax.settings import build
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.normalize import RunningStatistics
+from mqe_jax.train.policy import Policy, save_policy
+
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+
+from mqe_jax.export.check import largest_error, reference  # noqa: E402
+from mqe_jax.export.policy import shapes, to_onnx  # noqa: E402
+
+GATE = Path(__file__).parents[1] / "results" / "gate" / "seed0"
+WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
+
+
+def new_policy(env: Any, control: str = "command", **network: Any) -> Policy:
+    """A policy with random weights, statistics and action layer, large enough to saturate some actions."""
+    settings = {"task": env.name, "env": {"control": control}, "action_scale": 0.5, "network": network}
+    config = build(TrainConfig, settings)
+    dims = EnvDims(env.num_agents, env.observation_size, 0, env.action_size, env.teams, env.num_agents)
+    net = config.network.build(dims)
+    keys = jax.random.split(jax.random.PRNGKey(3), 3)
+    params = jax.tree.map(lambda x: x + 0.1, net.acting(jax.jit(net.init)(keys[0])))
+    mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
+    return Policy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), dims, config, {})
+
+
+def test_a_trained_run_is_exported_with_its_walk_policy(tmp_path: Path, capsys: Any) -> None:
+    file = tmp_path / "gate.onnx"
+    assert cli.main(["export", str(GATE), "--onnx", str(file)]) == 0
+    assert "joint_target" in capsys.readouterr().out
+    model = onnx.load(file)
+    sizes = shapes(model)
+    assert sizes["inputs"]["obs"] == ["N", 2, 16] and sizes["outputs"]["joint_target"] == ["N", 2, 12]
+    memory = sorted(name for name in sizes["inputs"] if name.startswith("walk_"))
+    assert memory == WALK_MEMORY
+    assert all(sizes["outputs"][f"next_{name}"] == sizes["inputs"][name] for name in memory)
+    properties = {entry.key: entry.value for entry in model.metadata_props}
+    assert (properties["task"], properties["control"], properties["period_s"]) == ("go1gate", "command", "0.02")
+    assert file.stat().st_size < 5e6
+
+
+def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() -> None:
+    """Joint targets in onnxruntime, from sensor readings, are those that the environment gives its motors."""
+    env = make("go1gate", impl="c", num_envs=1)
+    policy = load_policy(GATE)
+    session = onnxruntime.InferenceSession(to_onnx(policy, env).SerializeToString())
+    sizes = {i.name: i.shape[1:] for i in session.get_inputs()}
+    memory = {name: np.zeros((1, *sizes[name]), np.float32) for name in WALK_MEMORY}
+    state, step = jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.jit(env.step)
+    now = env.read(state.data)
+    for _ in range(20):
+        now = env.read(state.data)
+        sensed = {
+            "obs": state.obs,
+            "gravity": now.projected_gravity,
+            "joint_position": now.joint_position,
+            "joint_velocity": now.joint_velocity,
+        }
+        inputs = {name: np.asarray(value, np.float32)[None] for name, value in sensed.items()}
+        names = [output.name for output in session.get_outputs()]
+        found = dict(zip(names, session.run(names, {**inputs, **memory}), strict=True))
+        memory = {name: found[f"next_{name}"] for name in memory}
+        action, _ = policy.act(state.obs, (), deterministic=True)
+        np.testing.assert_allclose(found["action"][0], action, atol=1e-5)
+        state = step(state, action)
+        target = np.asarray(state.data.ctrl)[env.index.actuator]
+        np.testing.assert_allclose(found["joint_target"][0], target, atol=1e-4)
+    assert float(now.position_w[:, 0].max()) > 1.05  # they walked
+
+
+@pytest.mark.parametrize(
+    ("task", "control", "network"),
+    [
+        ("go1revolvingdoor", "command", {"recurrent": True, "share_policy": False, "action_mean": "tanh"}),
+        ("go1revolvingdoor", "position", {"recurrent": False, "activation": "elu", "hidden_sizes": [32, 16]}),
+        ("go1gate", "torque", {"recurrent": True, "activation": "tanh", "gru_size": 24}),
+    ],
+)
+def test_networks_memories_controls_and_mirrored_teams_agree(task: str, control: str, network: dict[str, Any]) -> None:
+    env = make(task, impl="c", control=control, num_envs=1)
+    policy = new_policy(env, control, **network, critic_input="observations")
+    assert largest_error(to_onnx(policy, env), policy, env, steps=3) < 2e-5
+
+
+def test_a_mirrored_team_gets_mirrored_commands() -> None:
+    """The reference of the comparison is the environment's own rule: y and yaw change sign for team 1."""
+    env = make("go1revolvingdoor", impl="c", num_envs=1)
+    policy = new_policy(env, recurrent=False, critic_input="observations")
+    sizes = shapes(to_onnx(policy, env))["inputs"]
+    inputs = {name: np.zeros((1, *shape[1:]), np.float32) for name, shape in sizes.items()}
+    outputs = jax.jit(lambda inputs: reference(policy, env, inputs))(inputs)
+    assert np.array_equal(outputs["action"][0, 0], outputs["action"][0, 1]) and np.all(outputs["action"] != 0.0)
+    ours, theirs = np.asarray(outputs["commands"])[0, :, :3]
+    np.testing.assert_allclose(theirs, ours * [1.0, -1.0, -1.0], atol=1e-6)
+
+
+def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: Any) -> None:
+    env = make("go1gate", impl="c", num_envs=1)
+    save_policy(tmp_path, new_policy(env, name="mat"))
+    for arguments, words in (
+        ([str(tmp_path), "--onnx", str(tmp_path / "a.onnx")], ("network", "'mat'", "actor_critic")),
+        ([str(GATE), "--onnx", str(tmp_path / "a.txt")], ("onnx", "a.txt", ".onnx")),
+        ([str(tmp_path / "none"), "--onnx", str(tmp_path / "a.onnx")], ("none",)),
+    ):
+        assert cli.main(["export", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and all(word in said for word in words), said
+    policy = new_policy(env, recurrent=False, critic_input="observations")
+    with pytest.raises(InputError, match="trained for"):
+        to_onnx(policy, make("go1tug", impl="c", num_envs=1))

@@ -1,0 +1,188 @@
+"""Pages of the documentation that are generated from the code, and repairs of links and formulas: hooks of MkDocs.
+
+Generated: one page for each task (picture, clip, sizes, observation, rewards, parameters) with their overview, and the
+API reference. Links to files outside docs/ become their paths, and LaTeX becomes MathML, so that the built site needs
+neither the repository nor another host.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import latex2mathml.converter
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+# Module of each page of the reference, and the names shown (all public ones where empty).
+REFERENCE = {
+    "environments": ("mqe_jax.envs", ("make", "tasks", "register_task")),
+    "base": ("mqe_jax.envs.base", ("State", "QuadrupedEnv")),
+    "vector": ("mqe_jax.envs.autoreset", ()),
+    "parameters": ("mqe_jax.envs.params", ("TaskParams",)),
+    "randomization": ("mqe_jax.envs.randomization", ("Randomization",)),
+    "observations": ("mqe_jax.envs.observation", ()),
+    "rewards": ("mqe_jax.envs.reward", ()),
+    "matches": ("mqe_jax.envs.match", ("Match",)),
+    "scenes": ("mqe_jax.scene", ("Scene",)),
+    "terrain": ("mqe_jax.terrain", ()),
+    "objects": ("mqe_jax.objects", ()),
+    "robots": ("mqe_jax.robots.robot", ("Robot",)),
+    "walk_policy": ("mqe_jax.walk_policy", ()),
+    "planners": ("mqe_jax.planners", ()),
+    "training_settings": ("mqe_jax.train.config", ()),
+    "networks": ("mqe_jax.train.networks", ()),
+    "policies": ("mqe_jax.train.policy", ("Policy", "load_policy", "save_policy")),
+    "evaluation": ("mqe_jax.train.evaluate", ("EvalResult", "evaluate")),
+    "rendering": ("mqe_jax.viz.render", ()),
+    "recording": ("mqe_jax.viz.recording", ()),
+    "export": ("mqe_jax.export.policy", ()),
+}
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Adds the generated pages."""
+    for path, content in pages().items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Repairs links and formulas of a page."""
+    return formulas(links(markdown))
+
+
+def links(markdown: str) -> str:
+    """Replaces links to files of the repository outside docs/ by their names and paths."""
+
+    def plain(match: re.Match[str]) -> str:
+        text, path = match.groups()
+        return text if path.rstrip("/").endswith(text.replace("\\", "")) else f"{text} (`{path}`)"
+
+    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", plain, markdown)
+
+
+def formulas(markdown: str) -> str:
+    """Replaces $$...$$ and $...$ outside of code by MathML."""
+
+    def block(match: re.Match[str]) -> str:
+        return "\n" + latex2mathml.converter.convert(match.group(1).replace("\n", " "), display="block") + "\n"
+
+    def inline(match: re.Match[str]) -> str:
+        return latex2mathml.converter.convert(match.group(1))
+
+    parts = re.split(r"(```.*?```|`[^`\n]*`)", markdown, flags=re.DOTALL)
+    for index in range(0, len(parts), 2):
+        text = re.sub(r"\$\$(.+?)\$\$", block, parts[index], flags=re.DOTALL)
+        parts[index] = re.sub(r"\$([^$\n]+?)\$", inline, text)
+    return "".join(parts)
+
+
+def pages() -> dict[str, str]:
+    """Returns the generated pages by path."""
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note about a missing warp-lang
+        from mqe_jax.envs import TASKS
+    made = {f"tasks/{name}.md": task_page(task) for name, task in TASKS.items()}
+    made["tasks/index.md"] = overview(TASKS)
+    for name, (module, members) in REFERENCE.items():
+        made[f"reference/{name}.md"] = reference_page(module, members)
+    return made
+
+
+def reference_page(module: str, members: tuple[str, ...]) -> str:
+    """Returns the page of a module, which mkdocstrings fills."""
+    if not members:
+        return f"# {module}\n\n::: {module}\n"
+    return f"# {module}\n\n" + "\n".join(f"::: {module}.{name}\n" for name in members)
+
+
+def overview(tasks: Mapping[str, Any]) -> str:
+    """Returns the page that lists all tasks."""
+    kinds: dict[str, list[str]] = {"Collaborative": [], "Competitive": [], "For tests": []}
+    for name, task in tasks.items():
+        env = _make(task)
+        kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Collaborative"
+        style = '{ style="min-width: 9em" }'
+        image = f"[![{task.title}]({_image(name)}){style}]({name}.md)" if _image(name) else ""
+        sizes = f"{env.num_agents} | {env.observation_size} | {env.privileged_observation_size}"
+        limit = f"{env.params.episode_length:g}"
+        kinds[kind].append(f"| [`{name}`]({name}.md) | {task.title} | {sizes} | {limit} | {image} |")
+    columns = "| id | name | agents | observation | privileged | time limit, s | |\n|---|---|---|---|---|---|---|"
+    parts = [f"## {kind}\n\n{columns}\n" + "\n".join(rows) for kind, rows in kinds.items()]
+    head = "# Tasks\n\nSizes, rewards and parameters on these pages are read from the code."
+    return "\n\n".join([head, *parts]) + "\n"
+
+
+def task_page(task: Any) -> str:
+    """Returns the page of a task."""
+    env, name = _make(task), task.name
+    body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
+    media = [f"![{task.title}]({_image(name)})"] if _image(name) else []
+    if (DOCS / "clips" / f"{name}.gif").is_file():
+        media.append(f"The scripted policy (`mqe render {name}`):\n\n![clip](../clips/{name}.gif)")
+    facts = [
+        f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
+        "- action per agent: command 3 (velocities for the walk policy), position 12, torque 12",
+        f"- observation {env.observation_size} per agent, privileged observation {env.privileged_observation_size}",
+        f"- time limit {env.params.episode_length:g} s, {env.max_steps} steps of {env.dt:g} s",
+    ]
+    rows = [f"| `{b.name}` | {b.width} | {b.meaning or ''} |" for b in env.observation_layout.blocks]
+    sections = [
+        f"# {task.title} (`{name}`)",
+        *media,
+        body,
+        "\n".join(facts),
+        "## Observation of an agent\n\n| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
+        "## Reward terms\n\n" + _fields(type(env.params.rewards), "weight"),
+        "A weight is set by `--set rewards.NAME=VALUE`, or `make(task, rewards={...})`.",
+        "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _make(task: Any) -> Any:
+    return task(num_envs=1, impl="c")
+
+
+def _image(name: str) -> str | None:
+    return f"../{name}.png" if (DOCS / f"{name}.png").is_file() else None
+
+
+def _fields(record: type[Any], column: str, skip: tuple[str, ...] = ()) -> str:
+    """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give."""
+    meanings: dict[str, str] = {}
+    for cls in reversed(record.__mro__):
+        meanings |= attributes(cls.__doc__ or "")
+    own = list(attributes(record.__doc__ or ""))
+    values = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
+    rows = []
+    for name in sorted(values, key=lambda name: own.index(name) if name in own else len(own)):
+        meaning = meanings.get(name, "").replace("|", "\\|")
+        rows.append(f"| `{name}` | {_shown(values[name])} | {meaning} |")
+    return f"| name | {column} | meaning |\n|---|---|---|\n" + "\n".join(rows)
+
+
+def _shown(value: Any) -> str:
+    if value is dataclasses.MISSING:
+        return ""
+    return f"{value:g}" if isinstance(value, float) else f"`{value}`"
+
+
+def attributes(docstring: str) -> dict[str, str]:
+    """Returns the entries of a docstring's section `Attributes:` by name."""
+    section = re.search(r"Attributes:\n(.*?)(?:\n\s*\n|\Z)", inspect.cleandoc(docstring), re.DOTALL)
+    entries: dict[str, str] = {}
+    for line in section.group(1).splitlines() if section else []:
+        if match := re.match(r"    (\w+): (.*)", line):
+            entries[match.group(1)] = match.group(2)
+        elif entries:
+            entries[next(reversed(entries))] += " " + line.strip()
+    return entries
