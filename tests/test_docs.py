@@ -117,7 +117,7 @@ def test_tables_of_tasks_say_what_the_docstrings_say() -> None:
     from mqe_jax.envs.gate import Go1Gate
 
     page = docs_pages.task_page(Go1Gate)
-    assert "| `collision` | -2 | in steps with any trunk contact. |" in page
+    assert "| `collision` | -2 | Paid in steps with any trunk contact. |" in page
     assert "| `gate` | 2 | centre of the gap, m |" in page
     assert "| `gate_width` | 0.6 | of the gap, m. |" in page
     assert "| `robot` | `go1` | name of the robot" in page

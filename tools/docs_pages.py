@@ -7,11 +7,14 @@ neither the repository nor another host.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import inspect
 import io
+import itertools
 import re
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -160,8 +163,8 @@ def _fields(record: type[Any], column: str, skip: tuple[str, ...] = ()) -> str:
     """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give."""
     meanings: dict[str, str] = {}
     for cls in reversed(record.__mro__):
-        meanings |= attributes(cls.__doc__ or "")
-    own = list(attributes(record.__doc__ or ""))
+        meanings |= attributes(cls)
+    own = list(attributes(record))
     values = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
     rows = []
     for name in sorted(values, key=lambda name: own.index(name) if name in own else len(own)):
@@ -176,13 +179,16 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else f"`{value}`"
 
 
-def attributes(docstring: str) -> dict[str, str]:
-    """Returns the entries of a docstring's section `Attributes:` by name."""
-    section = re.search(r"Attributes:\n(.*?)(?:\n\s*\n|\Z)", inspect.cleandoc(docstring), re.DOTALL)
+def attributes(cls: type[Any]) -> dict[str, str]:
+    """Returns the docstrings under a class's own fields by name."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+    except (OSError, TypeError):  # a class without source, such as object
+        return {}
     entries: dict[str, str] = {}
-    for line in section.group(1).splitlines() if section else []:
-        if match := re.match(r"    (\w+): (.*)", line):
-            entries[match.group(1)] = match.group(2)
-        elif entries:
-            entries[next(reversed(entries))] += " " + line.strip()
+    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    for field, text in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
+            if isinstance(text.value, ast.Constant) and isinstance(text.value.value, str):
+                entries[field.target.id] = " ".join(text.value.value.split())
     return entries

@@ -37,11 +37,12 @@ class Env(BraxEnv):
     rules end the episode. The time limit is left to Brax's EpisodeWrapper, which otherwise took it for a termination:
     pass it `episode_length`. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is
     the observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's own state.
-
-    Attributes:
-        env: the task.
-        episode_length: time limit, environment steps.
     """
+
+    env: QuadrupedEnv
+    """The task."""
+    episode_length: int
+    """Time limit, environment steps."""
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
         """Makes the environment of a task, from its id or given; `overrides` are those of `mqe_jax.make`."""

@@ -50,12 +50,14 @@ class HostEnvs:
 
     A reset without a seed continues the environment's own random numbers, so that it gives the same episode as an
     automatic reset.
-
-    Attributes:
-        env: the task.
-        num_envs: N.
-        state: the environments' states; None before the first reset.
     """
+
+    env: QuadrupedEnv
+    """The task."""
+    num_envs: int
+    """N."""
+    state: State | None
+    """The environments' states; None before the first reset."""
 
     def __init__(self, env: QuadrupedEnv, num_envs: int) -> None:
         if num_envs < 1:

@@ -28,10 +28,10 @@ class Env(MultiAgentEnv):
 
     Infos have one value per agent (A,), the shape that JaxMARL's baselines expect: `truncation`, and the metrics. Dones
     are true for terminations and truncations alike.
-
-    Attributes:
-        env: the task.
     """
+
+    env: QuadrupedEnv
+    """The task."""
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
         """Makes the environment of a task, from its id or given; `overrides` are those of `mqe_jax.make`."""

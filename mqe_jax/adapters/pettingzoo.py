@@ -40,11 +40,12 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     """One environment as a parallel environment; all agents end together.
 
     A copy or pickle is a new environment with the same settings, as vectorisers such as SuperSuit make them.
-
-    Attributes:
-        teams: agents of each team.
-        state_space: of `state()`.
     """
+
+    teams: Any
+    """Agents of each team."""
+    state_space: Any
+    """Of `state()`."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "mqe",

@@ -27,12 +27,12 @@ _POINTS = 200
 
 
 class Panel:
-    """The viewer's controls; changes go to the session, which the loop reads.
+    """The viewer's controls; changes go to the session, which the loop reads."""
 
-    Attributes:
-        camera: label of the followed body, or `free`.
-        env: index of the environment that plots, state and camera show, and in which a robot is driven.
-    """
+    camera: str
+    """Label of the followed body, or `free`."""
+    env: int
+    """Index of the environment that plots, state and camera show, and in which a robot is driven."""
 
     def __init__(self, server: Any, session: Session, bodies: Sequence[str], on_camera: Callable[[], None]) -> None:
         self._session, self._gui = session, server.gui

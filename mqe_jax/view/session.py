@@ -32,19 +32,16 @@ class Frame(NamedTuple):
 
 @dataclass
 class Drive:
-    """The robot driven by hand: a stepped command, and what buttons add while they are held.
-
-    Attributes:
-        env: index of its environment.
-        robot: index of the agent, or None where no robot is driven.
-        command: vx, vy, yaw_rate that the keys have set (3,), m/s and rad/s.
-        clock: time in s.
-    """
+    """The robot driven by hand: a stepped command, and what buttons add while they are held."""
 
     env: int = 0
+    """Index of its environment."""
     robot: int | None = None
+    """Index of the agent, or None where no robot is driven."""
     command: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """Vx, vy, yaw_rate that the keys have set (3,), m/s and rad/s."""
     clock: Callable[[], float] = time.monotonic
+    """Time in s."""
 
     def __post_init__(self) -> None:
         self.limit = np.array([COMMAND_RANGES[name][1] for name in DRIVEN])
@@ -68,18 +65,24 @@ class Drive:
 
 
 class Session:
-    """N environments that step under policies, with the record of their last steps.
+    """N environments that step under policies, with the record of their last steps."""
 
-    Attributes:
-        env: the task.
-        num_envs: N.
-        paused: whether `advance` is to be called only on request.
-        speed: simulated per real time.
-        drive: the robot driven by hand.
-        terms: names of the logged rewards: the terms, then their sum.
-        steps: environment steps so far.
-        episodes: episodes that have ended, of each environment (N,).
-    """
+    env: Any
+    """The task."""
+    num_envs: int
+    """N."""
+    paused: bool
+    """Whether `advance` is to be called only on request."""
+    speed: float
+    """Simulated per real time."""
+    drive: Drive
+    """The robot driven by hand."""
+    terms: tuple[str, ...]
+    """Names of the logged rewards: the terms, then their sum."""
+    steps: int
+    """Environment steps so far."""
+    episodes: np.ndarray
+    """Episodes that have ended, of each environment (N,)."""
 
     def __init__(self, env: Any, vector_env: Any, act: Act, memory: Any, seed: int = 0, history: float = 10.0) -> None:
         """Makes the environments; `history` is the length of the record, s."""

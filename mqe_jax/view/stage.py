@@ -28,11 +28,10 @@ class _Batch:
 
 
 class Stage:
-    """Draws frames of N environments below one movable root, which keeps a followed body in place.
+    """Draws frames of N environments below one movable root, which keeps a followed body in place."""
 
-    Attributes:
-        bodies: ids of the bodies that a camera can follow, by label.
-    """
+    bodies: dict[str, int]
+    """Ids of the bodies that a camera can follow, by label."""
 
     def __init__(self, server: Any, env: Any, frame: Frame) -> None:
         self._server, self._model = server, env.mj_model

@@ -22,13 +22,14 @@ _BEHIND = 0.25  # s of delay that the loop gives up catching up with
 
 
 class Viewer:
-    """Shows a session in the browser.
+    """Shows a session in the browser."""
 
-    Attributes:
-        session: the simulation.
-        server: the server; nothing but `host` reaches it.
-        url: address of the page.
-    """
+    session: Session
+    """The simulation."""
+    server: viser.ViserServer
+    """The server; nothing but `host` reaches it."""
+    url: str
+    """Address of the page."""
 
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.session = session

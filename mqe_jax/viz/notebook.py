@@ -16,12 +16,12 @@ from mqe_jax.viz.render import render_episode
 
 
 class Clip:
-    """A clip that a notebook shows where a cell returns it.
+    """A clip that a notebook shows where a cell returns it."""
 
-    Attributes:
-        data: the file's content.
-        kind: mp4 or gif.
-    """
+    data: bytes
+    """The file's content."""
+    kind: str
+    """Mp4 or gif."""
 
     def __init__(self, data: bytes, kind: str) -> None:
         self.data, self.kind = data, kind
