@@ -10,6 +10,8 @@ import jax.numpy as jnp
 # The blocks (A, width) of one environment's observations by name.
 Observation = Mapping[str, jax.Array]
 
+GAIN = 1.5  # 1/s, commanded speed per distance from the goal
+
 
 def pose(base: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns x, y (A, 2), m, and yaw (A,), rad, from base information (A, 6)."""
@@ -25,7 +27,7 @@ def go_to(position: jax.Array, yaw: jax.Array, goal: jax.Array, heading: jax.Arr
         goal: (A, 2), m.
         heading: goal yaw, rad, environment frame.
     """
-    apart = 1.5 * (goal - position)
+    apart = GAIN * (goal - position)
     along = jnp.cos(yaw) * apart[:, 0] + jnp.sin(yaw) * apart[:, 1]
     left = -jnp.sin(yaw) * apart[:, 0] + jnp.cos(yaw) * apart[:, 1]
     turn = jnp.arctan2(jnp.sin(heading - yaw), jnp.cos(heading - yaw))

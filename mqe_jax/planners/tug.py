@@ -1,20 +1,26 @@
-"""Scripted policy of Push Cylinder: align with the cylinder's axis, then push at full speed."""
+"""Scripted policy of Push Cylinder: align with the cylinder's axis, then push a little faster than it moves."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.planners.steering import Observation, go_to, pose
+from mqe_jax.planners.steering import GAIN, Observation, go_to, pose
 
 _AXIS_X = 1.6  # m, of the line on which the cylinder slides
+_ALIGNED = 0.25  # m, distance from that line within which a robot pushes
+_BEFORE = 1.65  # m, distance from the cylinder's axis at which a robot aligns
+_EXCESS = 0.4  # m/s, speed of a pushing robot's goal above the cylinder's
 
 
 def plan_tug(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3), each in its own frame."""
-    (position, yaw), cylinder = pose(obs["base"]), obs["cylinder"][:, 0]
-    aside = jnp.abs(position[:, 0] - _AXIS_X)
+    (position, yaw), (cylinder, speed) = pose(obs["base"]), obs["cylinder"].T
+    x, y = position.T
     # Align first: a robot that pushes off-axis slides along the cylinder.
-    ahead = jnp.where(aside < 0.25, cylinder, jnp.minimum(cylinder - 1.65, position[:, 1]))
+    before = jnp.minimum(cylinder - _BEFORE, y)
+    # Full speed against a blocked cylinder turns the robot aside and tips it over.
+    push = jnp.minimum(cylinder, y + (jnp.maximum(speed, 0.0) + _EXCESS) / GAIN)
+    ahead = jnp.where(jnp.abs(x - _AXIS_X) < _ALIGNED, push, before)
     goal = jnp.stack([jnp.full(2, _AXIS_X), ahead], axis=-1)
     return go_to(position, yaw, goal, jnp.pi / 2)
