@@ -7,15 +7,38 @@ import jax.numpy as jnp
 
 from mqe_jax.planners.steering import Observation, go_to
 
-_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, points in the goal
+_GOAL_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, points in the goal
 _GOAL = jnp.array([12.0, 0.0])  # m
+# Against the defender: the ball passes it on the flank at this point (x, distance from the middle), m. On the straight
+# line to the goal it touches the defender and is deflected beyond the post.
+_FLANK = (10.0, 1.5)
+_INNER_AIMS = jnp.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]])  # m, points in the goal further from the posts
+_TURN_IN = 9.4  # m, x of the ball from which it is played towards the goal
+_LEAD = 0.3  # s, over which the ball's motion is predicted
+_KEEP_BACK = 2.0  # m, from the ball back to the supporting robot, which stays in the middle
 
 
 def plan_defender(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3); the unobserved defender is assumed where its control law steers to."""
-    ball = obs["ball"][:, :2]
-    opponents = (0.6 * ball + 0.4 * _GOAL)[:, None]
-    return jax.vmap(_play)(obs["base"], obs["mate"], opponents, ball, obs["ball_velocity"][:, :2])
+    """Returns both robots' actions (2, 3): one dribbles past the defender on the flank, then turns in to the goal.
+
+    The unobserved defender is assumed where its control law steers to. The robot that is nearer to the place from which
+    the ball is played towards the goal attacks; a robot on the far side of the ball leaves it to a better placed mate.
+    """
+    ball, velocity = obs["ball"][0, :2], obs["ball_velocity"][0, :2]
+    opponents = (0.6 * ball + 0.4 * _GOAL)[None]
+    flank = jnp.array([_FLANK[0], jnp.where(ball[1] > 0, _FLANK[1], -_FLANK[1])])
+    aims = jnp.where(ball[0] < _TURN_IN, flank, _INNER_AIMS)
+    ahead = ball + _LEAD * velocity
+    way = _GOAL - ball
+    start = ahead - 0.6 * way / jnp.maximum(jnp.linalg.norm(way), 1e-3)
+    support = jnp.array([jnp.minimum(ahead[0] - _KEEP_BACK, 9.5), 0.0])
+
+    def play(own: jax.Array, mate: jax.Array) -> jax.Array:
+        attack, way = _attack(own, opponents, ball, velocity, aims)
+        nearer = jnp.linalg.norm(own[:2] - start) < jnp.linalg.norm(mate[:2] - start)
+        return _walk(own, jnp.where(nearer, attack, support), way)
+
+    return jax.vmap(play)(obs["base"], obs["mate"])
 
 
 def plan_1vs1(obs: Observation) -> jax.Array:
@@ -41,14 +64,35 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
         ball: position (2,), m.
         velocity: of the ball (2,), m/s.
     """
+    attack, way = _attack(own, opponents, ball, velocity, _GOAL_AIMS)
+    ball = ball + _LEAD * velocity
+    left = way[::-1] * jnp.array([-1.0, 1.0])
+    offset = own[:2] - ball
+    support = ball - 1.5 * way + 0.8 * jnp.sign(offset @ left) * left
+    nearer = jnp.linalg.norm(offset) < jnp.linalg.norm(mate[:2] - ball)
+    return _walk(own, jnp.where(nearer, attack, support), way)
+
+
+def _attack(
+    own: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array, aims: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Returns where to walk in order to play the ball (2,), m, and the unit vector towards the chosen aim (2,).
+
+    Args:
+        own: base information (6,).
+        opponents: positions (K, 2), m.
+        ball: position (2,), m.
+        velocity: of the ball (2,), m/s.
+        aims: points to play the ball to (M, 2), m.
+    """
     position, yaw = own[:2], own[5]
     near = jnp.linalg.norm(position - ball) < 0.35
-    ball = ball + 0.3 * velocity
+    ball = ball + _LEAD * velocity
     facing = jnp.array([jnp.cos(yaw), jnp.sin(yaw)])
     offset = position - ball
     distance = jnp.linalg.norm(offset)
     # The aim with the most clearance and the least turning.
-    ways = _AIMS - ball
+    ways = aims - ball
     ways = ways / jnp.linalg.norm(ways, axis=-1, keepdims=True)
     lefts = ways[:, ::-1] * jnp.array([-1.0, 1.0])
     ahead, apart = ways @ (opponents - ball).T, jnp.abs(lefts @ (opponents - ball).T)
@@ -64,8 +108,9 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
     # From in front of the ball: first to the side, then back.
     side = jnp.sign(aside) * left
     around = jnp.where(jnp.abs(aside) < 0.3, position + 0.6 * side, behind + 0.45 * side)
-    attack = jnp.where(lined_up | between_legs, push, jnp.where(along > -0.3, around, behind))
-    support = ball - 1.5 * way + 0.8 * side
-    nearer = distance < jnp.linalg.norm(mate[:2] - ball)
-    heading = jnp.arctan2(way[1], way[0])
-    return go_to(position[None], yaw[None], jnp.where(nearer, attack, support)[None], heading)[0]
+    return jnp.where(lined_up | between_legs, push, jnp.where(along > -0.3, around, behind)), way
+
+
+def _walk(own: jax.Array, goal: jax.Array, way: jax.Array) -> jax.Array:
+    """Returns one robot's action (3,) towards a goal position (2,), facing along `way` (2,)."""
+    return go_to(own[None, :2], own[None, 5], goal[None], jnp.arctan2(way[1], way[0]))[0]
