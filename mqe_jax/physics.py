@@ -123,7 +123,7 @@ class Physics:
                 model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=max_constraints_per_env
             )
         else:
-            self._mjx_model = mjx.put_model(model, impl="jax")
+            self._mjx_model = mjx.put_model(_margins_as_size(model), impl="jax")
             self._template = mjx.make_data(model, impl="jax")
 
     @functools.cached_property
@@ -201,6 +201,20 @@ class Physics:
             if len(contact.dist) == _contact_cap(self.model):
                 return jnp.all(contact.dist < contact.includemargin)
         return jnp.zeros((), bool)
+
+
+def _margins_as_size(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy in which spheres and capsules are larger by their contact margin, which is then 0.
+
+    MJX-JAX ignores margins where a box is touched. For every pair of which one shape has a margin, a larger radius is
+    the same; two robots touch one margin earlier.
+    """
+    model = model.__copy__()
+    round_types = [int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)]
+    rounded = np.isin(model.geom_type, round_types)
+    model.geom_size[rounded, 0] += model.geom_margin[rounded]
+    model.geom_margin[rounded] = 0.0
+    return model
 
 
 def _contact_cap(model: mujoco.MjModel) -> int:

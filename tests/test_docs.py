@@ -119,8 +119,8 @@ def test_tables_of_tasks_say_what_the_docstrings_say() -> None:
     page = docs_pages.task_page(Go1Gate)
     assert "| `collision` | -2 | Paid in steps with any trunk contact. |" in page
     assert "| `gate` | 2 | centre of the gap, m |" in page
-    assert "| `gate_width` | 0.6 | of the gap, m. |" in page
-    assert "| `robot` | `go1` | name of the robot" in page
+    assert "| `gate_width` | 0.6 | Width of the gap, m. |" in page
+    assert "| `robot` | `go1` | Name of the robot" in page
 
 
 def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:

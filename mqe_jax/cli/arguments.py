@@ -144,9 +144,9 @@ class Render:
     """Picture width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .gif, 1280 for .png."""
     fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Frames per second. Default: 25 for .mp4, 12.5 for .gif."""
-    view: Literal["follow", "scene", "side"] | None = None
-    """Camera: follow (robots and objects), scene (all of it), side (the first robot). Default: follow in a clip, scene
-    in a picture."""
+    view: Literal["follow", "near", "scene", "side"] | None = None
+    """Camera: follow (robots and objects), near (them too, at rest), scene (all of it), side (the first robot).
+    Default: follow in a clip, scene in a picture."""
     speed: float = 1.0
     """Playing speed of a clip; 0.5 is slow motion."""
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None

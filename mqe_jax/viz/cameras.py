@@ -25,8 +25,9 @@ class Camera:
     """Elevation, degrees: -90 looks straight down."""
 
 
-VIEWS = ("follow", "scene", "side")
-"""Names of the views: following robots and objects, the whole scene, from the side of the first robot."""
+VIEWS = ("follow", "near", "scene", "side")
+"""Names of the views: following robots and objects, at rest and near enough to see them all through the episode, the
+whole scene, from the side of the first robot."""
 
 _MARGIN = np.array([0.45, 0.45, 0.3])  # around a followed body, m
 _REACH = 3.0  # distance from the ball within which robots are followed, m
@@ -58,7 +59,7 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     tops = [box_corners(model, data, geom)[:, 2].max() for geom in scenery_geoms(model)]
     tall = max(tops, default=0.0) > min(data.xpos[body][2] for body in robots) + _TALL
     start = Camera((0.0, 0.0, 0.0), 1.0, elevation=-50.0 if tall else -30.0)
-    fitted = []
+    fitted, everywhere = [], []
     for index in range(len(episode)):
         pose(model, data, episode, index)
         if view == "side":
@@ -67,7 +68,11 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
             continue
         places = data.xpos[_followed(data, robots, objects)]
         corners = np.concatenate([places + _MARGIN * (a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
-        fitted.append(_fitted(model, corners, start, aspect, (2.0, 9.0)))
+        everywhere.append(corners)
+        if view == "follow":
+            fitted.append(_fitted(model, corners, start, aspect, (2.0, 9.0)))
+    if view == "near":
+        return [_fitted(model, np.concatenate(everywhere), start, aspect, (2.0, 14.0))] * len(episode)
     width = 0.3 if view == "side" else _SMOOTHING
     return _smoothed(fitted, max(1, round(width / episode.dt)))
 
