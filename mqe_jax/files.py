@@ -39,7 +39,7 @@ def check_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Holds a lock on a folder; it ends with the process, however that ends.
+    """Holds a lock on a folder; it is released when the process exits, even abnormally.
 
     Raises:
         InputError: where another process (or this one) already holds it.

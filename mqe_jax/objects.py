@@ -110,7 +110,7 @@ class Ball(Object):
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
         """Adds the ball, a thin shell, on three slides and a ball joint.
 
-        A free joint would not do, because it has a single damping coefficient for all six degrees of freedom.
+        A free joint is unsuitable, because it has a single damping coefficient for all six degrees of freedom.
         """
         body = self._body(spec, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
         self._slides(body, "xyz", self.drag)

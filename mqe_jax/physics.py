@@ -204,10 +204,10 @@ class Physics:
 
 
 def _margins_as_size(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy in which spheres and capsules are larger by their contact margin, which is then 0.
+    """Returns a copy whose sphere and capsule radii are inflated by their contact margins, which are set to 0.
 
-    MJX-JAX ignores margins where a box is touched. For every pair of which one shape has a margin, a larger radius is
-    the same; two robots touch one margin earlier.
+    MJX-JAX ignores margins in box contacts. Inflation is equivalent for pairs in which only one geom has a margin;
+    contact between two robots begins one margin earlier.
     """
     model = model.__copy__()
     round_types = [int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)]

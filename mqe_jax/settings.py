@@ -10,8 +10,8 @@ A record is a frozen dataclass whose fields carry their types and bounds once, a
 Fields are given by keyword. Every way of making a record, `Ppo(clip=0.1)` included, validates it, and raises an
 `InputError` of one line: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
 
-Numbers are finite unless a field is `AnyFloat`; booleans are not numbers; numpy scalars and strings such as "7e-4"
-(which YAML does not read as a number) are; "none" means None for an optional field.
+Numbers are finite unless a field is `AnyFloat`; booleans are rejected as numbers; numpy scalars and strings such as
+"7e-4" (which YAML does not read as a number) are accepted; "none" means None for an optional field.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def _bounds(metadata: tuple[Any, ...]) -> str:
 
 
 def _lenient(hint: Any) -> Any:
-    """Returns an annotated type that also takes what YAML and numpy give for it, and no boolean for a number."""
+    """Returns an annotated type that also accepts YAML and numpy representations, and rejects booleans as numbers."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is ClassVar or hint is ClassVar:
         return hint

@@ -194,7 +194,7 @@ class WrongSize(Probe):
 
 def test_a_wrong_observation_size_is_named() -> None:
     env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
-    with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); its sizes say \(4, 2, 7\)"):
+    with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)"):
         make_learner(env, small(num_envs=4))
 
 

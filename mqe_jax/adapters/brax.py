@@ -34,8 +34,8 @@ class Env(BraxEnv):
     """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after agent.
 
     The reward is the mean over the agents of team 0: all agents in cooperative tasks. `done` is 1 where the task's
-    rules end the episode. The time limit is left to Brax's EpisodeWrapper, which otherwise took it for a termination:
-    pass it `episode_length`. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is
+    rules end the episode. The time limit is left to Brax's EpisodeWrapper, which would otherwise treat it as a
+    termination: pass it `episode_length`. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is
     the observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's own state.
     """
 

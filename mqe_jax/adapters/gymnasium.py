@@ -42,7 +42,7 @@ def register() -> None:
 class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment: observations (A, O), actions (A, action_size) in [-1, 1].
 
-    The task's own time limit truncates. The first reset with seed s is `env.reset(jax.random.PRNGKey(s))`.
+    Episodes are truncated at the task's time limit. The first reset with seed s is `env.reset(jax.random.PRNGKey(s))`.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012

@@ -45,7 +45,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     teams: Any
     """Agents of each team."""
     state_space: Any
-    """Of `state()`."""
+    """Observation space of `state()`."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "mqe",

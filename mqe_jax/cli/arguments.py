@@ -145,8 +145,8 @@ class Render:
     fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Frames per second. Default: 25 for .mp4, 12.5 for .gif."""
     view: Literal["follow", "near", "scene", "side"] | None = None
-    """Camera: follow (robots and objects), near (them too, at rest), scene (all of it), side (the first robot).
-    Default: follow in a clip, scene in a picture."""
+    """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
+    side (tracks the first robot). Default: follow in a clip, scene in a picture."""
     speed: float = 1.0
     """Playing speed of a clip; 0.5 is slow motion."""
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -222,7 +222,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train tasks x algorithms x settings x seeds into one folder, and report; continues what is missing."""
+    """Train tasks x algorithms x settings x seeds into one folder, and report; resumes interrupted runs."""
 
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""
@@ -268,9 +268,9 @@ class WalkTrain:
     initial_std: float = 1.0
     """Standard deviation of the actions at the start."""
     curriculum: int = 400
-    """Iterations over which slopes, forces and kicks grow to their full size."""
+    """Curriculum length: iterations over which slopes, forces and kicks are ramped to their maxima."""
     critic_warmup: int = 0
-    """First iterations in which the weights to fine-tune stay as they are, while the critic learns their values."""
+    """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
     anneal: float = 0.25
     """Last fraction of the training over which learning rate and entropy bonus fall linearly to zero."""
     impl: Impl = "auto"

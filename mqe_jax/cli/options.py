@@ -63,7 +63,7 @@ DumpDiverged = Annotated[
     Path | None,
     tyro.conf.arg(
         metavar="FOLDER",
-        help="Record the last 64 steps of environments whose physics diverges there (see `mqe replay`). "
+        help="Write the last 64 steps of each environment whose physics diverges into FOLDER (see `mqe replay`). "
         "Keeps the states of two rollouts in memory.",
     ),
 ]

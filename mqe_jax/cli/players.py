@@ -29,7 +29,7 @@ class Player:
     policy: Policy | str
     """Trained policy, or one of `PLANNER_NAMES`."""
     opponent: str | None = None
-    """Opponent of team 1 in a match: one of `PLANNER_NAMES`, or self; None is idle."""
+    """Policy of team 1 in a match: one of `PLANNER_NAMES`, or self (the same as team 0); None is idle."""
 
     def act(self, env: Any, deterministic: bool) -> Act:
         """Returns the batched `act` of all agents.
@@ -78,7 +78,7 @@ def against(act: Act, opponent: Act, env: Any) -> Act:
 
 
 def planner(name: str, env: Any) -> Act:
-    """Returns the `act` of an untrained policy; InputError where the task has no scripted one."""
+    """Returns the `act` of a scripted or trivial policy; InputError where the task has no scripted one."""
     shape = (env.num_agents, env.action_size)
     plan = _scripted(env) if name == "scripted" else None
 

@@ -27,7 +27,7 @@ class View:
     num_envs: int = 1
     """Number of environments, side by side: 1 to 16."""
     host: str = "127.0.0.1"
-    """Address to listen on; the default is reached from this machine only. The page has no password."""
+    """Address to listen on; the default is reachable from this machine only. There is no authentication."""
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     impl: Impl = "auto"

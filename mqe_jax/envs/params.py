@@ -36,9 +36,9 @@ class TaskParams:
     released system, is never reached: a robot that turns over by pitching shows a roll of pi.
     """
     min_height: float = -1.0
-    """An episode ends when any trunk is lower, m."""
+    """Minimum trunk height, m; below it the episode terminates."""
     max_height: float = 100.0
-    """An episode ends when any trunk is higher, m."""
+    """Maximum trunk height, m; above it the episode terminates."""
     end_on_collision: bool = False
     """Whether a contact force on an agent's trunk above `collision_force` ends the episode."""
     collision_force: Positive = 1.0

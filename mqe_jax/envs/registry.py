@@ -61,7 +61,7 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None
 
 
 def load(package: str, path: str) -> Any:
-    """Returns what MODULE:NAME below a package names."""
+    """Imports and returns the object MODULE:NAME of a package."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(f"{package}.{module}"), name)
 

@@ -62,11 +62,11 @@ class SeesawParams(TaskParams):
     plank_mass: Positive = 100.0
     """Plank mass, kg."""
     plank_inertia: Positive = 100.0
-    """About the hinge, kg m^2."""
+    """Plank inertia about the hinge, kg m^2."""
     plank_limit: Positive = 0.254
     """Maximum |angle|, rad."""
     plank_damping: NonNegative = 1000.0
-    """Plank damping of the hinge, N m s/rad."""
+    """Damping of the plank's hinge, N m s/rad."""
     plank_start: float = -0.25
     """Angle at reset, rad; negative with the near end down."""
     platform: tuple[float, float, float] = (8.0, 0.0, 1.0)

@@ -51,7 +51,7 @@ class SheepEasyParams(TaskParams):
     spawn_apart: NonNegative = 1.95
     """Distance between the robots, m."""
     gate_width: Positive = 0.8
-    """Gate width of the gap, m."""
+    """Width of the gate's gap, m."""
     gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
     """Half-widths of the range of the gap's centre in x and y, m."""
     past_gate: float = 0.0

@@ -11,8 +11,8 @@ from mqe_jax.export.graph import Graph
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.policy import Policy
 
-_LIMIT = 10.0  # of normalised observations, and
-_MIN_STD = 1e-2  # floor of their deviation, both as in `train.normalize`
+_LIMIT = 10.0  # clip of normalised observations (`train.normalize`)
+_MIN_STD = 1e-2  # floor of the standard deviation (`train.normalize`)
 _ACTIVATIONS = {"relu": "Relu", "elu": "Elu", "tanh": "Tanh"}
 
 

@@ -186,7 +186,7 @@ class WalkSettings:
     stance_length: float
     """Default distance between front and rear feet, m."""
     min_knee_height: float
-    """A knee below it counts as thigh and calf touching the ground, m."""
+    """Knee height below which contact of thigh and calf with the ground is assumed, m."""
     min_trunk_height: float
     """A trunk origin below it counts as a fall, m."""
 

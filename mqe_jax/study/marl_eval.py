@@ -13,7 +13,7 @@ def to_marl_eval(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns environment -> task -> algorithm -> run -> step_k -> {step_count, metric: [value]}, absolute_metrics.
 
     `runs` are evaluation records (`mqe_jax.study.records`) of trainings that have ended. Each list holds one value,
-    the mean over the evaluation's episodes under drawn actions: the format allows one value in place of one for each
+    the mean over the evaluation's episodes under sampled actions: the format allows one value in place of one for each
     episode.
     """
     tree: dict[str, Any] = {}

@@ -98,7 +98,7 @@ def read_curve(path: Path) -> Curve:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, TypeError, ValueError):
-        raise InputError(f"{path}: is not a table of numbers as a training writes it") from None
+        raise InputError(f"{path}: is not a metrics.csv or a thinned curve") from None
     if not {"env_steps", "average_step_reward"} <= set(curve) or not rows:
         raise InputError(f"{path}: has no rows with columns env_steps and average_step_reward")
     return curve

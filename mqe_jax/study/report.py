@@ -1,6 +1,6 @@
 """The report of a study: figures, tables and aggregates beside the paper's values, generated from raw data alone.
 
-The same raw data give the same files: intervals are drawn from a fixed seed, and pictures carry no date.
+The same raw data give the same files: intervals are drawn from a fixed seed, and figures contain no timestamp.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def report(folder: Path) -> list[Path]:
 
 _EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% stratified bootstrap interval.
 `training`: average step reward over the last {_LAST:.0%} of the training's steps, as in the paper's figure. `absolute`:
-average step reward of the best checkpoint over the final evaluation's episodes, actions drawn; `success` likewise.
+average step reward of the best checkpoint over the final evaluation's episodes, actions sampled; `success` likewise.
 `paper`: read off the paper's figure after 40 M steps (from scratch: the best algorithm's value)."""
 _SETTINGS = {paper.HIERARCHICAL: "walk policy", paper.SCRATCH: "from scratch"}
 _HEADINGS = {

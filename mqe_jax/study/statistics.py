@@ -1,8 +1,8 @@
 """Statistics over few runs: interquartile mean, stratified bootstrap intervals, probability of improvement, profiles.
 
 Scores are float arrays (runs, tasks); a statistic maps scores with any leading axes (..., runs, tasks) to (...).
-Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 2022, arXiv 2209.10485 (their use for
-teams of agents). Numbers equal those of the `rliable` package (tests/data/rliable.json).
+Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 2022, arXiv 2209.10485 (their use in
+MARL). Numbers equal those of the `rliable` package (tests/data/rliable.json).
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class PPO:
     clip: Positive = 0.2
     """Half width of the clipping interval of the ratio."""
     dual_clip: Annotated[float, Gt(1)] | None = None
-    """Bound on the loss of negative advantages, in advantages (the paper's variant: 3.0); none disables it."""
+    """Dual-clip coefficient c: for A < 0 the loss is at most c |A| (the paper's variant: 3.0); none disables it."""
     gamma: Fraction = 0.99
     """Discount per step."""
     gae_lambda: Fraction = 0.95
@@ -93,7 +93,7 @@ class Curriculum:
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
     failure_bootstrap_until: Positive = 0.5
-    """Fraction of the training after which that fraction is 0."""
+    """Fraction of the training over which `failure_bootstrap` is annealed to 0."""
 
 
 @record
@@ -132,9 +132,9 @@ class EvaluationSettings:
     """
 
     every: PositiveInt | None = None
-    """Updates between two evaluations; none evaluates never."""
+    """Updates between two evaluations; none disables evaluation."""
     episodes: PositiveInt = 32
-    """Episodes of each evaluation under drawn actions, and as many under mean actions; one in each environment."""
+    """Episodes of each evaluation under sampled actions, and as many under mean actions; one in each environment."""
 
 
 @record

@@ -107,8 +107,8 @@ def evaluate(
 class Evaluator:
     """Evaluations of many policies by one compiled program, B at a time; see `evaluate`.
 
-    `act(params, obs (N, A, O), memory, key) -> (action, memory)` is the policy of parameters, of which each of the B
-    evaluations has its own (leading axis B), or all the same (None).
+    `act(params, obs (N, A, O), memory, key) -> (action, memory)` is the policy; `params` has a leading axis B, one
+    set for each evaluation, or is None if all evaluations share one policy.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class Evaluator:
             if self._recorder is not None:
                 self._recorder.add(trace)
             if np.all(np.asarray(progress.finished) >= quota):
-                # Sums alone: the environments may hold leaves without an axis of the evaluation.
+                # Only the sums are indexed: environment states may contain unbatched leaves.
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
                 each = [jax.tree.map(lambda x: x[i], sums) for i in range(len(keys))]  # noqa: B023
                 return [_result(self._env.name, episodes, own) for own in each]

@@ -184,7 +184,7 @@ def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
     for name, shape in expected.items():
         found = getattr(state, name).shape
         if found != shape:
-            raise InputError(f"env: {name} of {env.name} has shape {found}; its sizes say {shape}")
+            raise InputError(f"env: {name} of {env.name} has shape {found}; expected {shape}")
     assistance = config.curriculum.assistance
     if assistance and not hasattr(state, "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")

@@ -80,7 +80,7 @@ def _plain(result: EvalResult) -> dict[str, Any]:
 
 
 def score(evaluation: dict[str, Any]) -> float:
-    """Returns what makes an evaluation the best: the average step reward under drawn actions."""
+    """Returns what makes an evaluation the best: the average step reward under sampled actions."""
     value = evaluation["sampled"]["average_step_reward"]
     return -math.inf if value is None else float(value)
 

@@ -57,8 +57,8 @@ class Network(NamedTuple):
     `acting(params) -> params`: the part that `act` needs, which a saved policy keeps
     `initial_memory(num_envs) -> memory`: zeros with leading axis N
     `act(acting_params, actor_memory, obs (N, A, O), key or None) -> (action (N, A, D), log_prob (N, A, D),
-    actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents may act one after
-    the other inside.
+    actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents may act
+    autoregressively within one call.
     `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P)) -> (value (L, N, V),
     critic_memory)`
     `evaluate(params, memory, is_first (L, C), obs, privileged, action) -> Evaluation`, all agents in parallel
@@ -78,7 +78,7 @@ class NetworkSettings:
     """Base of every network's settings record."""
 
     name: str
-    """Registered name of the network, whose settings the other fields are."""
+    """Registered name of the network that the other fields configure."""
 
     def build(self, dims: EnvDims) -> Network:
         """Returns the network for an environment; InputError where the settings do not fit it."""

@@ -95,12 +95,12 @@ def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
 
 
 def value_normalize(statistics: ValueStatistics, value: jax.Array) -> jax.Array:
-    """Returns the normalised value of one in units of reward."""
+    """Normalises values in reward units."""
     mean, std = _value_moments(statistics)
     return (value - mean) / jnp.maximum(std, _TINY)
 
 
 def value_denormalize(statistics: ValueStatistics, value: jax.Array) -> jax.Array:
-    """Returns the value in units of reward of a normalised one."""
+    """Denormalises values to reward units."""
     mean, std = _value_moments(statistics)
     return value * std + mean

@@ -83,7 +83,7 @@ def train_seeds(
     eval_env: VectorEnv | None = None,
     recorder: Recorder | None = None,
 ) -> list[TrainState]:
-    """Trains several seeds at once in one program, each as alone and in a run folder of its own; see `train`.
+    """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
 
     `configs` differ in their seed alone. Runs are resumed together, from the newest checkpoint that all of them have.
     The recorder receives the environments of all seeds as one batch.
@@ -105,7 +105,7 @@ def train_seeds(
 
 
 def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
-    """Returns each folder's checkpoint of the newest step that all have; none where some have none yet, at step 0.
+    """Returns each folder's checkpoint at the newest step common to all; None (start from scratch) if any has none.
 
     Raises:
         InputError: where the folders have no step in common.
@@ -275,7 +275,7 @@ def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) ->
 
 
 def _learned(state: TrainState) -> dict[str, Any]:
-    """Returns everything that updates change, without the environments."""
+    """Returns the learned state: parameters, optimiser and statistics, without environment states."""
     return {
         "params": state.params,
         "optimizer": state.optimizer,

@@ -1,7 +1,7 @@
 """States of several seeds in one pytree, as `jax.vmap` batches them.
 
-Warp keeps contacts of all environments in shared buffers, which `vmap` passes on without an axis of their own. Every
-physics step fills them anew, so that one seed's buffers serve for all, and checkpoints leave them out.
+Warp keeps contacts of all environments in shared buffers, which `vmap` leaves unbatched. They are
+overwritten in every physics step, so one copy suffices for all seeds, and checkpoints leave them out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mqe_jax.train.types import PyTree
 
 
 def shared_leaves(init: Callable[[jax.Array], PyTree]) -> PyTree:
-    """Returns for each leaf of `init(key)` whether it has no axis of its own under `vmap`."""
+    """Returns for each leaf of `init(key)` whether it is unbatched under `vmap`."""
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     keys = jax.ShapeDtypeStruct((2, 2), jnp.uint32)
     alone, batched = jax.eval_shape(init, key), jax.eval_shape(jax.vmap(init), keys)

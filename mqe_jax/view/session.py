@@ -1,4 +1,4 @@
-"""The simulation behind the viewer: environments under policies, one robot driven by hand. Knows no browser."""
+"""The simulation behind the viewer: environments under policies, and a driven robot. Independent of the browser."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Drive:
         self._held[direction] = self.clock() + HOLD_TIME
 
     def now(self) -> np.ndarray:
-        """Returns the present command (3,), within its limits."""
+        """Returns the current command (3,), within its limits."""
         held = [direction for direction, until in list(self._held.items()) if until > self.clock()]
         total = self.command + np.sum([np.zeros(3), *(np.asarray(d) * self.limit for d in held)], axis=0)
         return np.clip(total, -self.limit, self.limit)

@@ -18,7 +18,7 @@ DRAW_RATE = 25.0
 PANEL_RATE = 5.0
 """Frames per second of the scene, and of state and plots."""
 _FIELD_OF_VIEW = 0.87  # rad, vertical
-_BEHIND = 0.25  # s of delay that the loop gives up catching up with
+_BEHIND = 0.25  # lag behind real time beyond which the schedule is reset, s
 
 
 class Viewer:
@@ -27,7 +27,7 @@ class Viewer:
     session: Session
     """The simulation."""
     server: viser.ViserServer
-    """The server; nothing but `host` reaches it."""
+    """The web server; it listens on `host` only."""
     url: str
     """Address of the page."""
 
@@ -45,7 +45,7 @@ class Viewer:
         self._real_time = 0.0
 
     def run(self, stop: threading.Event | None = None) -> None:
-        """Steps and draws in the session's pace until `stop` is set, or Ctrl-C; then closes the server."""
+        """Steps and draws at the session's speed until `stop` is set, or Ctrl-C; then closes the server."""
         stop = stop or threading.Event()
         dt = self.session.env.dt
         due = drawn = shown = time.monotonic()
@@ -74,7 +74,7 @@ class Viewer:
             self.server.stop()
 
     def _step_if_due(self, now: float, due: float) -> bool:
-        """Resets and steps as asked, and where the next step is due; returns whether it was a step of the pace."""
+        """Handles reset and single-step requests, advances if the next step is due; returns whether it was due."""
         if self._panel.take_reset():
             self.session.reset()
         for _ in range(self._panel.take_steps()):

@@ -26,8 +26,8 @@ class Camera:
 
 
 VIEWS = ("follow", "near", "scene", "side")
-"""Names of the views: following robots and objects, at rest and near enough to see them all through the episode, the
-whole scene, from the side of the first robot."""
+"""Names of the views. follow: tracks robots and objects; near: fixed, frames their trajectories; scene: fixed, whole
+scene; side: tracks the first robot from its side."""
 
 _MARGIN = np.array([0.45, 0.45, 0.3])  # around a followed body, m
 _REACH = 3.0  # distance from the ball within which robots are followed, m

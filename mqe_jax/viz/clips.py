@@ -38,7 +38,7 @@ def check_output(path: Path) -> Path:
         except ImportError:
             raise InputError(
                 f"output {str(path)!r}: .mp4 needs imageio-ffmpeg "
-                "(pip install 'mqe-jax[render]'); allowed without them: .gif, .png"
+                "(pip install 'mqe-jax[render]'); without it use .gif or .png"
             ) from None
     return path
 

@@ -76,7 +76,7 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
             rate = [100 * v for v in smooth(table["success"])]
             right.plot([s / 1e6 for s in table["env_steps"]], rate, color=_SECOND, lw=1.4, alpha=0.9)
         right.set(ylim=(0, 100))
-        right.set_ylabel("episodes that succeed (%)", color=_SECOND)
+        right.set_ylabel("success rate (%)", color=_SECOND)
         right.spines[["top", "left"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="best")
     path.parent.mkdir(parents=True, exist_ok=True)

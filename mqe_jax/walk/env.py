@@ -68,7 +68,7 @@ class WalkState:
     mean_error: jax.Array
     """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
     step: jax.Array
-    """Steps counted towards the time limit () int32; starts at any offset."""
+    """Steps counted towards the time limit () int32; starts at a random offset in training."""
     age: jax.Array
     """Steps since the reset () int32."""
     difficulty: jax.Array

@@ -48,8 +48,12 @@ SCENARIOS = {
     "slope_up": Scenario(velocity=(1.0, 0.0, 0.0), slope=0.25, meaning="vx 1.0 up a slope of 0.25 rad"),
     "slope_down": Scenario(velocity=(1.0, 0.0, 0.0), slope=-0.25, meaning="vx 1.0 down a slope of 0.25 rad"),
     "stand": Scenario(duration=11.0, velocity=(0.0, 0.0, 0.0), meaning="zero command"),
-    "force_against": Scenario(velocity=(0.5, 0.0, 0.0), force=(-30.0, 0.0), meaning="vx 0.5 against 30 N"),
-    "force_across": Scenario(velocity=(0.5, 0.0, 0.0), force=(0.0, 30.0), meaning="vx 0.5 across 30 N"),
+    "force_against": Scenario(
+        velocity=(0.5, 0.0, 0.0), force=(-30.0, 0.0), meaning="vx 0.5 under an opposing force of 30 N"
+    ),
+    "force_across": Scenario(
+        velocity=(0.5, 0.0, 0.0), force=(0.0, 30.0), meaning="vx 0.5 under a lateral force of 30 N"
+    ),
     "trot": Scenario(velocity=(0.5, 0.0, 0.0), meaning="vx 0.5, trot at 3 Hz"),
     "pace": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", meaning="vx 0.5, pace at 3 Hz"),
     "trot_slow": Scenario(velocity=(0.5, 0.0, 0.0), frequency=2.0, meaning="vx 0.5, trot at 2 Hz"),

@@ -23,7 +23,7 @@ class WalkRewards:
     """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
 
     `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground that happens at the knee, so it is
-    read from the knee's height (`WalkSettings.min_knee_height`), at no cost for contact sensors.
+    read from the knee's height (`WalkSettings.min_knee_height`), which avoids contact sensors.
     """
 
     track_velocity: float = 0.6

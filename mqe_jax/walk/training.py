@@ -75,7 +75,7 @@ class WalkConfig:
     curriculum: int = 400
     """Iterations over which slopes, forces and kicks grow to their maxima."""
     critic_warmup: int = 0
-    """First iterations in which only critic and adaptation network learn, for given policy weights."""
+    """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
     anneal: float = 0.0
     """Last fraction of the training over which learning rate and entropy bonus fall linearly to zero."""
     seed: int = 1
@@ -201,7 +201,7 @@ def make_iteration(
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
         old_log_std = learner.params["log_std"]
-        # Gradients of the policy are zero until the critic has learned the values of given weights.
+        # Policy gradients are zeroed during the first `critic_warmup` iterations of fine-tuning.
         acting = (learner.iteration >= config.critic_warmup).astype(jnp.float32)
 
         def loss(params: Any, t: jax.Array, n: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -259,7 +259,7 @@ def _to_checkpoint(learner: WalkLearner) -> dict[str, Any]:
     """Returns what a checkpoint holds of a learner: 12 MB instead of 25.
 
     Adam's second moments are kept as bfloat16 (bits in uint16), its first moments not at all: these restart from zero
-    and recover within some ten minibatches.
+    and recover within about ten minibatches.
     """
     half = lambda x: jax.lax.bitcast_convert_type(x.astype(jnp.bfloat16), jnp.uint16)  # noqa: E731
     return {
