@@ -36,7 +36,8 @@ class Env(BraxEnv):
     The reward is the mean over the agents of team 0: all agents in cooperative tasks. `done` is 1 where the task's
     rules end the episode. The time limit is left to Brax's EpisodeWrapper, which would otherwise treat it as a
     termination: pass it `episode_length`. `info["truncation"]` is 1 in the step that reaches the time limit,
-    `info[FINAL_OBS]` is the observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's own state.
+    `info[FINAL_OBS]` is the observation at the end of the step, also after an automatic reset. `pipeline_state` is
+    the task's own state.
     """
 
     env: QuadrupedEnv
