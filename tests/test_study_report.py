@@ -123,7 +123,7 @@ def test_bad_raw_data_are_named(tmp_path: Path) -> None:
     write_record(tmp_path, made_up(Cell("go1gate", "mappo"), 0))
     path = tmp_path / "raw" / "go1gate" / "mappo" / "seed0"
     path.with_suffix(".csv").write_text("env_steps\nhello\n")
-    with pytest.raises(InputError, match=r"seed0\.csv: is not a table"):
+    with pytest.raises(InputError, match=r"seed0\.csv: is not a metrics"):
         report(tmp_path)
     path.with_suffix(".json").write_text(json.dumps({"task": "go1gate"}))
     with pytest.raises(InputError, match=r"seed0\.json: is not the record"):

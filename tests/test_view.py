@@ -188,7 +188,12 @@ def viewer() -> Iterator[SimpleNamespace]:
     command = ["view", "go1gate", "--planner", "idle", "--port", str(port), "--set", "episode_length=600"]
     command += ["--set", "end_on_collision=false"]
     with subprocess.Popen(
-        [sys.executable, "-m", "mqe_jax.cli", *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [sys.executable, "-m", "mqe_jax.cli", *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        # A shell starts background jobs with SIGINT ignored, which children inherit.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         assert process.stdout is not None
         said = ""
@@ -198,7 +203,10 @@ def viewer() -> Iterator[SimpleNamespace]:
                 break
         yield SimpleNamespace(port=port, process=process, said=said)
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
+        try:
+            assert process.wait(30) == 130
+        finally:
+            process.kill()
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net/tcp to read the sockets from")
