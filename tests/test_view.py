@@ -187,13 +187,11 @@ def viewer() -> Iterator[SimpleNamespace]:
     port = free_port()
     command = ["view", "go1gate", "--planner", "idle", "--port", str(port), "--set", "episode_length=600"]
     command += ["--set", "end_on_collision=false"]
+    # A shell starts background jobs with SIGINT ignored, which children inherit.
+    program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    program += "from mqe_jax.cli import main; sys.exit(main())"
     with subprocess.Popen(
-        [sys.executable, "-m", "mqe_jax.cli", *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        # A shell starts background jobs with SIGINT ignored, which children inherit.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        [sys.executable, "-c", program, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
         assert process.stdout is not None
         said = ""
