@@ -13,6 +13,10 @@ class InputError(ValueError):
     """
 
 
+class InUseError(InputError):
+    """A folder that another process works in."""
+
+
 class NonFiniteError(ArithmeticError):
     """Training produced NaN or infinite numbers. The command line prints it as one line, exit code 1."""
 

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, InUseError
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -42,14 +42,14 @@ def locked(folder: Path) -> Iterator[None]:
     """Holds a lock on a folder; it is released when the process exits, even abnormally.
 
     Raises:
-        InputError: where another process (or this one) already holds it.
+        InUseError: where another process (or this one) already holds it.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(f"run_dir: {folder} is in use by another training") from None
+            raise InUseError(f"run_dir: {folder} is in use by another process") from None
         yield
     finally:
         os.close(handle)

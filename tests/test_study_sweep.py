@@ -14,6 +14,7 @@ from probes import Probe
 from mqe_jax import cli
 from mqe_jax.cli import study_commands
 from mqe_jax.errors import InputError
+from mqe_jax.files import locked
 from mqe_jax.settings import build, override
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.sweep import Sweep
@@ -89,6 +90,25 @@ def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) ->
             assert record["absolute"]["episodes"] == 40
             steps = [row["env_steps"] for row in csv.DictReader(path.with_suffix(".csv").open())]
             assert steps == ["16", "32", "48"]
+
+
+def test_processes_share_a_sweep(tmp_path: Path) -> None:
+    """A cell that another process trains is left to it; one that it has ended since is not trained again."""
+    sweep, folder = load(tmp_path), tmp_path / "study"
+    jobs = sweeps.plan(sweep, folder, config_of)
+    trained: list[str] = []
+
+    def environments(config: TrainConfig, seeds: int) -> tuple[Probe, Probe]:
+        trained.append(config.ppo.ratio)
+        return PROBE, PROBE
+
+    (folder / "runs" / jobs[0].cell.path).mkdir(parents=True)
+    with locked(folder / "runs" / jobs[0].cell.path):
+        assert sweeps.run(folder, jobs, environments) == jobs[:1]
+    assert trained == ["joint"]
+    assert sweeps.run(folder, jobs, environments) == []
+    assert trained == ["joint", "agent"]
+    assert sweeps.plan(sweep, folder, config_of) == []
 
 
 def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: 
 def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     def again(state: TrainState, row: dict[str, float]) -> None:
         for resume in (False, True):
-            with pytest.raises(InputError, match=r"already holds a run|in use by another training"):
+            with pytest.raises(InputError, match=r"already holds a run|in use by another process"):
                 train(PROBE, settings(), tmp_path, resume=resume)
         raise Killed
 

@@ -36,12 +36,16 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
         return result
     sweeps.prepare(settings, folder)
     try:
-        sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
+        others = sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
     except KeyboardInterrupt:
         say(f"mqe: stopped; continue with: mqe sweep {arguments.file} --folder {folder}")
         raise
-    files = reports.report(folder)
-    say(f"mqe: {files[-1]} and {len(files) - 1} more files beside it")
+    if others:
+        cells = ", ".join(job.cell.path.as_posix() for job in others)
+        say(f"mqe: left to other processes that train this sweep: {cells}")
+    files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
+    if files:
+        say(f"mqe: {files[-1]} and {len(files) - 1} more files beside it")
     return {"left": _estimate(folder, sweeps.plan(settings, folder, config_of)), "report": [str(f) for f in files]}
 
 

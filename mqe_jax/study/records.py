@@ -128,7 +128,7 @@ def write_record(folder: Path, record: Record) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     identity = {"task": cell.task, "algorithm": cell.algorithm, "setting": cell.setting, "seed": record.seed}
     write_atomically(path.with_suffix(".csv"), table(thin(record.curve)).encode())
-    text = json.dumps(_rounded({**identity, **record.evaluation}), indent=1) + "\n"
+    text = json.dumps(_rounded({**identity, **record.evaluation}), separators=(",", ":")) + "\n"
     write_atomically(path.with_suffix(".json"), text.encode())
 
 

@@ -8,6 +8,7 @@ FOLDER/report/...    the report, remade when the sweep ends (`mqe_jax.study.repo
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ from typing import Annotated, Any
 import yaml
 from annotated_types import MinLen
 
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, InUseError
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import NonNegativeInt, PositiveInt, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.paper import HIERARCHICAL
@@ -175,17 +176,31 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
 
-def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> None:
+def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> list[Job]:
     """Trains the jobs sequentially; each continues from its checkpoints and leaves raw data when it ends.
 
+    Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
+    first. Returns the jobs left to other processes.
+
     Raises:
-        InputError: where another process works in the folder, or a run cannot be continued.
+        InputError: where a run cannot be continued.
     """
-    with locked(folder):
-        for job in jobs:
+    left = []
+    for job in jobs:
+        cell_folder = folder / "runs" / job.cell.path
+        cell_folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as lock:
+            try:
+                lock.enter_context(locked(cell_folder))
+            except InUseError:
+                left.append(job)
+                continue
+            if all(_raw(folder, job.cell, config.seed).is_file() for config in job.configs):
+                continue  # ended by another process since the jobs were planned
             env, eval_env = environments(job.configs[0], len(job.configs))
             train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
             for config, run_dir in zip(job.configs, job.folders, strict=True):
                 evaluation = read_evaluations(run_dir)
                 kept = {name: evaluation[name] for name in ("evaluations", "absolute")}
                 write_record(folder, Record(job.cell, config.seed, read_curve(run_dir / "metrics.csv"), kept))
+    return left
