@@ -118,12 +118,15 @@ class Physics:
         from mujoco import mjx
 
         if self.impl == "warp":
-            self._mjx_model = _quiet(mjx.put_model(model, impl="warp"))
+            self._mjx_step, self._mjx_model = mjx.step, _quiet(mjx.put_model(model, impl="warp"))
             self._template = mjx.make_data(
                 model, impl="warp", naconmax=num_envs * contacts_per_env, njmax=max_constraints_per_env
             )
         else:
-            self._mjx_model = mjx.put_model(_margins_as_size(model), impl="jax")
+            from mqe_jax.mjx_step import MarginStep
+
+            self._mjx_step = MarginStep(model)
+            self._mjx_model = self._mjx_step.model
             self._template = mjx.make_data(model, impl="jax")
 
     @functools.cached_property
@@ -179,10 +182,9 @@ class Physics:
             data = data.replace(xfrc_applied=xfrc_applied.astype(jnp.float32))
         if self.impl == "c":
             return self._engine.step(data, dict(fields or {}), xfrc_applied is not None, substeps)
-        from mujoco import mjx
 
         model = self._mjx_model.replace(**fields) if fields else self._mjx_model
-        return jax.lax.scan(lambda state, _: (mjx.step(model, state), None), data, None, substeps)[0]
+        return jax.lax.scan(lambda state, _: (self._mjx_step(model, state), None), data, None, substeps)[0]
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
         """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
@@ -201,20 +203,6 @@ class Physics:
             if len(contact.dist) == _contact_cap(self.model):
                 return jnp.all(contact.dist < contact.includemargin)
         return jnp.zeros((), bool)
-
-
-def _margins_as_size(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy whose sphere and capsule radii are inflated by their contact margins, which are set to 0.
-
-    MJX-JAX ignores margins in box contacts. Inflation is equivalent for pairs in which only one geom has a margin;
-    contact between two robots begins one margin earlier.
-    """
-    model = model.__copy__()
-    round_types = [int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)]
-    rounded = np.isin(model.geom_type, round_types)
-    model.geom_size[rounded, 0] += model.geom_margin[rounded]
-    model.geom_margin[rounded] = 0.0
-    return model
 
 
 def _contact_cap(model: mujoco.MjModel) -> int:

@@ -1,6 +1,7 @@
 """Agreement of two engines on the same episodes, and random actions in crowds of environments on Warp.
 
-`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp`, or `... crowd FOLDER warp`.
+`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`, or `... crowd FOLDER warp`. With `c`,
+`agree` measures how fast trajectories of one engine separate from initial positions that differ by 1e-6.
 """
 
 from __future__ import annotations
@@ -109,7 +110,11 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     num_envs = len(reference["data/qpos"])
     env: Any = make(task, impl=engine, control="position", episode_length=1000.0, num_envs=num_envs)
     fresh = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
-    data = fresh.data.replace(**{name: jnp.asarray(reference[f"data/{name}"]) for name in STATE_FIELDS})
+    fields = {name: jnp.asarray(reference[f"data/{name}"]) for name in STATE_FIELDS}
+    if engine == "c":
+        shift = jax.random.uniform(jax.random.PRNGKey(3), fields["qpos"].shape, minval=-1e-6, maxval=1e-6)
+        fields["qpos"] = fields["qpos"] + shift
+    data = fresh.data.replace(**fields)
     parts = without_data(fresh)
     leaves = [jnp.asarray(reference[f"leaf/{i}"]) for i in range(len(jax.tree.leaves(parts)))]
     states = dataclasses.replace(fresh, data=data, **jax.tree.unflatten(jax.tree.structure(parts), leaves))
