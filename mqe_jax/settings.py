@@ -74,8 +74,8 @@ Range = Annotated[
 def record(cls: type[T]) -> type[T]:
     """Makes a class a frozen, keyword-only dataclass that validates its fields.
 
-    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; nested
-    records get their path put before it. A subclass of a record must be decorated too.
+    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
+    of nested records are prefixed with their path. A subclass of a record must be decorated too.
     """
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
@@ -212,7 +212,7 @@ def _lenient(hint: Any) -> Any:
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is ClassVar or hint is ClassVar:
         return hint
-    if origin is Annotated:  # conversions come last in the annotation, which is first in time
+    if origin is Annotated:  # pydantic applies the last validators of an annotation first
         kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
     if origin in (typing.Union, types.UnionType):

@@ -30,12 +30,12 @@ from mqe_jax.viz.clips import check_output
 
 
 def is_run(target: str) -> bool:
-    """Returns whether RUN|TASK is the folder of a run."""
+    """Returns whether RUN|TASK is a run folder."""
     return os.sep in target or Path(target).exists()
 
 
 def find_player(arguments: Eval | Render | View, default: str) -> Player:
-    """Returns the player of RUN|TASK, --policy and --planner; `default` is the planner of a task without either."""
+    """Returns the player selected by RUN|TASK, --policy and --planner; `default` applies to a task without either."""
     target = arguments.target
     if arguments.planner is not None and arguments.policy is not None:
         raise InputError("planner: give --planner or --policy, not both")
@@ -64,11 +64,11 @@ def _overrides(arguments: Train | Eval | Render | View | Bench) -> dict[str, Any
 
 
 def _run_config(target: str) -> Any:
-    """Returns the settings of a run's folder."""
+    """Returns the settings in a run folder."""
     if not Path(target).is_dir():
-        raise InputError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
+        raise InputError(f"run: no folder {target!r}; allowed: a run folder, or a task's id")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
-        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not the folder of a training")
+        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder")
     config = runner.load_run_config(target)
     if config.task is None:
         raise InputError(f"{target}: {runner.CONFIG_FILE} has no 'task' entry")

@@ -23,8 +23,8 @@ def export(arguments: Export) -> dict[str, Any]:
     if task is None:
         raise InputError(f"{arguments.run_dir}: its settings have no 'task' entry")
 
+    from mqe_jax.export.actor import check_network
     from mqe_jax.export.check import largest_error
-    from mqe_jax.export.planner import check_network
     from mqe_jax.export.policy import save_onnx, shapes, to_onnx
 
     check_network(policy)

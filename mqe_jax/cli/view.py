@@ -31,6 +31,6 @@ def view(arguments: View) -> None:
 
     viewer = Viewer(Session(env, vector_env, act, memory, arguments.seed), arguments.host, arguments.port)
     if arguments.host not in _LOCAL:
-        say(f"mqe: warning: anyone who reaches {arguments.host} can open this page and drive the robots")
+        say(f"mqe: warning: every machine that reaches {arguments.host} can open this page and control the robots")
     say(f"mqe: open {viewer.url} in a browser; Ctrl-C ends")
     viewer.run()

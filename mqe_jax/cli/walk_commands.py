@@ -60,7 +60,7 @@ def walk_train(arguments: WalkTrain) -> None:
 
 
 def walk_eval(arguments: WalkEval) -> dict[str, Any]:
-    """Measures the walk policy and prints a table, or gives the object for `--json`."""
+    """Evaluates the walk policy; prints a table, or returns the object for `--json`."""
     from mqe_jax import robots, walk_policy
     from mqe_jax.walk.evaluation import evaluate_walk
 
