@@ -38,7 +38,7 @@ def plain(*objects: objects.Object) -> Any:
     return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
 
 
-def test_a_ball_that_was_kicked_rolls_and_comes_to_rest() -> None:
+def test_a_ball_with_initial_velocity_rolls_and_comes_to_rest() -> None:
     scene = plain(Ball("ball"))
     index, data = scene.objects["ball"], mujoco.MjData(scene.model)
     data.qpos[index.qpos[:3]] = [2.0, 3.0, 0.1]

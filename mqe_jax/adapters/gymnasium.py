@@ -146,7 +146,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Starts episodes.
 
         Args:
-            seed: of environment 0 (environment i uses seed + i), or one per environment; None continues the PRNG stream.
+            seed: of environment 0 (environment i: seed + i), or one per environment; None continues the PRNG stream.
             options: `reset_mask` (N,) bool selects the environments to reset.
         """
         super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
@@ -169,7 +169,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Advances all environments by one step; actions are clipped to [-1, 1]."""
         if self.autoreset_mode is AutoresetMode.DISABLED:
             if self._ended.any():
-                raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask")
+                raise InputError(
+                    f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask"
+                )
             out = self._host.step(actions)
         else:
             same_step = self.autoreset_mode is AutoresetMode.SAME_STEP

@@ -148,7 +148,7 @@ def _restarted(env: QuadrupedEnv, state: State) -> State:
 
 
 def _selected(env: QuadrupedEnv, choose: jax.Array, first: State, second: State) -> State:
-    """Returns `first` where `choose` () is true, else `second`, without selecting between buffers that environments share."""
+    """Returns `first` where `choose` () is true, else `second`; buffers that environments share are not selected."""
     data = env.physics.merge(choose, first.data, second.data)
     first = dataclasses.replace(first, data=data)
     names = [field.name for field in dataclasses.fields(State) if field.name != "data"]

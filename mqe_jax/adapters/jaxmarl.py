@@ -24,7 +24,7 @@ Arrays = dict[str, jax.Array]
 
 
 class Env(MultiAgentEnv):
-    """One environment, to be batched by `jax.vmap`; its state is the task's `State`, whose `final_obs` is kept by a reset.
+    """One environment; batch with `jax.vmap`. Its state is the task's `State`, whose `final_obs` is kept by a reset.
 
     Infos have one value per agent (A,), the shape that JaxMARL's baselines expect: `truncation`, and the metrics. Dones
     are true on termination and on truncation.

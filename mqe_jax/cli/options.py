@@ -53,9 +53,7 @@ Control = Annotated[
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
 TaskRobot = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or the run's robot."
-    ),
+    tyro.conf.arg(metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or the run's robot."),
 ]
 
 

@@ -36,7 +36,7 @@ class DivergenceRecorder:
         return content(env_state)
 
     def add(self, trace: Trace) -> None:
-        """Writes a recording of each environment that diverged in the trace, starting in the previous trace if needed."""
+        """Writes a recording of each environment that diverged in a trace, with steps of the previous one if needed."""
         for step, index in np.argwhere(np.asarray(trace.diverged) > 0.0)[: LIMIT - len(self.written)]:
             parts = [trace] if self._previous is None else [self._previous, trace]
             steps, actions = jax.tree.map(

@@ -91,7 +91,9 @@ def check_above(spawn_height: float, top: float, robot: str) -> None:
     """
     least = top + robots.get(robot).stand_height
     if spawn_height < least:
-        raise InputError(f"spawn_height: {spawn_height} must be at least {least:.2f}, as the supporting surface is at {top}")
+        raise InputError(
+            f"spawn_height: {spawn_height} must be at least {least:.2f}, as the supporting surface is at {top}"
+        )
 
 
 def check_gap(name: str, width: float, track_width: float) -> None:

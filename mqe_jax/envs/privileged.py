@@ -91,7 +91,7 @@ class PrivilegedObservation:
         randomized: RandomizedParams,
         walk: WalkMemory | None,
     ) -> jax.Array:
-        """Returns the observation of one environment (P,); `walk` is the walk policy's recurrent state, leading axis R."""
+        """Returns the observation of one environment (P,); `walk` is the walk policies' recurrent state (R, ...)."""
         robots = jnp.concatenate(
             [
                 robot_state.position_w,

@@ -129,7 +129,7 @@ class Go1SheepEasy(QuadrupedEnv):
     def scene(self) -> Scene:
         params = self.params
         before, middle, behind = params.lengths
-        spawn = SpawnArea(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
+        spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))

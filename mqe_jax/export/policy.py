@@ -1,8 +1,8 @@
 """A team's policy as one ONNX graph: the high-level policy and, in `command` control, the walk policy.
 
 Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
-the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in that
-frame, commands and joint targets in the robots' frame.
+the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in
+that frame, commands and joint targets are in the robots' frame.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|

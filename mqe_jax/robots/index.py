@@ -38,8 +38,8 @@ class RobotIndex:
     geoms: np.ndarray
     """Collision geom ids of each robot (R, G)."""
     trunk_force: np.ndarray
-    """Addresses in sensordata of the strongest contact force on each of the trunk's T collision geoms (R, T, 3), contact
-    frame, N.
+    """Addresses in sensordata of the strongest contact force on each of the trunk's T collision geoms (R, T, 3),
+    contact frame, N.
     """
     foot_force: np.ndarray
     """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless the scene has foot

@@ -1,9 +1,9 @@
 """Sweeps: tasks x algorithms x settings x seeds in one folder, resumed after any interruption.
 
-FOLDER/sweep.yaml    what the folder holds
+FOLDER/sweep.yaml    settings of the sweep
 FOLDER/runs/...      run folders, with checkpoints
-FOLDER/raw/...       raw data of the runs that have ended (`mqe_jax.study.records`)
-FOLDER/report/...    the report, remade when the sweep ends (`mqe_jax.study.report`)
+FOLDER/raw/...       raw data of finished runs (`mqe_jax.study.records`)
+FOLDER/report/...    the report, regenerated when the sweep ends (`mqe_jax.study.report`)
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Environments = Callable[[TrainConfig, int], tuple[VectorEnv, VectorEnv | None]]
 
 @record
 class Sweep:
-    """What a sweep trains: every combination of tasks, algorithms, variants and seeds."""
+    """Settings of a sweep, which trains every combination of tasks, algorithms, variants and seeds."""
 
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
-    """Names of the algorithms, as of `mqe train --algorithm`."""
+    """Names of the algorithms, as in `mqe train --algorithm`."""
     seeds: Annotated[tuple[NonNegativeInt, ...], MinLen(1)] = (0, 1, 2, 3, 4)
     """Random seeds."""
     seeds_together: PositiveInt | None = None
@@ -177,13 +177,13 @@ def prepare(sweep: Sweep, folder: Path) -> None:
 
 
 def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> list[Job]:
-    """Trains the jobs sequentially; each continues from its checkpoints and leaves raw data when it ends.
+    """Trains the jobs sequentially; each resumes from its checkpoints and writes raw data at its end.
 
     Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
     first. Returns the jobs left to other processes.
 
     Raises:
-        InputError: where a run cannot be continued.
+        InputError: where a run cannot be resumed.
     """
     left = []
     for job in jobs:

@@ -27,7 +27,7 @@ def render_frames(
 ) -> Iterator[np.ndarray]:
     """Yields the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
-    `views` holds a camera for each frame; the whole scene is in view if None.
+    `views` holds a camera for each frame; the view is `scene` if None.
 
     `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
@@ -53,8 +53,8 @@ def render_episode(
 ) -> str:
     """Renders an episode to a file by suffix; returns the renderer (`egl`, `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; a following view of a
-    clip, the whole scene in a picture. `speed` below 1 is slow motion; `at` is the time of a picture, s (the middle).
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow` for
+    a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the middle).
     Without GL, one line on standard error names the packages for 3-D images.
     """
     check_output(path)
