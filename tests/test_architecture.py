@@ -15,7 +15,7 @@ def test_every_import_goes_down() -> None:
     assert architecture.violations() == []
 
 
-def test_the_picture_is_drawn_from_the_present_imports() -> None:
+def test_the_import_diagram_is_up_to_date() -> None:
     """docs/architecture.svg is up to date, and docs/architecture.md names every module."""
     assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.draw()
     page = architecture.PICTURE.with_suffix(".md").read_text(encoding="utf-8")
@@ -23,7 +23,7 @@ def test_the_picture_is_drawn_from_the_present_imports() -> None:
 
 
 def test_a_wrong_import_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An import upwards is found, also inside a function, and told with its file."""
+    """An upward import is found, also inside a function, and reported with its file."""
     package = tmp_path / "mqe_jax"
     (package / "train").mkdir(parents=True)
     (package / "train" / "__init__.py").write_text("def late():\n    from mqe_jax.envs import make\n")

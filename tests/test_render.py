@@ -1,4 +1,4 @@
-"""Drawing: what is in the frame, what lands on disk, what is refused."""
+"""Rendering: content of the frames, written files, rejected input."""
 
 import os
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv
 
 
 def in_image(model: Any, camera: cameras.Camera, point: np.ndarray, aspect: float) -> float:
-    """How far from the image's centre a point is drawn: 1 is its edge."""
+    """Distance of a point's projection from the image centre: 1 is the edge."""
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])
@@ -144,7 +144,7 @@ def test_a_broken_drawing_leaves_nothing_behind(tmp_path: Path) -> None:
 )
 def test_bad_outputs_are_refused(tmp_path: Path, name: str, said: str) -> None:
     if name.startswith("/proc") and not os.path.isdir("/proc"):
-        pytest.skip("no folder here that nobody may write")
+        pytest.skip("no read-only folder here")
     with pytest.raises(ValueError, match=said):
         clips.check_output(tmp_path / name)
 

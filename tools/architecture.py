@@ -145,7 +145,7 @@ def main() -> int:
             wrong.append(f"{PICTURE.relative_to(ROOT)}: out of date; run python tools/architecture.py")
     else:
         PICTURE.write_text(draw(), encoding="utf-8")
-    print("\n".join(wrong) or "every import goes down")
+    print("\n".join(wrong) or "all imports respect the layering")
     return 1 if wrong else 0
 
 
