@@ -150,7 +150,7 @@ class Controller:
     num_agents: int
     """Number of agents A: the first A robots."""
     walk_params: walk_policy.Params | None
-    """Weights of the walk policy, or None where it is not used."""
+    """Weights of the walk policy, or None if it is not used."""
     actuator_params: ActuatorParams | None
     """Weights of the actuator network, or None for PD."""
     commands: tuple[str, ...]

@@ -7,8 +7,8 @@ A record is a frozen dataclass whose fields carry their types and bounds once, a
         clip: Positive = 0.2
         \"\"\"Half width of the clipping interval of the ratio.\"\"\"
 
-Fields are given by keyword. Every way of making a record, `Ppo(clip=0.1)` included, validates it, and raises an
-`InputError` of one line: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
+Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and raises a one-line
+`InputError`: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
 
 Numbers are finite unless a field is `AnyFloat`; booleans are rejected as numbers; numpy scalars and strings such as
 "7e-4" (which YAML does not read as a number) are accepted; "none" means None for an optional field.
@@ -127,7 +127,7 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
-    """Returns a record as nested mappings, lists and scalars that YAML and JSON can hold.
+    """Returns a record as nested mappings, lists and scalars that YAML and JSON can represent.
 
     Raises:
         InputError: for a value in a free mapping that is none of these.
@@ -139,7 +139,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
     """Reads names and values from a YAML file; an empty file holds none.
 
     Raises:
-        InputError: naming the file, where it cannot be read or is not a mapping.
+        InputError: naming the file, if it cannot be read or is not a mapping.
     """
     try:
         values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
@@ -335,7 +335,7 @@ def _one_line(kind: Any, values: Any, error: pydantic.ValidationError) -> InputE
 
 
 def _locate(kind: Any, values: Any, error: ErrorDetails) -> tuple[list[str], Any, Any]:
-    """Returns the path of the field at fault, its annotated type, and the value given for it."""
+    """Returns the path of the invalid field, its annotated type, and the given value."""
     path: list[str] = []
     where = kind
     for part in error["loc"]:

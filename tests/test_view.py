@@ -263,7 +263,7 @@ def page(viewer: SimpleNamespace) -> Iterator[Page]:
 def test_a_robot_is_driven_from_the_page(page: Page) -> None:
     """Hold the drive button, then press keys: only the selected robot moves on the page."""
     page.choose("Driven", "robot 2")
-    page.until(lambda: "2 (you)" in page.text())
+    page.until(lambda: "2 (driven)" in page.text())
     start = page.robots()
     button = page.page.get_by_role("button", name="Forward", exact=True)
     button.scroll_into_view_if_needed()

@@ -55,7 +55,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Makes the environment.
+        """Creates the environment.
 
         Args:
             task: id, or an environment.
@@ -109,7 +109,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Makes the environments.
+        """Creates the environments.
 
         Args:
             task: id, or an environment.

@@ -63,7 +63,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Makes the environment.
+        """Creates the environment.
 
         Args:
             task: id, or an environment.

@@ -43,7 +43,7 @@ First steps:
   mqe train go1gate --config demo             train two robots to pass a gate (minutes on a CPU)
   mqe eval runs/go1gate                       evaluate the trained policy
   mqe render runs/go1gate -o gate.mp4         render the trained policy
-  mqe view go1gate                            watch and drive in the browser
+  mqe view go1gate                            live view and teleoperation in the browser
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
@@ -63,7 +63,7 @@ class Tasks:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a team on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
+    """Train a policy on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
 
     task: tyro.conf.Positional[str]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
@@ -131,7 +131,7 @@ class Render:
     """File to write: .mp4, .gif or .png."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    (straight on at half speed). Default for a task: scripted if available, else forward."""
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -168,7 +168,7 @@ class Replay:
     """Replay a recording of diverged physics, and render it with --output."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Recording that `--dump-diverged` wrote (.npz)."""
+    """Recording written by `--dump-diverged` (.npz)."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
     """Clip or image to write: .mp4, .gif or .png."""
     impl: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
@@ -222,7 +222,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train tasks x algorithms x settings x seeds into one folder, and report; resumes interrupted runs."""
+    """Train all combinations of tasks, algorithms, settings and seeds, and report; resumes interrupted runs."""
 
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""

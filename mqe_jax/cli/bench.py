@@ -98,7 +98,7 @@ def device_name() -> str:
 
 
 def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a CSV file, written atomically; InputError where the file has other columns."""
+    """Appends a row to a CSV file, written atomically; InputError if the file has other columns."""
     rows: list[dict[str, Any]] = []
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:

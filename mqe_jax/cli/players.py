@@ -35,7 +35,7 @@ class Player:
         """Returns the batched `act` of all agents.
 
         Raises:
-            InputError: where the policy or the opponent does not fit the task.
+            InputError: if the policy or the opponent does not fit the task.
         """
         act = self._own_act(env, deterministic)
         if self.opponent is not None and len(env.teams) < 2:
@@ -78,7 +78,7 @@ def against(act: Act, opponent: Act, env: Any) -> Act:
 
 
 def planner(name: str, env: Any) -> Act:
-    """Returns the `act` of a scripted or trivial policy; InputError where the task has no scripted one."""
+    """Returns the `act` of a scripted or trivial policy; InputError if the task has no scripted one."""
     shape = (env.num_agents, env.action_size)
     plan = _scripted(env) if name == "scripted" else None
 

@@ -58,13 +58,13 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[VectorEnv,
 
 
 def platform() -> str:
-    """Returns the platform of JAX; raises an InputError where JAX_PLATFORMS names one that is missing."""
+    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable one."""
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        asked = os.environ.get("JAX_PLATFORMS", "")
-        said = str(error) or "no such device"
-        raise InputError(f"JAX_PLATFORMS: {asked!r} cannot be used here ({said}); try cpu") from None
+        requested = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error) or "no such device"
+        raise InputError(f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu") from None
 
 
 def find_config(name: str) -> Path:

@@ -19,7 +19,7 @@ class View:
     """Id of a task, or run folder."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    (straight on at half speed). Default for a task: scripted if available, else forward."""
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None

@@ -1,4 +1,4 @@
-"""Compares an exported graph in onnxruntime with the JAX functions that it was made from."""
+"""Compares an exported graph in onnxruntime with the exported JAX functions."""
 
 from __future__ import annotations
 

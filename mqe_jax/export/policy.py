@@ -65,7 +65,7 @@ def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
-    """Writes a model atomically; InputError where the file cannot be written."""
+    """Writes a model atomically; InputError if the file cannot be written."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Scripted policies of football: move behind the ball on the line to an open part of the goal, then walk through it."""
+"""Scripted policies of football: move behind the ball, facing an open part of the goal, then push it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scripted policy of Push Cylinder: align with the cylinder's axis, then push a little faster than it moves."""
+"""Scripted policy of Push Cylinder: align with the cylinder's axis, then push slightly faster than it moves."""
 
 from __future__ import annotations
 

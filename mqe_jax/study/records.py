@@ -88,7 +88,7 @@ def read_curve(path: Path) -> Curve:
     """Reads the columns of a metrics.csv or of a thinned curve.
 
     Raises:
-        InputError: naming the file, where it is missing or not such a table.
+        InputError: naming the file, if it is missing or malformed.
     """
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -136,7 +136,7 @@ def read_records(folder: Path) -> list[Record]:
     """Reads every run below FOLDER/raw, ordered by path and seed.
 
     Raises:
-        InputError: where there is none, or a file of one is missing or damaged.
+        InputError: if there is none, or a run's file is missing or damaged.
     """
     paths = sorted((folder / "raw").glob("*/*/seed*.json"))
     if not paths:

@@ -35,7 +35,7 @@ def report(folder: Path) -> list[Path]:
     """Writes FOLDER/report from FOLDER/raw; returns the files.
 
     Raises:
-        InputError: where the raw data are missing or damaged.
+        InputError: if the raw data are missing or damaged.
     """
     records = read_records(folder)
     cells: dict[Cell, list[Record]] = {}
@@ -136,7 +136,7 @@ def _absolute(record: Record, name: str) -> float:
 
 
 def _one(values: Sequence[float]) -> tuple[float, float, float]:
-    """Returns estimate and interval of one number over seeds, NaN where a seed has none."""
+    """Returns estimate and interval of one number over seeds, NaN if a seed has no value."""
     scores = np.array(values)[:, None]
     if not np.isfinite(scores).all():
         return math.nan, math.nan, math.nan

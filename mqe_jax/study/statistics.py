@@ -70,7 +70,7 @@ def bootstrap_interval(
     Tasks are the strata and stay fixed. With a single run both bounds equal the statistic.
 
     Raises:
-        InputError: where scores are not (runs, tasks), or not finite.
+        InputError: if scores are not (runs, tasks), or not finite.
     """
     groups = [np.asarray(group, np.float64) for group in ([scores] if isinstance(scores, np.ndarray) else scores)]
     for group in groups:

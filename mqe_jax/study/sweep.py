@@ -86,7 +86,7 @@ def load_sweep(path: Path) -> Sweep:
     """Reads a sweep's YAML file.
 
     Raises:
-        InputError: naming the file, for anything that is wrong in it.
+        InputError: naming the file, for invalid content.
     """
     try:
         return build(Sweep, load_yaml(path))
@@ -160,7 +160,7 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     """Creates the folder and writes sweep.yaml into it; tasks, algorithms, variants and seeds may be added later.
 
     Raises:
-        InputError: where the folder holds a sweep of other settings.
+        InputError: if the folder holds a sweep of other settings.
     """
     check_folder(folder)
     path = folder / SWEEP_FILE
@@ -180,10 +180,10 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
     """Trains the jobs sequentially; each resumes from its checkpoints and writes raw data at its end.
 
     Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
-    first. Returns the jobs left to other processes.
+    first. Returns the jobs skipped because other processes hold their cells.
 
     Raises:
-        InputError: where a run cannot be resumed.
+        InputError: if a run cannot be resumed.
     """
     left = []
     for job in jobs:
@@ -196,7 +196,7 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
                 left.append(job)
                 continue
             if all(_raw(folder, job.cell, config.seed).is_file() for config in job.configs):
-                continue  # ended by another process since the jobs were planned
+                continue  # finished by another process since the jobs were planned
             env, eval_env = environments(job.configs[0], len(job.configs))
             train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
             for config, run_dir in zip(job.configs, job.folders, strict=True):

@@ -31,7 +31,7 @@ class ActorCritic(GaussianSettings):
     critic_input: Literal["privileged", "observations", "own"] = "privileged"
     """Critic input: the privileged observation, all agents' observations, or each agent's own."""
     share_policy: bool = True
-    """Share one actor between all agents, which then differ only by an id in their observations; or one actor each."""
+    """Share one actor between all agents, distinguished only by an id in their observations; else one per agent."""
     hidden_sizes: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64,)
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"

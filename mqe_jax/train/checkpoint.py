@@ -92,7 +92,7 @@ def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
     Raises:
-        InputError: in one line naming the file, for a missing, damaged, truncated or foreign file, another format
+        InputError: in one line naming the file, for a missing, damaged or truncated file, another format or format
             version, and leaves that are missing, unknown or of another shape or dtype.
     """
     path = Path(path)
@@ -146,7 +146,7 @@ def prepare_folder(run_dir: Path, resume: bool, files: Sequence[str]) -> Path | 
         files: names of a run's files, besides its checkpoints.
 
     Raises:
-        InputError: where the folder cannot be written, holds a run that is not to be resumed, or one without a
+        InputError: if the folder cannot be written, holds a run that is not to be resumed, or one without a
             checkpoint. Nothing in it is changed.
     """
     check_folder(run_dir)

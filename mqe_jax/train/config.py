@@ -117,7 +117,7 @@ class Checkpointing:
     every: PositiveInt = 20
     """Updates between two checkpoints."""
     kept: PositiveInt = 2
-    """Number of the newest checkpoints to keep."""
+    """Number of checkpoints to keep, the newest ones."""
     environments: bool = True
     """Include the environments' states, so that a resumed run continues exactly. Without them a checkpoint holds only
     weights, optimiser state, statistics and keys (under 1 MB), and environments are reset when a run resumes."""
@@ -178,7 +178,7 @@ class TrainConfig:
 
     @property
     def training_env(self) -> dict[str, Any]:
-        """Overrides of the task's parameters while training."""
+        """Overrides of the task's parameters during training."""
         return {**self.env, **self.train_env}
 
     @property
@@ -196,7 +196,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
     """Reads settings from a YAML file, with overrides by nested or dotted names.
 
     Raises:
-        InputError: naming the file, for anything that is wrong in it; for an override, naming the setting.
+        InputError: naming the file, for invalid content; for an invalid override, naming the setting.
     """
     values = load_yaml(path)
     try:

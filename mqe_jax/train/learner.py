@@ -1,7 +1,7 @@
-"""PPO for teams: one pure function from a learner state to the next.
+"""Multi-agent PPO as one pure function from a learner state to the next.
 
 A rollout of all environments, advantages, then epochs of minibatches. MAPPO, JRPO, independent PPO and their variants
-differ in the ratio that PPO clips, the kind of value, and the network; all three are settings.
+differ in the ratio that PPO clips, the value (per agent or per team) and the network; all three are settings.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], 
     With `snapshot` (see `Recorder`), the metrics of an update also hold `trace`, a `Trace` of the rollout.
 
     Raises:
-        InputError: where the settings do not fit the environment.
+        InputError: if the settings do not fit the environment.
     """
     _check_environment(env, config)
     dims = env_dims(env, config)

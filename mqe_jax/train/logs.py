@@ -168,7 +168,7 @@ LOGGERS: dict[str, Callable[[Path, int], MetricsLog]] = {"tensorboard": TensorBo
 
 
 def check_loggers(names: tuple[str, ...]) -> None:
-    """Raises an InputError where a logger needs a package that is not installed; TensorBoard is optional."""
+    """Raises an InputError if a logger needs a package that is not installed; TensorBoard is optional."""
     if "wandb" in names and importlib.util.find_spec("wandb") is None:
         raise InputError("loggers: 'wandb' needs the package wandb; pip install 'mqe-jax[log]'")
 

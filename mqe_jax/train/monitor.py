@@ -144,7 +144,7 @@ def read_evaluations(run_dir: Path) -> dict[str, Any]:
     """Reads a run's evaluations; without the file there are none.
 
     Raises:
-        InputError: where the file is damaged.
+        InputError: if the file is damaged.
     """
     path = run_dir / EVALUATIONS_FILE
     if not path.is_file():

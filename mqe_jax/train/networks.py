@@ -81,7 +81,7 @@ class NetworkSettings:
     """Registered name of the network that the other fields configure."""
 
     def build(self, dims: EnvDims) -> Network:
-        """Returns the network for an environment; InputError where the settings do not fit it."""
+        """Returns the network for an environment; InputError if the settings do not fit it."""
         raise NotImplementedError
 
 

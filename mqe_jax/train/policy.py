@@ -101,7 +101,7 @@ def load_policy(run: str | Path) -> Policy:
     """Reads the policy of a run folder, or a policy file.
 
     Raises:
-        InputError: in one line naming the file, where it is missing, damaged, foreign or not finite.
+        InputError: in one line naming the file, if it is missing, damaged, of another format or non-finite.
     """
     path = Path(run)
     if path.is_dir():

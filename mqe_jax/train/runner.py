@@ -69,7 +69,7 @@ def train(
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
             process, or holds a run that is not to be resumed, has no checkpoint, or has other settings.
         NonFiniteError: after the first update with a non-finite loss or weight. Checkpoints and policy
-            on disk are those from before.
+            on disk are from before that update.
     """
     return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, recorder)[0]
 
@@ -108,7 +108,7 @@ def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
     """Returns each folder's checkpoint at the newest step common to all; None (start from scratch) if any has none.
 
     Raises:
-        InputError: where the folders have no step in common.
+        InputError: if the folders have no step in common.
     """
     by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
     common = set.intersection(*map(set, by_step))
@@ -187,7 +187,7 @@ class _Training:
         return [self._seed(i) for i in range(len(self._configs))]
 
     def _seed(self, i: int, state: TrainState | None = None) -> TrainState:
-        """Returns one seed's state, of the current ones or of those given."""
+        """Returns one seed's state from the current states, or from `state` if given."""
         states = self._state if state is None else state
         return states if self._single else take(states, self._shared, i)
 

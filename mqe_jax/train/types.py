@@ -104,7 +104,7 @@ def join_traces(traces: Trace) -> Trace:
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
-    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or with a `replace` of its own.
+    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or a class with a `replace` method.
 
     Raises:
         InputError: for another kind of state.

@@ -64,7 +64,9 @@ class Panel:
         for agent, (x, y, z) in enumerate(positions):
             vx, vy, turn = commands[agent]
             driven = (
-                " (you)" if (session.drive.env, session.drive.robot) == (self.env, agent) and session.drivable else ""
+                " (driven)"
+                if (session.drive.env, session.drive.robot) == (self.env, agent) and session.drivable
+                else ""
             )
             rows.append(f"| {agent + 1}{driven} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
         pace = "paused" if session.paused else f"{real_time:.2f} x real time"

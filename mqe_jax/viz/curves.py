@@ -15,7 +15,7 @@ _INK, _RUN, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:
-    """Returns the columns of a metrics.csv; InputError where it is missing or not one."""
+    """Returns the columns of a metrics.csv; InputError if it is missing or not one."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)

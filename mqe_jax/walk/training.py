@@ -118,7 +118,7 @@ def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index:
 def init_learner(
     key: jax.Array, config: WalkConfig, privileged_size: int, policy: walk_policy.Params | None = None
 ) -> WalkLearner:
-    """Samples the initial weights; those of the policy are `policy` where given, for fine-tuning."""
+    """Samples the initial weights; those of the policy are `policy` if given, for fine-tuning."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     params = {
         "policy": walk_policy.init_params(policy_key) if policy is None else policy,
@@ -293,7 +293,7 @@ def save(run_dir: Path, learner: WalkLearner, robot: Robot, config: WalkConfig) 
 
 
 def restore(run_dir: Path, learner: WalkLearner, robot: Robot) -> WalkLearner:
-    """Returns the learner of a run's newest checkpoint; `learner` itself where there is none.
+    """Returns the learner of a run's newest checkpoint; `learner` itself if there is none.
 
     Raises:
         InputError: if the checkpoint is damaged or of another robot.
