@@ -136,7 +136,7 @@ def to_mapping(settings: Any) -> dict[str, Any]:
 
 
 def load_yaml(path: str | Path) -> dict[str, Any]:
-    """Reads names and values from a YAML file; an empty file holds none.
+    """Reads names and values from a YAML file; an empty file gives an empty mapping.
 
     Raises:
         InputError: naming the file, if it cannot be read or is not a mapping.

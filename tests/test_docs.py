@@ -110,14 +110,14 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert "final_obs" in reference and "Advances one environment" in reference
 
 
-def test_tables_of_tasks_say_what_the_docstrings_say() -> None:
+def test_tables_of_tasks_match_the_docstrings() -> None:
     pytest.importorskip("mkdocs")
     import docs_pages
 
     from mqe_jax.envs.gate import Go1Gate
 
     page = docs_pages.task_page(Go1Gate)
-    assert "| `collision` | -2 | Paid in steps with any trunk contact. |" in page
+    assert "| `collision` | -2 | In steps with any trunk contact. |" in page
     assert "| `gate` | 2 | centre of the gap, m |" in page
     assert "| `gate_width` | 0.6 | Width of the gap, m. |" in page
     assert "| `robot` | `go1` | Name of the robot" in page

@@ -36,7 +36,7 @@ def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, ep
 
 def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: recording.Episode) -> None:
     assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
-    drawn = geometry.drawn_model(env.mj_model, episode)
+    drawn = geometry.rendering_model(env.mj_model, episode)
     low, high = geometry.extent(drawn, episode)
     assert high[1] == pytest.approx(1.5) and low[1] == pytest.approx(-1.5)
     own = geometry.extent(env.mj_model, episode)[1][1]
@@ -57,7 +57,7 @@ def in_image(model: Any, camera: cameras.Camera, point: np.ndarray, aspect: floa
 
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9])
 def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: recording.Episode, aspect: float) -> None:
-    model = geometry.drawn_model(env.mj_model, episode)
+    model = geometry.rendering_model(env.mj_model, episode)
     camera = cameras.default_camera(model, episode, aspect)
     low, high = geometry.extent(model, episode)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T

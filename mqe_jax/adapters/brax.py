@@ -54,7 +54,7 @@ class Env(BraxEnv):
         state = self.env.reset(rng)
         obs = state.obs.reshape(-1)
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
-        pipeline: Any = state  # any pytree, whatever Brax's annotation
+        pipeline: Any = state  # any pytree, although Brax's annotation is narrower
         zero = jnp.zeros(())
         return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=state.metrics, info=info)
 

@@ -14,7 +14,7 @@ import numpy as np
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
 from mqe_jax.viz.cameras import Camera, default_camera
-from mqe_jax.viz.geometry import drawn_model
+from mqe_jax.viz.geometry import rendering_model
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.render import render_frames
 
@@ -117,7 +117,7 @@ class HostEnvs:
         pose = (np.asarray(x)[index : index + 1] for x in (data.qpos, data.mocap_pos, data.mocap_quat))
         episode = Episode(*pose, dt=self.env.dt)
         if self._camera is None:
-            model = drawn_model(self.env.mj_model, episode)
+            model = rendering_model(self.env.mj_model, episode)
             self._camera = default_camera(model, episode, size[0] / size[1])
         return np.array(next(iter(render_frames(self.env, episode, [self._camera], size))))
 

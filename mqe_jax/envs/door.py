@@ -1,4 +1,4 @@
-"""go1revolvingdoor, the paper's Revolving Door: two robots race through a door that one robot can pass at a time."""
+"""go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a door that is wide enough for one."""
 
 from __future__ import annotations
 

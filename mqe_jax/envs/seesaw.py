@@ -1,4 +1,4 @@
-"""go1seesaw, the paper's Climb on Seesaw: one robot holds a seesaw down while the other walks up to a platform."""
+"""go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted while the other walks up to a platform."""
 
 from __future__ import annotations
 

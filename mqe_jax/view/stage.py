@@ -11,7 +11,7 @@ import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
 from mqe_jax.view.session import Frame
-from mqe_jax.viz.geometry import COLLISION_GROUP, drawn_model, extent, pose
+from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
@@ -38,7 +38,7 @@ class Stage:
         self._data = mujoco.MjData(self._model)
         self._count = len(frame.qpos)
         first = _episode(frame, 0, env.dt)
-        low, high = extent(drawn_model(self._model, first), first)
+        low, high = extent(rendering_model(self._model, first), first)
         self.centre, self.size = (low + high) / 2, high - low
         shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
         self._offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
@@ -175,10 +175,10 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
 
 def _wall_boxes(model: mujoco.MjModel, episode: Episode, geoms: list[int]) -> tuple[np.ndarray, ...]:
     """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, clipped at the side walls."""
-    drawn = drawn_model(model, episode)
-    data = mujoco.MjData(drawn)
-    pose(drawn, data, episode, 0)
+    clipped = rendering_model(model, episode)
+    data = mujoco.MjData(clipped)
+    pose(clipped, data, episode, 0)
     turns = np.zeros((len(geoms), 4))
     for row, geom in enumerate(geoms):
         mujoco.mju_mat2Quat(turns[row], data.geom_xmat[geom])
-    return data.geom_xpos[geoms].copy(), turns, drawn.geom_size[geoms].copy()
+    return data.geom_xpos[geoms].copy(), turns, clipped.geom_size[geoms].copy()

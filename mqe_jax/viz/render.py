@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.viz.cameras import Camera, cameras
 from mqe_jax.viz.clips import check_output, write_clip
-from mqe_jax.viz.geometry import drawn_model
+from mqe_jax.viz.geometry import rendering_model
 from mqe_jax.viz.gl import draw_gl, gl_backend
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.top_view import draw_top
@@ -31,7 +31,7 @@ def render_frames(
 
     `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
-    model = drawn_model(env.mj_model, episode)
+    model = rendering_model(env.mj_model, episode)
     if backend == "auto":
         backend = gl_backend()
     if backend is None:
@@ -70,7 +70,7 @@ def render_episode(
         )
     aspect = size[0] / size[1]
     if suffix == ".png":
-        views = cameras(drawn_model(env.mj_model, episode), episode, view or "scene", aspect)
+        views = cameras(rendering_model(env.mj_model, episode), episode, view or "scene", aspect)
         shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
         if backend is not None:
             views = views[shown : shown + 1]
@@ -83,6 +83,6 @@ def render_episode(
     else:
         episode = episode.every(max(1, round(speed / (fps * episode.dt))))
         fps = speed / episode.dt
-        views = cameras(drawn_model(env.mj_model, episode), episode, view or "follow", aspect)
+        views = cameras(rendering_model(env.mj_model, episode), episode, view or "follow", aspect)
     write_clip(path, render_frames(env, episode, views, size, backend), fps)
     return backend or "matplotlib"
