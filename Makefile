@@ -1,4 +1,4 @@
-# Needs Python >= 3.11, pip and make: every target makes .venv and installs what it needs.
+# Needs Python >= 3.11, pip and make: every target creates .venv and installs its dependencies.
 .DEFAULT_GOAL := help
 SHELL := /bin/bash
 VENV := .venv
@@ -9,16 +9,16 @@ EXTRAS ?= render,log,dev
 # The first Python that is new enough; override with `make PYTHON=/path/to/python3`.
 PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 python,\
   $(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
-# How many test files run side by side.
+# Number of parallel test processes.
 TEST_JOBS ?= 2
 SOURCES := $(wildcard mqe_jax tests examples tools)
 
 .PHONY: help install demo test soak docs check fmt clean system browser
 
-help: ## Say what the targets do
+help: ## List the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-install: $(STAMP) ## Make .venv and install the package with its tools
+install: $(STAMP) ## Create .venv and install the package with its tools
 
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "make: no Python >= 3.11 found; name one with make PYTHON=/path/to/python3" >&2; exit 2; }
@@ -30,13 +30,13 @@ $(STAMP): pyproject.toml constraints.txt
 	$$pip install --disable-pip-version-check -q -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 
-system: ## Install the GL libraries for pictures, where that is possible
+system: ## Install the GL libraries for rendering, where possible
 	@bash tools/install_gl.sh
 
-browser: ## Install Debian's Chromium for the test of `mqe view`, where that is possible
+browser: ## Install Debian's Chromium for the test of `mqe view`, where possible
 	@bash tools/install_chromium.sh
 
-demo: $(STAMP) system ## Train Narrow Gate on the CPU, print before and after, leave runs/demo
+demo: $(STAMP) system ## Train Narrow Gate on the CPU, evaluate before and after, write to runs/demo
 	JAX_PLATFORMS=cpu $(BIN)/mqe demo
 
 test: $(STAMP) ## Run the tests
@@ -56,7 +56,7 @@ check: $(STAMP) ## Lint, formatting, types
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 	$(BIN)/check-jsonschema --builtin-schema vendor.citation-file-format CITATION.cff
 
-fmt: $(STAMP) ## Format and fix what can be fixed
+fmt: $(STAMP) ## Format and apply automatic fixes
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 

@@ -2,8 +2,8 @@
 
     python examples/brax_ppo.py --seeds 0 1 2 --csv brax_ppo.csv
 
-needs `pip install 'mqe-jax[brax]'`. Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 and later no longer
-have; `device_put_replicated` below replaces it.
+needs `pip install 'mqe-jax[brax]'`. Brax 0.14.2 calls `jax.device_put_replicated`, which was removed in
+jax 0.10; `device_put_replicated` below replaces it.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from brax.training.agents.ppo import train as ppo
 from mqe_jax.adapters.brax import Env, wrap
 
 NUM_ENVS, EVAL_ENVS = 64, 512
-# While training, progress counts more than in the task itself, as in configs/demo.yaml; evaluations are on the task.
+# In training the approach reward has a larger weight, as in configs/demo.yaml; evaluations use the unmodified task.
 TRAINING_REWARDS = {"approach": 10.0}
 
 

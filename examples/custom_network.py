@@ -1,7 +1,7 @@
-"""A network of your own: every agent sees its observation beside the mean of all agents' encoded observations.
+"""A custom network: each actor's input is the agent's observation and the mean of all agents' encoded observations.
 
 `python examples/custom_network.py` trains it for a minute on a CPU, on the environment of foreign_env.py. Once
-registered, it is chosen by `network: {name: mean_field}` in YAML like those of the package.
+registered, it is selected by `network: {name: mean_field}` in YAML like the package's networks.
 """
 
 from __future__ import annotations

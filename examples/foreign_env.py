@@ -1,4 +1,4 @@
-"""Trains an environment written by hand: two points on a plane that must meet. No robots, no physics engine.
+"""Trains on an environment outside the package: two points on a plane that must meet, without robots or physics engine.
 
 `python examples/foreign_env.py` prints the distance at the end of episodes before and after; a minute on a CPU.
 """
@@ -33,9 +33,9 @@ class State(NamedTuple):
     reward: jax.Array
     """Rewards (N, 2)."""
     terminated: jax.Array
-    """Whether an episode ended by its rules (N,)."""
+    """Whether an episode terminated (N,)."""
     truncated: jax.Array
-    """Whether an episode ended by the time limit (N,)."""
+    """Whether an episode was truncated at the time limit (N,)."""
     metrics: dict[str, jax.Array]
     """Metrics by name (N,) each."""
 
@@ -76,7 +76,7 @@ class Meeting:
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Moves the agents, and starts new episodes where one has ended."""
+        """Moves the agents, with automatic reset."""
         position = state.position + 0.1 * jnp.clip(action, -1.0, 1.0)
         apart = distance(position)
         truncated = state.step + 1 >= self.max_episode_steps

@@ -43,10 +43,10 @@ CONFIG: dict[str, Any] = {
     "ANNEAL_LR": True,
     "SEED": 0,
 }
-# Factor on the rewards that the learner sees, so that the critic's gradients do not drown those of the policy.
+# Reward scale, so that the critic's gradients do not dominate those of the policy.
 REWARD_SCALE = 0.1
 HIDDEN = (64, 64)
-# While training, progress counts more than in the task itself, as in configs/demo.yaml.
+# In training the approach reward has a larger weight, as in configs/demo.yaml.
 TRAINING_REWARDS = {"approach": 10.0}
 COLUMNS = ("env_steps", "return", "episode_length")
 
@@ -76,7 +76,7 @@ def value_of(params: Any, obs: jax.Array) -> jax.Array:
 
 
 def make_train(config: dict[str, Any], env: Env):
-    """Returns `train(key)`, which gives a table (updates, 3): environment steps, mean return and length."""
+    """Returns `train(key)`, which returns a table (updates, 3): environment steps, mean return and length."""
     from jaxmarl.wrappers.baselines import LogWrapper
 
     wrapped, agents, count = LogWrapper(env), env.agents, config["NUM_ENVS"]
@@ -113,7 +113,7 @@ def make_train(config: dict[str, Any], env: Env):
             action=action,
             log_prob=log_prob(params, obs, action),
             value=value_of(params, obs),
-            # The observation before an automatic reset, so that a truncated episode keeps its own last value.
+            # The observation before an automatic reset, so that a truncated episode bootstraps from its last state.
             next_value=value_of(params, per_agent(state.env_state.final_obs)),
             reward=REWARD_SCALE * stack(reward),
             done=stack(done),
@@ -173,7 +173,7 @@ def own_ippo(config: dict[str, Any], env: Env) -> np.ndarray:
 
 
 def baseline_ippo(checkout: Path, config: dict[str, Any], env: Env) -> np.ndarray:
-    """Trains with the IPPO of a JaxMARL checkout, which finds our environment under the name 'mqe'."""
+    """Trains with the IPPO of a JaxMARL checkout, in which this environment is registered as 'mqe'."""
     import jaxmarl
 
     path = checkout / "baselines" / "IPPO" / "ippo_ff_mabrax.py"
@@ -199,7 +199,7 @@ def baseline_ippo(checkout: Path, config: dict[str, Any], env: Env) -> np.ndarra
 
 
 def plot(rows: np.ndarray, path: Path, title: str) -> None:
-    """Draws the returns over the environment steps."""
+    """Plots the returns over the environment steps."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3), dpi=90, layout="constrained")

@@ -1,6 +1,6 @@
 """A custom task in five steps: a robot catches a mouse that flees from it around a pillar.
 
-docs/new_task.md explains the steps; `python examples/new_task.py` plays the task.
+docs/new_task.md explains the steps; `python examples/new_task.py` evaluates the scripted policy.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class CatchRewards:
     approach: float = 1.0
     """Per m of decrease of the distance between robot and mouse."""
     caught: float = 5.0
-    """Paid in the step in which the robot catches the mouse."""
+    """In the step in which the robot catches the mouse."""
 
 
 @record

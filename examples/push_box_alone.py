@@ -22,7 +22,7 @@ def start(env: QuadrupedEnv, key: jax.Array, place: jax.Array) -> State:
 
 
 def pushed(robots: int, num_envs: int = NUM_ENVS) -> float:
-    """Returns the box's mean displacement, m, at vx 0.8 m/s; with one robot the other stands aside."""
+    """Returns the box's mean displacement, m, at vx 0.8 m/s; with one robot the other is idle."""
     env = mqe_jax.make(
         "go1pushbox", num_envs=num_envs, track_width=8.0, gate_width=7.0, box_noise=0.0, spawn_velocity=0.0
     )

@@ -3,8 +3,8 @@
     pip install 'mqe-jax[pettingzoo]' stable-baselines3 supersuit
     python examples/sb3_pettingzoo.py --csv sb3.csv
 
-Evaluates the returns of agents on the unmodified task before and after. SuperSuit steps environments one after another:
-this shows that the interfaces fit, not how fast training can be.
+Evaluates the returns of agents on the unmodified task before and after. SuperSuit steps environments sequentially: the
+example demonstrates compatibility, not speed.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import numpy as np
 from mqe_jax.adapters import pettingzoo
 
 NUM_ENVS, EPISODES = 8, 32
-# While training, progress counts more than in the task itself, as in configs/demo.yaml.
+# In training the approach reward has a larger weight, as in configs/demo.yaml.
 TRAINING_REWARDS = {"approach": 10.0}
 
 
@@ -35,7 +35,7 @@ def main() -> None:
     """Runs the example."""
     ppo: Any = import_module("stable_baselines3").PPO
     evaluate: Any = import_module("stable_baselines3.common.evaluation").evaluate_policy
-    # PPO's own argument `seed` would call a method that SuperSuit's environments no longer have.
+    # PPO's argument `seed` would call a method that SuperSuit's environments lack.
     import_module("stable_baselines3.common.utils").set_random_seed(0)
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--steps", type=int, default=100_000, help="steps of agents")

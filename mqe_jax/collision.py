@@ -1,4 +1,4 @@
-"""Collision bits: two shapes collide where the contype of one has a bit of the other's conaffinity."""
+"""Collision bits: two geoms collide where the contype of one shares a bit with the other's conaffinity."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ MAX_ROBOTS = 16
 
 
 def robot_bits(number: int) -> tuple[int, int]:
-    """Returns (contype, conaffinity) of all shapes of robot `number`.
+    """Returns (contype, conaffinity) of all collision geoms of robot `number`.
 
-    Its contype is a bit of its own; its conaffinity has the bits of ground, walls, objects and every other robot. So
-    all collision shapes of different robots collide; a robot never collides with itself.
+    Each robot has its own contype bit; its conaffinity includes ground, walls, objects and every other robot. Geoms of
+    different robots therefore collide, geoms of the same robot do not.
     """
     first = 2 * OBJECT_BIT
     own, robots = first << number, (first << MAX_ROBOTS) - first

@@ -63,7 +63,7 @@ def check_commands(names: Sequence[str]) -> tuple[str, ...]:
             allowed = ", ".join(COMMAND_RANGES)
             raise InputError(f"commands: unknown command {name!r}{nearest(name, COMMAND_RANGES)}; allowed: {allowed}")
     if not names or len(set(names)) != len(names):
-        raise InputError(f"commands: {tuple(names)} must name at least one command, none twice")
+        raise InputError(f"commands: {tuple(names)} must be one or more distinct commands")
     return tuple(names)
 
 
@@ -110,7 +110,7 @@ def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Arra
     """Computes joint torques (...), N m, by the actuator network.
 
     Args:
-        params: of the network.
+        params: weights of the network.
         error: joint position minus target at this physics step and the two before (3, ...), rad.
         velocity: joint velocity likewise (3, ...), rad/s.
     """
@@ -126,13 +126,13 @@ class ControlState:
     """Controller state of one environment (R robots)."""
 
     walk: WalkMemory | None
-    """Memories of the walk policies, leading axis R; None where no robot uses one."""
+    """Recurrent states of the walk policies, leading axis R; None if no robot uses one."""
     delayed: jax.Array
     """Past actuator targets, newest first (lag + 1, R, 12)."""
     error: jax.Array
     """Joint position errors of the last two physics steps (2, R, 12), rad; empty without an actuator network."""
     velocity: jax.Array
-    """Joint velocities of the last two physics steps (2, R, 12), rad/s; empty likewise."""
+    """Joint velocities of the last two physics steps (2, R, 12), rad/s; empty without an actuator network."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,11 +150,11 @@ class Controller:
     num_agents: int
     """Number of agents A: the first A robots."""
     walk_params: walk_policy.Params | None
-    """Weights of the walk policy, or None where it is not used."""
+    """Weights of the walk policy, or None if it is not used."""
     actuator_params: ActuatorParams | None
     """Weights of the actuator network, or None for PD."""
     commands: tuple[str, ...]
-    """Commands that the action sets, in order."""
+    """Commands exposed to the action, in order."""
     default_commands: np.ndarray
     """Default commands of the walk policy (15,)."""
     lag: int = 0
@@ -228,7 +228,7 @@ class Controller:
         fields: dict[str, jax.Array],
         xfrc_applied: jax.Array | None,
     ) -> tuple[mjx.Data, ControlState]:
-        """Steps the physics by one environment step under targets (R, 12) that act `lag` () steps late."""
+        """Advances the physics by one environment step with targets (R, 12) delayed by `lag` () steps."""
         delayed = jnp.concatenate([target[None], state.delayed[:-1]])
         target = delayed[lag] if self.lag else target
         state = dataclasses.replace(state, delayed=delayed)

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Bad input from a user: arguments, settings or files. The command line prints it as one line, exit code 2.
+    """Invalid user input: arguments, settings or files. The command line prints it as one line, exit code 2.
 
     Any other exception is a defect of the program and keeps its traceback.
     """
 
 
 class InUseError(InputError):
-    """A folder that another process works in."""
+    """A folder that another process has locked."""
 
 
 class NonFiniteError(ArithmeticError):

@@ -1,4 +1,4 @@
-"""Files and folders: atomic writes, checks before any work, locks."""
+"""Files and folders: atomic writes, write checks, locks."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def flock(
     key: jax.Array,
     position: jax.Array,
     velocity: jax.Array,
-    dogs: jax.Array,
+    robots: jax.Array,
     *,
     restlessness: float,
     step: float,
@@ -24,8 +24,8 @@ def flock(
 ) -> jax.Array:
     """Returns the velocities (S, 2), m/s, of S sheep during the next environment step.
 
-    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over dogs of 0.2 r / q^1.4, with c the herd's centre (this
-    term is omitted for one sheep), r = p - p_dog and q = |r squared element by element|, zero beyond q = 9; then each
+    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4, with c the herd's centre (this
+    term is omitted for one sheep), r = p - p_robot and q = |r squared elementwise|, zero beyond q = 9; then each
     component is clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
     before and half after this, so that the sheep moves at the step's mean speed.
     Source: paper, section III, with the constants of the released system.
@@ -34,7 +34,7 @@ def flock(
         key: random key.
         position: of the sheep (S, 2), m.
         velocity: of the sheep (S, 2), m/s.
-        dogs: positions of the robots (A, 2), m.
+        robots: positions of the robots (A, 2), m.
         restlessness: s in the formula, m/s.
         step: environment step, s.
         friction: sliding friction between sheep and ground.
@@ -46,7 +46,7 @@ def flock(
     if len(position) > 1:
         inward = jnp.mean(position, axis=0) - position
         velocity += restlessness / 1.5 * inward / jnp.maximum(_length(inward), 1e-6)
-    away = position[:, None] - dogs[None]
+    away = position[:, None] - robots[None]
     nearness = jnp.maximum(_length(jnp.square(away)), 1e-3)
     velocity += jnp.sum(jnp.where(nearness > 9.0, 0.0, 0.2 * away / nearness**1.4), axis=1)
     return slowed(jnp.clip(velocity, -top_speed, top_speed), half)

@@ -49,14 +49,14 @@ class Object:
         body.ipos = (0, 0, 0)  # if unset, MuJoCo offsets the centre of mass by `position`
         return body
 
-    def _joint(self, body: Any, suffix: str, kind: Any, damping: float = 0.0, **shape: Any) -> None:
-        body.add_joint(name=f"object/{self.name}/{suffix}", type=kind, damping=(damping, 0, 0), **shape)
+    def _joint(self, body: Any, suffix: str, kind: Any, damping: float = 0.0, **options: Any) -> None:
+        body.add_joint(name=f"object/{self.name}/{suffix}", type=kind, damping=(damping, 0, 0), **options)
 
     def _slides(self, body: Any, axes: str, damping: float = 0.0) -> None:
         for axis in axes:
             self._joint(body, axis, _JOINT.mjJNT_SLIDE, damping, axis=_AXES[axis])
 
-    def _solid(self, body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **shape: Any) -> None:
+    def _solid(self, body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **options: Any) -> None:
         body.add_geom(
             name=f"object/{self.name}",
             type=kind,
@@ -66,12 +66,12 @@ class Object:
             priority=1,
             group=group,
             mass=0.0,
-            **shape,
+            **options,
         )
 
 
-def _visual_geom(body: Any, kind: Any, color: Color, **shape: Any) -> None:
-    body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **shape)
+def _visual_geom(body: Any, kind: Any, color: Color, **options: Any) -> None:
+    body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **options)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Physics on three engines behind one function; the state is always an `mjx.Data`.
+"""Physics: one `step` for three engines; the state is always an `mjx.Data`.
 
 | impl | engine | hardware |
 |---|---|---|
@@ -131,7 +131,7 @@ class Physics:
 
     @functools.cached_property
     def _template(self) -> mjx.Data:
-        """Template of the C engine, made on first use: importing MJX takes a second, which `mqe tasks` does without."""
+        """Template of the C engine, created on first use: importing MJX takes a second, which `mqe tasks` avoids."""
         from mujoco import mjx
 
         with jax.ensure_compile_time_eval():
@@ -211,7 +211,7 @@ def _contact_cap(model: mujoco.MjModel) -> int:
     return int(model.numeric("max_contact_points").data[0]) if "max_contact_points" in names else -1
 
 
-# Warp's flags for a solver that used all its iterations: expected with few iterations, and no overflow.
+# Warp's flags for a solver at its iteration limit: expected with few iterations, and not an overflow.
 _ITERATIONS = 1 << 9 | 1 << 10
 
 

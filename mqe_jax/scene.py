@@ -30,17 +30,17 @@ class Scene:
     robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
     """Robot type shared by all R robots."""
     contacts: str = "full"
-    """Set of the robots' collision shapes, one of `mqe_jax.robots.CONTACTS`."""
+    """Set of the robots' collision geoms, one of `mqe_jax.robots.CONTACTS`."""
     objects: tuple[Object, ...] = ()
     """Movable and fixed objects, added after the robots."""
     colors: tuple[int, ...] = ()
     """Colors of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty."""
     friction: float = 1.0
-    """Sliding friction of the robots' shapes and the ground."""
+    """Sliding friction of the robots' collision geoms and the ground."""
     torque_robots: int = 0
     """Number of robots, the first ones, whose actuators take torques (N m), not PD joint targets (rad)."""
     foot_sensors: bool = False
-    """Whether the feet's contact forces are measured too."""
+    """Whether to add contact force sensors to the feet."""
     timestep: float = 0.005
     """Physics step, s."""
     solver_iterations: int = 4

@@ -7,8 +7,8 @@ A record is a frozen dataclass whose fields carry their types and bounds once, a
         clip: Positive = 0.2
         \"\"\"Half width of the clipping interval of the ratio.\"\"\"
 
-Fields are given by keyword. Every way of making a record, `Ppo(clip=0.1)` included, validates it, and raises an
-`InputError` of one line: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
+Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and raises a one-line
+`InputError`: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
 
 Numbers are finite unless a field is `AnyFloat`; booleans are rejected as numbers; numpy scalars and strings such as
 "7e-4" (which YAML does not read as a number) are accepted; "none" means None for an optional field.
@@ -74,8 +74,8 @@ Range = Annotated[
 def record(cls: type[T]) -> type[T]:
     """Makes a class a frozen, keyword-only dataclass that validates its fields.
 
-    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; nested
-    records get their path put before it. A subclass of a record must be decorated too.
+    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
+    of nested records are prefixed with their path. A subclass of a record must be decorated too.
     """
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
@@ -127,7 +127,7 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
-    """Returns a record as nested mappings, lists and scalars that YAML and JSON can hold.
+    """Returns a record as nested mappings, lists and scalars that YAML and JSON can represent.
 
     Raises:
         InputError: for a value in a free mapping that is none of these.
@@ -136,10 +136,10 @@ def to_mapping(settings: Any) -> dict[str, Any]:
 
 
 def load_yaml(path: str | Path) -> dict[str, Any]:
-    """Reads names and values from a YAML file; an empty file holds none.
+    """Reads names and values from a YAML file; an empty file gives an empty mapping.
 
     Raises:
-        InputError: naming the file, where it cannot be read or is not a mapping.
+        InputError: naming the file, if it cannot be read or is not a mapping.
     """
     try:
         values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
@@ -212,7 +212,7 @@ def _lenient(hint: Any) -> Any:
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is ClassVar or hint is ClassVar:
         return hint
-    if origin is Annotated:  # conversions come last in the annotation, which is first in time
+    if origin is Annotated:  # pydantic applies the last validators of an annotation first
         kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
     if origin in (typing.Union, types.UnionType):
@@ -335,7 +335,7 @@ def _one_line(kind: Any, values: Any, error: pydantic.ValidationError) -> InputE
 
 
 def _locate(kind: Any, values: Any, error: ErrorDetails) -> tuple[list[str], Any, Any]:
-    """Returns the path of the field at fault, its annotated type, and the value given for it."""
+    """Returns the path of the invalid field, its annotated type, and the given value."""
     path: list[str] = []
     where = kind
     for part in error["loc"]:

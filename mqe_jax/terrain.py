@@ -1,8 +1,8 @@
 """Terrain: a track is a row of named blocks along x, each as wide as the track.
 
-A block is a small frozen dataclass with a length and a `layout` method; it is registered by name in one line.
-Blocks define their walls; a block whose walls differ between environments attaches them to an anchor, whose
-position is sampled at reset and is part of the state (mocap bodies, which all engines support).
+A block is a small frozen dataclass with a length and a `layout` method, registered by name. Walls whose positions
+differ between environments are attached to an anchor, which is sampled at reset and is part of the state (mocap bodies,
+which all engines support).
 
 Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z up; metres.
 """
@@ -151,16 +151,16 @@ class SpawnArea(Block):
     length: Ranged = 2.0
     spawn_x: float | None = None
     """X of the spawn poses from the block's start, m; half its length if None."""
-    room_width: float | None = None
+    spacing: float | None = None
     """Distance between neighbouring spawn poses, m; the track's width / number of robots if None."""
     back_wall: bool = True
     """Whether there is a wall behind the robots."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         x = start + (_number(self.length) / 2 if self.spawn_x is None else self.spawn_x)
-        room = track.width / track.num_robots if self.room_width is None else self.room_width
+        spacing = track.width / track.num_robots if self.spacing is None else self.spacing
         middle = (track.num_robots - 1) / 2
-        spawn = tuple((x, (robot - middle) * room, 0.0) for robot in range(track.num_robots))
+        spawn = tuple((x, (robot - middle) * spacing, 0.0) for robot in range(track.num_robots))
         back = (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),) if self.back_wall else ()
         return Layout(barriers=back, spawn=spawn)
 

@@ -102,7 +102,7 @@ def default_commands(robot: Robot, gait: str = "trot", **values: float) -> np.nd
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkMemory:
-    """Memory of one robot's walk policy."""
+    """Recurrent state of one robot's walk policy."""
 
     history: jax.Array
     """Last observations, oldest first (30, 70); zeros after a reset."""
@@ -115,7 +115,7 @@ class WalkMemory:
 
 
 def initial_memory() -> WalkMemory:
-    """Returns the memory of one robot after a reset."""
+    """Returns the recurrent state of one robot after a reset."""
     zeros = jnp.zeros(NUM_JOINTS)
     return WalkMemory(jnp.zeros((HISTORY, OBSERVATION_SIZE)), zeros, zeros, jnp.zeros(()))
 
@@ -145,7 +145,7 @@ def observe(
 
     Args:
         robot: robot type.
-        memory: its walk policy's.
+        memory: recurrent state of its walk policy.
         commands: unscaled (15,).
         gravity_b: unit gravity vector in the trunk frame (3,).
         joint_position: (12,), rad.
@@ -193,7 +193,7 @@ def walk(
     joint_position: jax.Array,
     joint_velocity: jax.Array,
 ) -> tuple[jax.Array, WalkMemory]:
-    """Computes one robot's joint targets (12,), rad, and its next memory; arguments as in `observe`."""
+    """Computes one robot's joint targets (12,), rad, and the next recurrent state; arguments as in `observe`."""
     observation = observe(robot, memory, commands, gravity_b, joint_position, joint_velocity)
     history = jnp.concatenate([memory.history[1:], observation[None]])
     flat = history.reshape(-1)

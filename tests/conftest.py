@@ -4,7 +4,7 @@ import os
 import subprocess
 from pathlib import Path
 
-# Before the first import of jax: what the environment sets already wins.
+# Before the first import of jax; existing environment variables take precedence.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
@@ -15,19 +15,19 @@ import pytest
 UNOPTIMISED = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
-def _soak_asked_for(config: pytest.Config) -> bool:
+def _soak_requested(config: pytest.Config) -> bool:
     return os.environ.get("MQE_SOAK") == "1" or "soak" in str(config.getoption("-m", default=""))
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Lets XLA compile without optimisation on the CPU, also in processes that tests start; XLA_FLAGS win."""
+    """Disables XLA optimisation on the CPU, also in subprocesses; an existing XLA_FLAGS takes precedence."""
     given = os.environ.get("XLA_FLAGS", "")
-    if os.environ["JAX_PLATFORMS"] == "cpu" and not _soak_asked_for(config) and UNOPTIMISED not in given:
+    if os.environ["JAX_PLATFORMS"] == "cpu" and not _soak_requested(config) and UNOPTIMISED not in given:
         os.environ["XLA_FLAGS"] = f"{UNOPTIMISED} {given}".strip()
 
 
 def _gpu_missing() -> str:
-    """Why a GPU test cannot run here; empty where it can."""
+    """Reason for skipping GPU tests; empty if they can run."""
     if os.environ["JAX_PLATFORMS"] == "cpu":
         return "JAX_PLATFORMS=cpu (set JAX_PLATFORMS=cuda,cpu to run the GPU tests)"
     try:
@@ -38,7 +38,7 @@ def _gpu_missing() -> str:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skips the tests marked `gpu` where there is no GPU, and those marked `soak` unless they are asked for.
+    """Skips the tests marked `gpu` where there is no GPU, and those marked `soak` unless requested.
 
     `MQE_SOAK=1 pytest` runs all tests, `pytest -m soak` the soak alone.
     """
@@ -46,7 +46,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     reason = _gpu_missing() if marked else ""
     for item in marked if reason else []:
         item.add_marker(pytest.mark.skip(reason=reason))
-    if _soak_asked_for(config):
+    if _soak_requested(config):
         return
     for item in items:
         if item.get_closest_marker("soak"):

@@ -48,7 +48,7 @@ def actions_of(env: Any, num_envs: int) -> jax.Array:
 
 
 def played(task: str, num_envs: int) -> dict[str, np.ndarray]:
-    """Physics states of environments in play, on the C engine: the task's planner acts, for all robots in a match.
+    """Physics states during scripted episodes on the C engine; in a match the scripted policy controls all robots.
 
     Of each environment's first `PLAY` steps, the one in which objects move fastest and robots touch most.
     """

@@ -1,6 +1,6 @@
-"""A task without physics, for what stands around the environments: command line, drawing, benchmark.
+"""A task without physics, for tests of command line, rendering and benchmark.
 
-Its `mj_model` is two jointed boxes that a drawing takes for robots, between a fixed wall and two moving ones.
+Its `mj_model` has two jointed boxes that rendering treats as robots, between a fixed wall and two moving ones.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ XML = f"""<mujoco><worldbody>
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FakeData:
-    """The three arrays of an `mjx.Data` that drawing reads, and ctrl."""
+    """The three arrays of an `mjx.Data` that rendering reads, and ctrl."""
 
     qpos: jax.Array
     mocap_pos: jax.Array

@@ -1,10 +1,10 @@
-"""How deep bodies stand in each other in scripted play, measured against the full shapes of the Unitree Go1.
+"""Penetration depths in scripted episodes, measured against the full collision geometry of the Unitree Go1.
 
     python -m tests.penetration [--tasks TASK ...] [--episodes 200] [-o FILE]
 
 Episodes are played on the C engine; their poses are then put into a second model, in which the robots have the
 shapes of the public description (trunk and head box, hip cylinder, thigh and calf box, foot sphere) whatever shapes
-the physics uses, and MuJoCo's own collision detection measures the depths. A box is taken as it is: its edges reach
+the physics uses, and MuJoCo's own collision detection measures the depths. The edges of a box reach
 beyond a capsule of half its width, so that the edges of the slim limbs may cut up to 2 x 3 mm into each other,
 and those of the trunk up to 2 cm, before the physics sees a contact; that counts as penetration here.
 
@@ -54,7 +54,7 @@ class Played(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Figures of F frames of R robots; depths in m, 0 where nothing touches."""
+    """Measurements of F frames of R robots; depths in m, 0 without contact."""
 
     body_robot: np.ndarray  # (F,) body against any part of another robot
     body_scene: np.ndarray  # (F,) body against walls, objects and ground
@@ -110,7 +110,7 @@ def _add_full_shapes(spec: mujoco.MjSpec, robot: int) -> None:
 
 
 def play(env: Any, opponent: str | None, episodes: int, seed: int) -> Played:
-    """Plays episodes of the scripted planner; each environment counts its first ones, as in an evaluation."""
+    """Runs episodes of the scripted policy; each environment contributes its first ones, as in an evaluation."""
     count = min(episodes, 64)
     quota = episodes // count + (np.arange(count) < episodes % count)
     act = planner("scripted", env)
@@ -334,7 +334,7 @@ def figures(measured: Measured, distance: np.ndarray, crossed: int, episodes: in
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Prints one line of JSON a task, and writes them all to a file if asked to."""
+    """Prints one line of JSON per task, and writes all of them to a file on request."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scripted = [task for task in TASKS if task in PLANNERS]
     parser.add_argument("--tasks", nargs="+", choices=scripted, default=scripted)

@@ -1,4 +1,4 @@
-"""Physics-free environments whose right answer is known, for the learner's tests."""
+"""Physics-free environments with known solutions, for the learner's tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mqe_jax.train.types import Trace
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ProbeState:
-    """The fields that the learner reads; leading axis N. `hidden` (N, 1) is what the task remembers."""
+    """The fields that the learner reads; leading axis N. `hidden` (N, 1) is the task's own state."""
 
     hidden: jax.Array
     obs: jax.Array
@@ -151,38 +151,38 @@ def show_step_and_parity(hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays 1 whatever is done."""
+    """Reward 1 for every action."""
     return jnp.ones_like(hidden)
 
 
 def pay_near_hidden(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays most where all agents do half the sign."""
+    """Reward maximal if all agents' actions are half the sign."""
     return -jnp.mean(jnp.square(action - 0.5 * hidden[:, None, None]), axis=(1, 2))
 
 
 def pay_sum_and_difference(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays most where agent 0 does half the sign and agent 1 the opposite: no agent's best act is its own."""
+    """Reward maximal if agent 0's action is half the sign and agent 1's the opposite."""
     first, second = action[:, 0, 0], action[:, 1, 0]
     return -jnp.square(first + second) - 0.25 * jnp.square(first - second - hidden)
 
 
 def pay_public_good(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays each agent 0.75 times the sum of all contributions in [-1, 1] less its own.
+    """Public-goods game: 0.75 times the sum of all contributions in [-1, 1], minus the agent's own.
 
-    What an agent gives costs it a quarter and gains two of them a half: +0.5 each where both give all, -0.5 each where
-    each does what is best for itself.
+    A contribution of 1 costs the agent 0.25 and raises the team's sum by 0.5: +0.5 each if both contribute 1, -0.5 each
+    in the Nash equilibrium.
     """
     given = jnp.clip(action[..., 0], -1.0, 1.0)
     return 0.75 * jnp.sum(given, axis=-1, keepdims=True) - given
 
 
 def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays most where both agents do the same: -2 variances where they draw independently, -1 where one sees."""
+    """Reward maximal for equal actions: -2 variances if sampled independently, -1 if one depends on the other."""
     return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
 
 
 class Traces:
-    """A recorder that keeps what it gets."""
+    """A recorder that stores its traces."""
 
     def __init__(self) -> None:
         self.all: list[Trace] = []

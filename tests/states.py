@@ -1,4 +1,4 @@
-"""Environments shared by tests, and states made by hand: robots and objects placed somewhere, at rest."""
+"""Environments shared by tests, and hand-built states: robots and objects at given positions, at rest."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def observation(env: QuadrupedEnv, state: State) -> np.ndarray:
 
 
 def terms_of(env: QuadrupedEnv, state: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The unweighted terms and the agents' rewards (A,) of a state that a step has led to."""
+    """The unweighted terms and the agents' rewards (A,) of a state after a step."""
     from mqe_jax.envs.reward import weigh
 
     terms, _ = env.rewards(state, env.read(state.data), jnp.array(False))

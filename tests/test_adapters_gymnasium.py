@@ -45,7 +45,7 @@ def actions(seed: int, *shape: int) -> np.ndarray:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_environment_checker(task: str) -> None:
-    """check_env passes; it warns only of observations without bounds."""
+    """check_env passes; it warns only about unbounded observations."""
     env: Any = gymnasium.make(f"mqe/{task}-v0", impl="c", **SHORT)
     assert isinstance(env.unwrapped, SingleEnv)
     with warnings.catch_warnings(record=True) as caught:
@@ -57,7 +57,7 @@ def test_environment_checker(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_single_environment_is_the_task(task: str) -> None:
-    """A seeded reset and a step give what the task itself gives."""
+    """A seeded reset and a step equal those of the task."""
     env: Any = gymnasium.make(f"mqe/{task}-v0", impl="c", **SHORT).unwrapped
     obs, info = env.reset(seed=SEED)
     state = jax.jit(env.env.reset)(jax.random.PRNGKey(SEED))
@@ -75,7 +75,7 @@ def test_single_environment_is_the_task(task: str) -> None:
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=["same", "next"])
 @pytest.mark.parametrize("task", TASKS)
 def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMode) -> None:
-    """Step by step, automatic resets included, it gives what SyncVectorEnv gives over single environments."""
+    """Every step, automatic resets included, equals that of SyncVectorEnv over single environments."""
     name = f"mqe/{task}-v0"
     ours: Any = gymnasium.make_vec(name, COUNT, impl="c", autoreset_mode=mode, **SHORT)
     theirs = gymnasium.make_vec(
@@ -107,7 +107,7 @@ def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMo
 
 
 def test_environment_i_is_the_single_one_with_seed_s_plus_i() -> None:
-    """Also where only one seed of a list is given again."""
+    """Also if only one seed of a list is not None."""
     vector: Any = VectorEnv("go1gate", COUNT, impl="c", **SHORT)
     single = SingleEnv("go1gate", impl="c", **SHORT)
     obs, _ = vector.reset(seed=SEED)
@@ -158,7 +158,7 @@ def test_render_returns_images() -> None:
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, Any], told: str) -> None:
-    """With what is allowed."""
+    """The error lists the allowed values."""
     with pytest.raises(InputError, match=told):
         VectorEnv("go1gate", **{"num_envs": 2, "impl": "c", **settings})
 

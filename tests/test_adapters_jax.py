@@ -31,7 +31,7 @@ def task_env(task: str) -> Any:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_brax_rollout(task: str) -> None:
-    """Under our wrapper: shapes, truncation apart from done, final observations, new episodes after each reset."""
+    """Under `wrap`: shapes, truncation separate from done, final observations, new episodes after each reset."""
     pytest.importorskip("brax", reason="needs the extra brax")
     from mqe_jax.adapters.brax import FINAL_OBS, Env, wrap
 
@@ -60,14 +60,14 @@ def test_brax_rollout(task: str) -> None:
     np.testing.assert_array_equal(truncation, ends)
     np.testing.assert_array_equal(steps[:, 0], [1, 2, 3, 1, 2, 3, 1])
     np.testing.assert_array_equal(np.abs(obs - final_obs).max(-1) > 1e-3, ends == 1)
-    # Each episode starts in a state of its own, unlike under Brax's wrapper.
+    # Each episode has a new initial state, unlike under Brax's wrapper.
     assert np.abs(obs[LIMIT - 1] - start).max(-1).min() > 1e-3
     assert np.abs(obs[LIMIT - 1] - obs[2 * LIMIT - 1]).max(-1).min() > 1e-3
 
 
 @pytest.mark.soak
 def test_brax_done_is_a_termination() -> None:
-    """Without EpisodeWrapper, the time limit shows in info alone; the metrics are the task's."""
+    """Without EpisodeWrapper, only info reports the time limit; the metrics are the task's."""
     pytest.importorskip("brax", reason="needs the extra brax")
     from mqe_jax.adapters.brax import Env
 
@@ -156,7 +156,7 @@ def test_jaxmarl_resets_to_a_given_state() -> None:
 
 @pytest.mark.parametrize("library", ["brax", "jaxmarl"])
 def test_without_the_library_the_extra_is_named(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Importing the adapter tells what to install."""
+    """Importing the adapter names the extra to install."""
     for name in [name for name in sys.modules if name.split(".")[0] == library]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, library, None)
@@ -179,7 +179,7 @@ def test_brax_ppo_example_trains() -> None:
 
 @pytest.mark.soak
 def test_jaxmarl_ippo_example_trains(tmp_path: Path) -> None:
-    """The example's IPPO runs on JaxMARL's wrappers; its curve has a row per update and a picture."""
+    """The example's IPPO runs on JaxMARL's wrappers; its curve has a row per update and a plot."""
     pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
     jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
 
@@ -193,7 +193,7 @@ def test_jaxmarl_ippo_example_trains(tmp_path: Path) -> None:
 
 
 def test_a_checkout_gets_our_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The baseline of a checkout makes our environment by JaxMARL's own `make`; its metrics become the curve."""
+    """The baseline of a checkout creates the environment by JaxMARL's `make`; its metrics become the curve."""
     jaxmarl = pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
     jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
     monkeypatch.setattr(jaxmarl, "make", jaxmarl.make)
@@ -215,7 +215,7 @@ def test_a_checkout_gets_our_environment(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_missing_checkout_is_named(tmp_path: Path) -> None:
-    """With the file that was looked for."""
+    """The error names the missing file."""
     pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
     jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
 

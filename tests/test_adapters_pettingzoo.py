@@ -53,7 +53,7 @@ def test_max_cycles(task: str) -> None:
 
 
 def test_steps_of_both_forms() -> None:
-    """Agents are robots by name, rewards and infos are theirs, all end together, and an ended episode stays empty."""
+    """Agents are named robot_i with their own rewards and infos, end together, and an ended episode has no agents."""
     env = adapter.parallel_env("go1gate", **SHORT)
     obs, infos = env.reset(seed=3)
     assert env.agents == env.possible_agents == ["robot_0", "robot_1"] == list(obs)
@@ -100,7 +100,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="reset the environment first"):
         env.state()
     env.reset(seed=0)
-    with pytest.raises(InputError, match=r"actions: of \['robot_0'\]; expected one of each of robot_0, robot_1"):
+    with pytest.raises(InputError, match=r"actions: for \['robot_0'\]; expected one for each of robot_0, robot_1"):
         env.step({"robot_0": np.zeros(3, np.float32)})
     with pytest.raises(InputError, match="render_mode: 'human'"):
         adapter.parallel_env(render_mode="human")
@@ -111,7 +111,7 @@ def test_bad_input_is_named() -> None:
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Importing the adapter tells what to install."""
+    """Importing the adapter names the extra to install."""
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
     monkeypatch.delitem(sys.modules, "mqe_jax.adapters.pettingzoo")
     with pytest.raises(InputError, match=r"pip install 'mqe-jax\[pettingzoo\]'"):

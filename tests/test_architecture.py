@@ -1,4 +1,4 @@
-"""The direction of imports, and the picture of it."""
+"""The direction of imports, and the import diagram."""
 
 import sys
 from pathlib import Path
@@ -11,19 +11,19 @@ import architecture
 
 
 def test_every_import_goes_down() -> None:
-    """No room imports a room above it, and the trainer knows no task, robot or physics."""
+    """No module imports from a higher layer, and the trainer does not depend on tasks, robots or physics."""
     assert architecture.violations() == []
 
 
-def test_the_picture_is_drawn_from_the_present_imports() -> None:
-    """docs/architecture.svg is what tools/architecture.py draws, and the page names every room."""
+def test_the_import_diagram_is_up_to_date() -> None:
+    """docs/architecture.svg is up to date, and docs/architecture.md names every module."""
     assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.draw()
     page = architecture.PICTURE.with_suffix(".md").read_text(encoding="utf-8")
-    assert [room for room in architecture.rooms() if f"`{room}" not in page] == []
+    assert [module for module in architecture.modules() if f"`{module}" not in page] == []
 
 
 def test_a_wrong_import_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An import upwards is found, also inside a function, and told with its file."""
+    """An upward import is found, also inside a function, and reported with its file."""
     package = tmp_path / "mqe_jax"
     (package / "train").mkdir(parents=True)
     (package / "train" / "__init__.py").write_text("def late():\n    from mqe_jax.envs import make\n")

@@ -1,4 +1,4 @@
-"""The command line: what it prints, where, and how it refuses bad input."""
+"""The command line: output, streams, and error messages for invalid input."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ def replace_make_env(patch: pytest.MonkeyPatch, make_env: Any) -> None:
 
 @pytest.fixture(autouse=True)
 def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The task `fake` beside the real ones, and an empty working folder."""
+    """The task `fake` in addition to the real ones, and an empty working folder."""
     monkeypatch.chdir(tmp_path)
     real = commands.make_env
 
@@ -39,7 +39,7 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a tiny training."""
+    """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     patch = pytest.MonkeyPatch()
     env = FakeEnv()
@@ -164,7 +164,7 @@ BAD = {
         ["eval", "go1gate", "--planner", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
         ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],
     ),
-    "robots": (["eval", "go1tug", "--set", "num_agents=3"], ["num_agents: 3", "go1tug is for 2 robots"]),
+    "robots": (["eval", "go1tug", "--set", "num_agents=3"], ["num_agents: 3", "go1tug requires 2 robots"]),
     "run": (["eval", "runs/none"], ["runs/none"]),
     "no run": (["eval", "."], ["config.yaml"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
@@ -221,7 +221,7 @@ def test_defects_keep_their_traceback(error: Exception, monkeypatch: pytest.Monk
 
 
 def test_tasks_are_listed_without_importing_mjx() -> None:
-    """MJX takes a second to import, which `mqe tasks` would spend for nothing."""
+    """Importing MJX takes a second, which `mqe tasks` avoids."""
     code = "import sys; from mqe_jax.cli import main; print(main(['tasks']), 'mujoco.mjx' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "go1football-2vs2" in out and out.splitlines()[-1] == "0 False"

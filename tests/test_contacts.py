@@ -1,4 +1,4 @@
-"""How many contacts crowded scenes have, against the room that Warp's buffers are given."""
+"""Numbers of contacts in crowded scenes against the sizes of Warp's buffers."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ STACK = 0.35  # m; each robot starts that much above the one before
 def crowds(env: Any, data: mujoco.MjData) -> dict[str, tuple[np.ndarray, list[np.ndarray]]]:
     """For each object of the task, its geoms and the places (R, 2) at which a crowd starts.
 
-    The robots stand upon the object, close around it if it is solid, and at both ends of a supporting surface. Of
-    objects of equal shape only the first counts. A task without objects crowds where its robots start.
+    The robots stand on the object, close around it if it is solid, and at both ends of a supporting surface. Of objects
+    with equal geoms only the first is used; without objects the crowd is at the spawn poses.
     """
     model, robots = env.compiled.model, env.index.num_robots
     start = data.qpos[env.index.base_qpos[:, :2]]
@@ -56,7 +56,7 @@ def crowds(env: Any, data: mujoco.MjData) -> dict[str, tuple[np.ndarray, list[np
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_a_crowd_fits_into_the_buffers(task: str) -> None:
-    """All robots thrown together at each object, one upon the other, under random joint targets for two seconds."""
+    """All robots spawned at each object, stacked, under random joint targets for two seconds."""
     env = made(task)
     model, index = env.compiled.model, env.index
     start = jax.tree.map(np.asarray, initial(env))
@@ -85,7 +85,7 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
                 rows.append(data.nefc)
                 touched[-1] += bool(np.isin(data.contact.geom, geoms).any())
         print(f"{task} {name}: {max(contacts)} contacts, {max(rows)} rows at most; touched in {touched} of 100 steps")
-        assert max(contacts) >= 2 * robots, f"{name}: nobody touches anything: the scene is not crowded"
-        assert not len(geoms) or max(touched) >= 10, f"{name}: touched in {touched} of 100 steps: nobody is at it"
+        assert max(contacts) >= 2 * robots, f"{name}: too few contacts: the scene is not crowded"
+        assert not len(geoms) or max(touched) >= 10, f"{name}: touched in {touched} of 100 steps: no robot is near"
         assert max(contacts) <= env.params.contacts_per_robot * robots
         assert max(rows) <= env.params.constraints_per_robot * robots

@@ -1,4 +1,4 @@
-"""The documentation: its site is built without a warning, its code runs, its commands are ones that exist."""
+"""The documentation: the site builds without a warning, its code runs, its commands exist."""
 
 import os
 import re
@@ -20,7 +20,7 @@ NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # Blocks that are not run, by page and first line, with the reason.
 NOT_RUN = {
-    ("docs/evaluation.md", "import jax"): "needs the folder of a training",
+    ("docs/evaluation.md", "import jax"): "needs a run folder",
 }
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
 SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
@@ -39,7 +39,7 @@ def run_blocks(page: str) -> list[str]:
 
 @pytest.mark.parametrize("page", [name for name in NAMES if run_blocks(name)])
 def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Blocks of one page run in order in one namespace, as a reader types them."""
+    """Blocks of one page run in order in one namespace."""
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {"__name__": "__main__"}
     for block in run_blocks(page):
@@ -80,7 +80,7 @@ def test_a_wrong_command_would_be_found() -> None:
 
 
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
-    """Every task has a page with its picture, observation and rewards; formulas and links need no other host."""
+    """Every task has a page with its image, observation and rewards; formulas and links need no other host."""
     pytest.importorskip("mkdocs")
     pytest.importorskip("mkdocstrings")
     built = subprocess.run(
@@ -110,14 +110,14 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert "final_obs" in reference and "Advances one environment" in reference
 
 
-def test_tables_of_tasks_say_what_the_docstrings_say() -> None:
+def test_tables_of_tasks_match_the_docstrings() -> None:
     pytest.importorskip("mkdocs")
     import docs_pages
 
     from mqe_jax.envs.gate import Go1Gate
 
     page = docs_pages.task_page(Go1Gate)
-    assert "| `collision` | -2 | Paid in steps with any trunk contact. |" in page
+    assert "| `collision` | -2 | In steps with any trunk contact. |" in page
     assert "| `gate` | 2 | centre of the gap, m |" in page
     assert "| `gate_width` | 0.6 | Width of the gap, m. |" in page
     assert "| `robot` | `go1` | Name of the robot" in page

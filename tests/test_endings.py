@@ -15,7 +15,7 @@ from tests.states import made, placed, stepper, still
 
 
 def ground_height(env: Any, x: float, y: float) -> float:
-    """The height of what is below (x, y), m, without the robots."""
+    """Height of the ground or object below (x, y), m."""
     model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
     data.qpos[env.index.base_qpos[:, 2]] = 50.0
     mujoco.mj_kinematics(model, data)

@@ -1,4 +1,4 @@
-"""The scenes with shapes of their own move alike on MuJoCo's C engine and on MJX; `python -m tests.engines` has all."""
+"""Scenes with distinct geoms agree on MuJoCo's C engine and MJX; `python -m tests.engines` compares all tasks."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_contract(task: str, count: int, steps: int) -> None:
     assert env.action_space.shape == (env.num_agents, env.action_size)
     assert state.reward.shape == (count, env.num_agents)
 
-    # Every other environment is at its time limit: it is reset, and its last observation is kept.
+    # Every second environment is at its time limit: it is reset, and its last observation is kept.
     late = jnp.where(jnp.arange(count) % 2 == 0, env.max_steps - 1, state.step)
     state, _ = step(dataclasses.replace(state, step=late), keys[10])
     ended = np.asarray(state.terminated | state.truncated)
@@ -297,7 +297,7 @@ def test_randomisation_reaches_the_physics() -> None:
         (lambda: make("go1tug", radius=3.0), r"radius: 3.0 .*less than half of the arena"),
         (lambda: make("go1revolvingdoor", gap=1.5), r"door_size: .*narrower than the gap, 1.5"),
         (lambda: make("go1bridge", platform_x=(3.0, 4.0)), r"platform_x: .*more than a platform's length"),
-        (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate is for 2"),
+        (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate requires 2"),
         (lambda: make("go1gate", num_envs=0), r"num_envs: 0 must be at least 1"),
         (lambda: make("go1plane", gait="gallop"), r"gait: unknown name 'gallop'"),
         (lambda: make("go1plane", commands=("vx", "vz")), r"commands: unknown command 'vz'"),

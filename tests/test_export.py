@@ -1,4 +1,4 @@
-"""Exported graphs: the same numbers in onnxruntime as in JAX, and what is refused."""
+"""Exported graphs: equal outputs in onnxruntime and in JAX, and rejected networks."""
 
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def test_a_trained_run_is_exported_with_its_walk_policy(tmp_path: Path, capsys: 
 
 
 def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() -> None:
-    """Joint targets in onnxruntime, from sensor readings, are those that the environment gives its motors."""
+    """Joint targets in onnxruntime, from sensor readings, equal the environment's actuator targets."""
     env = make("go1gate", impl="c", num_envs=1)
     policy = load_policy(GATE)
     session = onnxruntime.InferenceSession(to_onnx(policy, env).SerializeToString())
@@ -97,15 +97,15 @@ def test_networks_memories_controls_and_mirrored_teams_agree(task: str, control:
 
 
 def test_a_mirrored_team_gets_mirrored_commands() -> None:
-    """The reference of the comparison is the environment's own rule: y and yaw change sign for team 1."""
+    """The reference is the environment's own mapping: y and yaw change sign for team 1."""
     env = make("go1revolvingdoor", impl="c", num_envs=1)
     policy = new_policy(env, recurrent=False, critic_input="observations")
     sizes = shapes(to_onnx(policy, env))["inputs"]
     inputs = {name: np.zeros((1, *shape[1:]), np.float32) for name, shape in sizes.items()}
     outputs = jax.jit(lambda inputs: reference(policy, env, inputs))(inputs)
     assert np.array_equal(outputs["action"][0, 0], outputs["action"][0, 1]) and np.all(outputs["action"] != 0.0)
-    ours, theirs = np.asarray(outputs["commands"])[0, :, :3]
-    np.testing.assert_allclose(theirs, ours * [1.0, -1.0, -1.0], atol=1e-6)
+    first, second = np.asarray(outputs["commands"])[0, :, :3]
+    np.testing.assert_allclose(second, first * [1.0, -1.0, -1.0], atol=1e-6)
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: Any) -> None:

@@ -158,9 +158,9 @@ def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], fresh: 
     here = with_ball(env, standing(env, state, places), (6.3, 1.1, 0.4), (0.8, -0.3, 0.1))
     there = standing(env, state, np.roll(turned(places), half, axis=0))
     there = with_ball(env, there, (14 - 6.3, -1.1, 0.4), (-0.8, 0.3, 0.1))
-    ours, theirs = observation(env, here), observation(env, there)
-    np.testing.assert_allclose(theirs, np.roll(ours, half, axis=0), atol=1e-5)
-    assert np.abs(ours[0] - ours[half]).max() > 0.5  # and the two sides do not see the same here
+    first, second = observation(env, here), observation(env, there)
+    np.testing.assert_allclose(second, np.roll(first, half, axis=0), atol=1e-5)
+    assert np.abs(first[0] - first[half]).max() > 0.5  # the two teams' observations differ
 
 
 def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
@@ -311,7 +311,7 @@ def test_the_law_of_the_defender_by_hand(position: Any, yaw: float, ball: Any, m
 
 
 def test_the_defender_steps_sideways_towards_the_line() -> None:
-    """Ball straight ahead, the defender 0.2 m to the right of the line as it looks (y +0.2): it goes left, to -y."""
+    """Ball straight ahead, the defender 0.2 m to the right of the line in its own frame (y +0.2): moves left, to -y."""
     own = np.hypot(3.0, 0.2)
     facing = np.arctan2(0.2, -3.0)
     law = defend(jnp.array([9.0, 0.2]), jnp.array(facing), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
@@ -321,7 +321,7 @@ def test_the_defender_steps_sideways_towards_the_line() -> None:
 
 
 def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, attack_step: Any, fresh: Any) -> None:
-    """It walks there by the walk policy and follows a ball to the other side."""
+    """Under the walk policy it reaches its target and follows the ball to the other side."""
     start = standing(attack, fresh[attack.name], [(4, -4, 0), (4, 4, 0), (10, 0, np.pi)])
     goal, state = np.array([12.0, 0.0]), start
     for ball in ((8.0, -2.0), (8.0, 2.0)):
@@ -347,7 +347,7 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
 
 
 def test_the_defender_stands_while_the_agents_give_torques() -> None:
-    """It follows joint targets of the walk policy, whatever an agent's action means."""
+    """It follows joint targets of the walk policy in every action mode of the agents."""
     env: Any = make("go1football-defender", impl="c", control="torque")
     state = standing(env, initial(env), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
     np.testing.assert_allclose(env.controller.neutral[:2], 0)
@@ -363,7 +363,7 @@ def test_the_defender_stands_while_the_agents_give_torques() -> None:
 
 
 def test_wrong_numbers_of_robots_are_named() -> None:
-    with pytest.raises(ValueError, match="num_agents: 4; go1football-1vs1 is for 2 robots"):
+    with pytest.raises(ValueError, match="num_agents: 4; go1football-1vs1 requires 2 robots"):
         make("go1football-1vs1", impl="c", num_agents=4)
 
 

@@ -67,8 +67,8 @@ def test_actions_and_observations_of_the_other_team_have_no_effect() -> None:
     before = log_probs(network, params, obs, action)
     other = log_probs(network, params, obs.at[:, 2:].add(1.0), action.at[:, 2:].add(1.0))
     np.testing.assert_allclose(other[:, :2], before[:, :2], atol=1e-6)
-    mates = log_probs(network, params, obs.at[:, 1].set(obs[::-1, 1]), action)
-    assert np.abs(mates[:, 0] - before[:, 0]).max() > 1e-3
+    teammates = log_probs(network, params, obs.at[:, 1].set(obs[::-1, 1]), action)
+    assert np.abs(teammates[:, 0] - before[:, 0]).max() > 1e-3
 
 
 def test_both_teams_have_the_same_weights() -> None:

@@ -131,7 +131,7 @@ def test_tug_result_and_end() -> None:
     assert stepped(env, dataclasses.replace(state, step=jnp.int32(env.max_steps - 1))).truncated
     fallen = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0, 0, 0]], {"cylinder": [0.13]})
     assert stepped(env, fallen).terminated
-    assert result(env, fallen) == (0, 1)  # who falls loses, also with the cylinder on the other half
+    assert result(env, fallen) == (0, 1)  # a fall loses, also with the cylinder on the other half
     both = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0.9, 0, 0]], {"cylinder": [0.13]})
     assert result(env, both) == (0, 0)
 

@@ -23,7 +23,7 @@ FILE = Path(__file__).parents[1] / "examples" / "new_task.py"
 
 @pytest.fixture
 def example() -> Any:
-    """The example's module; what it registers is taken out again."""
+    """The example's module; its registrations are removed afterwards."""
     spec = importlib.util.spec_from_file_location("new_task", FILE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -58,7 +58,7 @@ def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> Non
 
 
 def test_a_taken_or_missing_id_is_refused() -> None:
-    with pytest.raises(ValueError, match="the id 'go1gate' is taken by Go1Gate"):
+    with pytest.raises(ValueError, match="the id 'go1gate' is already registered by Go1Gate"):
         register_task(type("Other", (TASKS["go1plane"],), {"name": "go1gate"}))
     with pytest.raises(ValueError, match="its `name` is empty"):
         register_task(type("Nameless", (TASKS["go1plane"],), {"name": ""}))

@@ -1,4 +1,4 @@
-"""Objects and NPCs: how boxes, balls and sheep move, and the tasks that are built of them."""
+"""Objects and NPCs: motion of boxes, balls and sheep, and the tasks with them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plain(*objects: objects.Object) -> Any:
     return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
 
 
-def test_a_ball_that_was_kicked_rolls_and_comes_to_rest() -> None:
+def test_a_ball_with_initial_velocity_rolls_and_comes_to_rest() -> None:
     scene = plain(Ball("ball"))
     index, data = scene.objects["ball"], mujoco.MjData(scene.model)
     data.qpos[index.qpos[:3]] = [2.0, 3.0, 0.1]
@@ -68,7 +68,7 @@ def test_a_box_slides_under_more_than_its_friction_only() -> None:
 
 
 def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0, seed: int = 0) -> np.ndarray:
-    """Positions (T, S, 2) of sheep that nothing stops."""
+    """Positions (T, S, 2) of unobstructed sheep."""
 
     def move(carry: Any, key: Any) -> Any:
         position, velocity = carry
@@ -88,7 +88,7 @@ def test_one_sheep_flees_from_a_dog_at_08_m_and_not_at_2_m() -> None:
 
 
 def test_the_law_of_the_flock_by_hand() -> None:
-    """One sheep at rest 0.5 m from a dog: q = 0.25, 0.2 * 0.5 / 0.25^1.4 = 0.6964 m/s, less 0.0981 m/s of friction."""
+    """One sheep at rest 0.5 m from a robot: q = 0.25, 0.2 * 0.5 / 0.25^1.4 = 0.6964 m/s, minus 0.0981 m/s friction."""
     velocity = flock(
         jax.random.PRNGKey(0),
         jnp.array([[1.0, 0.0]]),

@@ -1,4 +1,4 @@
-"""Physics on three engines: the compiled robot's figures, agreement with MuJoCo, states that stay finite."""
+"""Physics on three engines: constants of the compiled robot, agreement with MuJoCo, finite states."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> N
 
 @pytest.mark.parametrize("impl", IMPLS)
 def test_trunk_force_is_read(impl: str) -> None:
-    """Two robots that overlap feel each other; a robot lying on its belly feels the ground."""
+    """Contact forces on two overlapping robots, and on a trunk that lies on the ground."""
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     index = env.index
@@ -127,7 +127,7 @@ def test_trunk_force_is_read(impl: str) -> None:
 
 
 def test_gate_stands_where_each_environment_drew_it() -> None:
-    """Walls stand where each environment's gate was drawn, and stop a robot there."""
+    """Walls are at each environment's sampled gate, and stop a robot there."""
     env = make("go1gate", impl="c", control="position")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
     gap = states.anchors[:, 0]

@@ -14,7 +14,7 @@ SPEED = COMMAND_RANGES["vx"][0]  # m/s per unit of forward action
 
 
 def push(speed: float, x: float = 1.6) -> np.ndarray:
-    """Actions (2, 3) of robots that touch a cylinder of this speed, m/s."""
+    """Actions (2, 3) of robots in contact with a cylinder of the given speed, m/s."""
     base = jnp.tile(jnp.array([x, -0.7, 0.3, 0.0, 0.0, jnp.pi / 2]), (2, 1))
     return np.asarray(plan_tug({"base": base, "cylinder": jnp.tile(jnp.array([0.8, speed]), (2, 1))}))
 

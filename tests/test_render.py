@@ -1,4 +1,4 @@
-"""Drawing: what is in the frame, what lands on disk, what is refused."""
+"""Rendering: content of the frames, written files, rejected input."""
 
 import os
 from pathlib import Path
@@ -36,7 +36,7 @@ def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, ep
 
 def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: recording.Episode) -> None:
     assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
-    drawn = geometry.drawn_model(env.mj_model, episode)
+    drawn = geometry.rendering_model(env.mj_model, episode)
     low, high = geometry.extent(drawn, episode)
     assert high[1] == pytest.approx(1.5) and low[1] == pytest.approx(-1.5)
     own = geometry.extent(env.mj_model, episode)[1][1]
@@ -44,7 +44,7 @@ def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv
 
 
 def in_image(model: Any, camera: cameras.Camera, point: np.ndarray, aspect: float) -> float:
-    """How far from the image's centre a point is drawn: 1 is its edge."""
+    """Distance of a point's projection from the image centre: 1 is the edge."""
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])
@@ -57,7 +57,7 @@ def in_image(model: Any, camera: cameras.Camera, point: np.ndarray, aspect: floa
 
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9])
 def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: recording.Episode, aspect: float) -> None:
-    model = geometry.drawn_model(env.mj_model, episode)
+    model = geometry.rendering_model(env.mj_model, episode)
     camera = cameras.default_camera(model, episode, aspect)
     low, high = geometry.extent(model, episode)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
@@ -144,7 +144,7 @@ def test_a_broken_drawing_leaves_nothing_behind(tmp_path: Path) -> None:
 )
 def test_bad_outputs_are_refused(tmp_path: Path, name: str, said: str) -> None:
     if name.startswith("/proc") and not os.path.isdir("/proc"):
-        pytest.skip("no folder here that nobody may write")
+        pytest.skip("no read-only folder here")
     with pytest.raises(ValueError, match=said):
         clips.check_output(tmp_path / name)
 

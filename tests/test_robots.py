@@ -1,4 +1,4 @@
-"""Robots as values: the registry, mirror symmetry, variants of one's own, and standing under PD control."""
+"""Robots as values: the registry, mirror symmetry, custom variants, and standing under PD control."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_stands_on_its_default_pose(name: str) -> None:
 
 
 def test_a_variant_of_ones_own_is_a_robot_of_every_task(lifted: Robot) -> None:
-    """Masses, gains, pose and limits come from the value; its walk weights are those that it names."""
+    """Masses, gains, pose, limits and walk weights are those of the `Robot`."""
     env = make("go1gate", impl="c", robot="lifted")
     model = env.compiled.model
     assert env.robot is lifted
@@ -116,7 +116,7 @@ def test_a_variant_of_ones_own_is_a_robot_of_every_task(lifted: Robot) -> None:
 
 
 def test_collision_sets_are_swapped_as_data() -> None:
-    """Several shapes per link, all of which touch the other robot's: bits, index tables and sensors follow."""
+    """Several collision shapes per link: collision bits, index tables and sensors cover all of them."""
     shapes = (
         CollisionShape("trunk", box((0.188, 0.047, 0.057)), name="body"),
         CollisionShape("trunk", sphere(0.05, (0.27, 0.0, 0.0)), name="head"),
@@ -142,7 +142,7 @@ def test_unknown_names_are_refused_with_the_nearest() -> None:
         robots.get("go3")
     with pytest.raises(ValueError, match=r"robot: unknown name 'g01'"):
         make("go1gate", robot="g01")
-    with pytest.raises(InputError, match=r"'go1' is taken"):
+    with pytest.raises(InputError, match=r"'go1' is already registered"):
         robots.register(dataclasses.replace(GO1, kp=10.0))
 
 
@@ -151,7 +151,7 @@ def test_wrong_data_is_refused_by_name() -> None:
         dataclasses.replace(GO1, torque_limit=np.ones(3))
     with pytest.raises(InputError, match=r"Robot\.default_joints"):
         dataclasses.replace(GO1, default_joints=np.zeros(12))
-    with pytest.raises(InputError, match=r"Robot\.collision: names must differ; foot"):
+    with pytest.raises(InputError, match=r"Robot\.collision: duplicate names foot"):
         dataclasses.replace(GO1, collision=(*GO1.collision, GO1.collision[-1]))
     with pytest.raises(InputError, match=r"unknown part 'tail'"):
         CollisionShape("tail", sphere(0.02))

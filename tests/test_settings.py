@@ -1,4 +1,4 @@
-"""Records of settings: what is accepted, and that every mistake is one line with the path, the value and the bounds."""
+"""Records of settings: accepted values, and one-line errors with the path, the value and the bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Algorithms by name: their settings, and games that tell them apart."""
+"""Algorithms by name: their settings, and games that distinguish them."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def learn(env: VectorEnv, config: TrainConfig, updates: int, last: int) -> float
 
 @pytest.mark.parametrize(("algorithm", "cooperates"), [("jrpo", True), ("ippo", False)])
 def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, cooperates: bool) -> None:
-    """What is best for each is worst for all: -0.5 each; the joint ratio gives all, +0.5 each."""
+    """Individual ratios converge to the Nash equilibrium, -0.5 each; the joint ratio contributes all, +0.5 each."""
     env = Probe(probes.show_hidden, probes.pay_public_good, num_envs=32)
     reward = learn(env, settings(algorithm, PLAIN), 50, 5)
     assert reward >= 0.45 if cooperates else reward <= -0.45
 
 
 def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
-    """The loss is two variances where agents draw independently, and one where the second sees the first."""
+    """The loss is two variances for independent agents, and one if the second is conditioned on the first."""
     log_std = -1.2
     fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
     env = Probe(probes.show_hidden, probes.pay_meeting, num_envs=32)

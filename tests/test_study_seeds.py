@@ -24,7 +24,7 @@ PROBE = Probe(probes.show_hidden, probes.pay_near_hidden, num_envs=4)
 
 
 def settings(seed: int, **values: Any) -> TrainConfig:
-    """Settings of a tiny training of four updates."""
+    """Settings of a tiny training run of four updates."""
     defaults = {
         "seed": seed,
         "num_envs": 4,
@@ -44,11 +44,11 @@ def assert_close(one: Any, other: Any, rtol: float = 1e-7, atol: float = 1e-5) -
 
 
 class Stop(Exception):
-    """A training stopped from outside."""
+    """An externally stopped training run."""
 
 
 def stop_after(updates: int) -> Any:
-    """A callback that stops a training in the middle."""
+    """A callback that stops a training run midway."""
 
     def on_update(state: Any, row: dict[str, float]) -> None:
         if row["updates"] > updates:
@@ -71,7 +71,7 @@ def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path) -> None:
     assert len(together) == len((tmp_path / "alone" / "metrics.csv").read_text().splitlines()) == 5
     assert load_policy(folders[2]).metadata["env_steps"] == 64
     longer = [override(config, {"total_steps": 80}) for config in configs]
-    assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 5  # a seed goes on alone
+    assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 5  # one seed resumes separately
 
 
 def test_one_update_of_seeds_together_is_that_of_each_alone() -> None:
@@ -86,7 +86,7 @@ def test_one_update_of_seeds_together_is_that_of_each_alone() -> None:
 
 
 def test_seeds_must_have_the_same_settings(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="seed alone"):
+    with pytest.raises(InputError, match="only in the seed"):
         train_seeds(PROBE, [settings(0), settings(1, ppo__clip=0.3)], [tmp_path / "a", tmp_path / "b"])
 
 

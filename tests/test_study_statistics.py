@@ -1,4 +1,4 @@
-"""Statistics of few runs, beside numbers of the `rliable` package (tools/rliable_fixture.py)."""
+"""Statistics of few runs, compared with the `rliable` package (tools/rliable_fixture.py)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CASES = pytest.mark.parametrize("case", FIXTURE["cases"], ids=lambda case: str(n
 
 
 class PackageRandom:
-    """The package's draws: numpy's older generator, one index per run and task, the matrices in turn."""
+    """The package's samples: numpy's older generator, one index per run and task, the matrices in turn."""
 
     def __init__(self, *shapes: tuple[int, ...]) -> None:
         state = np.random.RandomState(FIXTURE["seed"])

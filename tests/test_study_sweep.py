@@ -39,7 +39,7 @@ settings:
 
 
 class Stop(Exception):
-    """A sweep stopped from outside."""
+    """An externally stopped sweep."""
 
 
 def config_of(task: str, algorithm: str) -> TrainConfig:
@@ -93,7 +93,7 @@ def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) ->
 
 
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
-    """A cell that another process trains is left to it; one that it has ended since is not trained again."""
+    """A cell locked by another process is skipped; one that it has finished since is not trained again."""
     sweep, folder = load(tmp_path), tmp_path / "study"
     jobs = sweeps.plan(sweep, folder, config_of)
     trained: list[str] = []
@@ -176,7 +176,7 @@ def test_the_commands_say_what_is_left_and_report(
 
 
 def _pretend(folders: tuple[Path, ...], *rest: Any) -> None:
-    """Leaves what a training leaves."""
+    """Writes the files of a training run."""
     for folder in folders:
         folder.mkdir(parents=True)
         (folder / runner.CSV_FILE).write_text("env_steps,average_step_reward\n16,0.5\n32,0.75\n")

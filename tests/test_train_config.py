@@ -1,4 +1,4 @@
-"""Training settings: every file loads, every mistake is named."""
+"""Training settings: every file loads, every error names its setting."""
 
 from __future__ import annotations
 

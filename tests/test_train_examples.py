@@ -1,4 +1,4 @@
-"""The examples of an environment and of a network of one's own, at a small size."""
+"""The examples of a custom environment and a custom network, at a small size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A training that is killed outright and resumed ends as one that was left alone, bit for bit, on the C engine."""
+"""A training run that is killed and resumed equals an uninterrupted one, bit for bit, on the C engine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def start(run_dir: Path, *flags: str) -> subprocess.Popen[bytes]:
 
 
 def newest(run_dir: Path) -> dict[str, np.ndarray]:
-    """Everything in the last checkpoint by name: parameters, optimiser, environments, keys."""
+    """Contents of the last checkpoint by name: parameters, optimiser, environments, keys."""
     from safetensors.numpy import load_file
 
     return load_file(max(list_checkpoints(run_dir)))

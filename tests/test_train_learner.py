@@ -1,4 +1,4 @@
-"""The learner on probe environments whose right answer is known."""
+"""The learner on probe environments with known solutions."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
 
 
 def test_small_rewards_are_learnt_as_large_ones() -> None:
-    """The same training at rewards of 1 and of 0.001: the same values up to the scale."""
+    """Training with rewards of 1 and of 0.001: equal values up to the scale."""
     values = []
     for scale in (1.0, 1e-3):
         env = Probe(probes.show_hidden, lambda h, a, s=scale: s * h, num_envs=16)
@@ -110,7 +110,7 @@ def test_memory_carries_a_sign_through_an_episode() -> None:
     env = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=32)
     config = small(network__recurrent=True, network__chunk_length=4, stagger_episodes=True)
     _, metrics = learn(env, config, 50)
-    assert float(metrics["average_step_reward"]) > -0.06  # without memory at best -0.19
+    assert float(metrics["average_step_reward"]) > -0.06  # without a recurrent state at best -0.19
 
 
 class CountingProbe(Probe):
@@ -134,7 +134,7 @@ class OnePass(NamedTuple):
 
 @pytest.fixture(scope="module")
 def one_pass() -> OnePass:
-    """Runs updates of one epoch over one batch, with memory; odd environments have longer episodes."""
+    """Runs updates of one epoch over one batch, with a recurrent network; odd environments have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
     learner = make_learner(
         env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
@@ -150,7 +150,7 @@ def one_pass() -> OnePass:
 
 
 def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
-    """The first gradient step sees the rollout's own log-densities, memory and resets included."""
+    """The first gradient step reproduces the rollout's log-densities, recurrent states and resets included."""
     for metrics in one_pass.metrics:
         assert abs(float(metrics["approx_kl"])) < 1e-6
         assert float(metrics["clip_fraction"]) == 0.0

@@ -79,7 +79,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before a training begins."""
+    """Before training begins."""
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name))
     with pytest.raises(InputError, match=r"'wandb' needs the package wandb; pip install 'mqe-jax\[log\]'"):
@@ -88,7 +88,7 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_loggers_are_a_setting() -> None:
-    """Chosen by name; an unknown one is refused."""
+    """Selected by name; an unknown name is rejected."""
     assert TrainConfig().loggers == ("tensorboard",)
     assert set(TrainConfig(loggers=("tensorboard", "wandb")).loggers) == set(logs.LOGGERS)
     with pytest.raises(InputError, match="loggers"):

@@ -1,4 +1,4 @@
-"""The learner's parts: numbers worked out by hand."""
+"""The learner's parts against values computed by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole training: run folder, resuming, checkpoints and their damage, evaluation, loaded policies."""
+"""A complete training run: run folder, resuming, damaged checkpoints, evaluation, loaded policies."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def assert_same(one: Any, other: Any) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_programs_are_kept(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Lets the trainings of this file, which all compile the same update, compile it once."""
+    """Shares one compiled update between all training runs of this file."""
     names = (
         "jax_compilation_cache_dir",
         "jax_persistent_cache_min_compile_time_secs",
@@ -80,7 +80,7 @@ def compiled_programs_are_kept(tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
-    """A training that ran from start to end: its folder and its last state."""
+    """A complete training run: its folder and its last state."""
     run_dir = tmp_path_factory.mktemp("runs") / "straight"
     return run_dir, train(PROBE, settings(), run_dir)
 
@@ -170,7 +170,7 @@ def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path
 
 
 def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays NaN where an action is above 3 standard deviations or so."""
+    """Reward NaN for actions above about 3 standard deviations."""
     return jnp.where(action[:, 0, 0] > 2.0, jnp.nan, 0.0)
 
 
@@ -321,7 +321,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
-    """Short episodes (2 steps, successes) do not crowd out long ones (30 steps)."""
+    """Short episodes (2 steps, successes) are not over-represented against long ones (30 steps)."""
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30)
 
     def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:

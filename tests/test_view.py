@@ -48,7 +48,7 @@ def test_a_driven_robot_obeys_the_hand_and_the_others_their_policy() -> None:
     moved = run.frame().qpos[:, run.env.robot_x] - np.array([1.0, 1.0])
     np.testing.assert_allclose(moved, [[0.025, 0.025], [0.025, -0.05]], atol=1e-6)
     np.testing.assert_allclose(run.commands[-1][0], [[0.5, 0, 0], [0.5, 0, 0]])
-    # The robot does what the driver says in its own frame, though its agent acts in a mirrored one.
+    # Teleoperation commands are in the robot's frame, although its agent acts in a mirrored one.
     np.testing.assert_allclose(run.commands[-1][1], [[0.5, 0, 0], [-1.0, 0.25, 0.5]], atol=1e-6)
 
 
@@ -220,7 +220,7 @@ def chromium() -> str | None:
 
 
 class Page:
-    """The viewer's page, read as a user reads it."""
+    """The viewer's page, as rendered."""
 
     def __init__(self, page: Any) -> None:
         self.page = page
@@ -261,9 +261,9 @@ def page(viewer: SimpleNamespace) -> Iterator[Page]:
 
 
 def test_a_robot_is_driven_from_the_page(page: Page) -> None:
-    """Hold the drive button, then press keys: the page says that the robot, and no other, has moved."""
+    """Hold the drive button, then press keys: only the selected robot moves on the page."""
     page.choose("Driven", "robot 2")
-    page.until(lambda: "2 (you)" in page.text())
+    page.until(lambda: "2 (driven)" in page.text())
     start = page.robots()
     button = page.page.get_by_role("button", name="Forward", exact=True)
     button.scroll_into_view_if_needed()

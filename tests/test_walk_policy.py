@@ -1,4 +1,4 @@
-"""The walk policy's network, memory, conversion and measuring environment."""
+"""The walk policy's network, recurrent state, conversion and evaluation environment."""
 
 from __future__ import annotations
 
@@ -278,10 +278,10 @@ def test_slope_turns_gravity() -> None:
 
 
 def test_shipped_policy_walks() -> None:
-    """Three seconds at 0.8 m/s: the robot keeps its feet and its speed."""
+    """Three seconds at 0.8 m/s: the robot does not fall and tracks its speed."""
     from mqe_jax.walk.evaluation import Scenario, measure
 
-    task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
+    task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6)
     env = WalkEnv(GO1, task, impl="c", num_envs=4)
     figures = measure(env, walk_policy.load_params(GO1), Scenario(duration=3.0, velocity=(0.8, 0.0, 0.0)), 4)
     assert figures["fall_rate"] == 0

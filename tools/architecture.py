@@ -1,7 +1,7 @@
-"""The rooms of `mqe_jax`, what each may import, and the picture of it in docs/architecture.svg.
+"""The modules of `mqe_jax`, their allowed imports, and the import diagram docs/architecture.svg.
 
-`python tools/architecture.py` draws the picture from the imports in the source; `--check` exits with 1 where the
-picture is out of date or a room imports what it may not. tests/test_architecture.py does the same.
+`python tools/architecture.py` draws the diagram from the imports in the source; `--check` exits with 1 if the diagram
+is out of date or an import violates the layering. tests/test_architecture.py checks the same.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mqe_jax"
 PICTURE = ROOT / "docs" / "architecture.svg"
 
-# Layers from bottom to top, each a row of rooms. A room may import from the layers below it and from rooms to its left.
+# Layers from bottom to top, each a row of modules. A module may import from lower layers and from modules to its left.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "files", "settings"),
     ("collision", "rotation", "robots"),
@@ -26,33 +26,33 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("study", "viz", "view", "export", "adapters"),
     ("cli",),
 )
-# Where each room stands across the picture, from 0 (left) to 1 (right).
+# Horizontal position of each module in the diagram, from 0 (left) to 1 (right).
 ACROSS = {
     "errors": 0.3, "files": 0.86, "settings": 0.58, "rotation": 0.86, "collision": 0.3, "robots": 0.58, "terrain": 0.12,
     "objects": 0.33, "npc": 0.53, "scene": 0.36, "physics": 0.7, "walk_policy": 0.5, "control": 0.76, "envs": 0.25,
     "train": 0.9, "planners": 0.34, "walk": 0.62, "study": 0.08, "viz": 0.27, "view": 0.46, "export": 0.65,
     "adapters": 0.84, "cli": 0.5,
 }  # fmt: skip
-# Exceptions to the rule above: these see less. The trainer knows no task, no robot and no physics.
+# Stricter exceptions to the rule above. The trainer does not depend on tasks, robots or physics.
 ONLY: dict[str, frozenset[str]] = {"train": frozenset({"errors", "files", "settings"})}
 
 
-def rooms() -> list[str]:
-    """Names of the rooms that exist: the package's modules and subpackages, without its `__init__`."""
+def modules() -> list[str]:
+    """Returns the names of the package's modules and subpackages, without `__init__`."""
     found = {path.stem for path in PACKAGE.glob("*.py")} | {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
     return sorted(found - {"__init__"})
 
 
-def allowed(room: str) -> frozenset[str]:
-    """The rooms that `room` may import."""
-    if room in ONLY:
-        return ONLY[room]
+def allowed(module: str) -> frozenset[str]:
+    """Returns the modules that `module` may import."""
+    if module in ONLY:
+        return ONLY[module]
     order = [name for layer in LAYERS for name in layer]
-    return frozenset(order[: order.index(room)])
+    return frozenset(order[: order.index(module)])
 
 
 def imports(path: Path) -> set[str]:
-    """Rooms of this package that a source file imports, at any depth of its code."""
+    """Returns the modules of this package that a source file imports, at any nesting depth."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module == "mqe_jax":
@@ -65,41 +65,41 @@ def imports(path: Path) -> set[str]:
 
 
 def edges() -> dict[str, dict[str, str]]:
-    """For each room the rooms that it imports, with one file that does so."""
+    """Returns, for each module, the modules that it imports, with one importing file."""
     table: dict[str, dict[str, str]] = {}
-    for room in rooms():
-        single = PACKAGE / f"{room}.py"
-        for path in [single] if single.is_file() else sorted((PACKAGE / room).rglob("*.py")):
-            for other in sorted(imports(path) - {room}):
-                table.setdefault(room, {}).setdefault(other, path.relative_to(ROOT).as_posix())
+    for module in modules():
+        single = PACKAGE / f"{module}.py"
+        for path in [single] if single.is_file() else sorted((PACKAGE / module).rglob("*.py")):
+            for other in sorted(imports(path) - {module}):
+                table.setdefault(module, {}).setdefault(other, path.relative_to(ROOT).as_posix())
     return table
 
 
 def violations() -> list[str]:
-    """Imports that go the wrong way, each named with its file; rooms without a layer."""
+    """Returns imports that violate the layering, each with its file, and modules without a layer."""
     known = {name for layer in LAYERS for name in layer}
-    wrong = [f"{room}: has no layer in tools/architecture.py" for room in rooms() if room not in known]
-    for room, others in edges().items():
-        if room in known:
-            wrong += [f"{path}: {room} may not import {o}" for o, path in others.items() if o not in allowed(room)]
+    wrong = [f"{module}: has no layer in tools/architecture.py" for module in modules() if module not in known]
+    for module, others in edges().items():
+        if module in known:
+            wrong += [f"{path}: {module} may not import {o}" for o, path in others.items() if o not in allowed(module)]
     return wrong
 
 
 def reduced(table: dict[str, dict[str, str]]) -> dict[str, set[str]]:
-    """The imports that no chain of other imports implies: few enough to be drawn."""
+    """Returns the transitive reduction of the imports, for the diagram."""
 
-    def reach(room: str) -> set[str]:
-        return {room}.union(*(reach(other) for other in table.get(room, {})))
+    def reach(module: str) -> set[str]:
+        return {module}.union(*(reach(other) for other in table.get(module, {})))
 
     return {
-        room: {o for o in others if not any(o in reach(between) for between in others if between != o)}
-        for room, others in table.items()
+        module: {o for o in others if not any(o in reach(between) for between in others if between != o)}
+        for module, others in table.items()
     }
 
 
 def draw() -> str:
-    """The picture as SVG text: layers as rows, imports as lines from the importing room down to the imported one."""
-    table, present = reduced(edges()), set(rooms())
+    """Returns the diagram as SVG text: layers as rows, imports as lines from the importing module to the imported."""
+    table, present = reduced(edges()), set(modules())
     width, row, box = 860, 76, 132
     place: dict[str, tuple[float, float]] = {}
     height = row * len(LAYERS) + 20
@@ -107,9 +107,9 @@ def draw() -> str:
         for name in present.intersection(layer):
             place[name] = (width * ACROSS[name], height - row * (level + 0.5) - 10)
     lines, boxes = [], []
-    for room, others in sorted(table.items()):
+    for module, others in sorted(table.items()):
         for other in sorted(others):
-            (x1, y1), (x2, y2) = place[room], place[other]
+            (x1, y1), (x2, y2) = place[module], place[other]
             if y1 == y2:
                 side = 1 if x2 > x1 else -1
                 way = f"M{x1 + side * box / 2:.0f},{y1:.0f} L{x2 - side * box / 2:.0f},{y2:.0f}"
@@ -138,14 +138,14 @@ def draw() -> str:
 
 
 def main() -> int:
-    """Draws the picture, or checks it; returns the exit status."""
+    """Draws or checks the diagram; returns the exit status."""
     wrong = violations()
     if "--check" in sys.argv[1:]:
         if not PICTURE.is_file() or PICTURE.read_text(encoding="utf-8") != draw():
             wrong.append(f"{PICTURE.relative_to(ROOT)}: out of date; run python tools/architecture.py")
     else:
         PICTURE.write_text(draw(), encoding="utf-8")
-    print("\n".join(wrong) or "every import goes down")
+    print("\n".join(wrong) or "all imports respect the layering")
     return 1 if wrong else 0
 
 

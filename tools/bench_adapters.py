@@ -1,4 +1,4 @@
-"""Measures what an adapter adds to the step: our own vectorised step against the Gymnasium adapter's, in turn.
+"""Measures the overhead of the Gymnasium adapter relative to `mqe_jax.VectorEnv`, in interleaved pairs.
 
 `python tools/bench_adapters.py --task go1gate --num-envs 64 --pairs 5 --csv FILE` compiles both in one process, then
 times them in interleaved pairs of blocks of environment steps with random actions, and prints the medians and their

@@ -1,9 +1,10 @@
-"""Compares the throughput of checkouts in turn on one machine: medians and ratios of the pairs.
+"""Compares the throughput of checkouts on one machine: medians and ratios of interleaved timings.
 
 `python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE` starts
-one process per checkout and case, lets each compile, and then times them in turn: a machine whose speed drifts slows
-all alike. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few calls of 50
-environment steps, whole step and bare physics. `--pause FILE` stops the process whose id is in FILE while it times.
+one process per checkout and case, waits for compilation, and then times them in turn, so that drifts of the machine's
+speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few
+calls of 50 environment steps, whole step and bare physics. `--pause FILE` stops the process whose id is in FILE while
+it times.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Measures the wall time of a training update: one seed against several, and the learner's and evaluation's shares.
+"""Measures the wall time of a training update: one seed and several, and the fractions of learner and evaluation.
 
 `python tools/bench_training.py --algorithms mappo jrpo mat --seeds 1 5 --json FILE` starts a process per algorithm and
-number of seeds. They compile side by side and are then timed in turn, with the paper's settings: the whole update, its
-rollout alone (the rest is the learner), and an evaluation of all (32 episodes each with sampled and mean actions).
+number of seeds. They compile in parallel and are then timed in turn, with the paper's settings: the whole update, its
+rollout alone (the rest is the learner), and an evaluation (32 episodes each with sampled and with mean actions).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 
 def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, total_steps: int, repeats: int) -> None:
-    """Process of one case: compiles, says that it is ready, and times when it is told to."""
+    """Process of one case: compiles, reports readiness, and times on request."""
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
 
@@ -96,7 +96,7 @@ def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, total_
     }
     figures["learner_share"] = 1.0 - figures["rollout_s"] / figures["update_s"]
     updates = config.num_updates
-    # Twenty evaluations a run.
+    # Twenty evaluations per run.
     spent = 20 * figures["evaluation_s"]
     figures["evaluation_share"] = spent / (spent + updates * figures["update_s"])
     figures["env_steps_per_s"] = seeds * config.steps_per_update / figures["update_s"]
@@ -126,7 +126,7 @@ def main() -> int:
     for algorithm, seeds in cases:
         command = [sys.executable, str(Path(__file__).resolve()), "--work", arguments.task, arguments.impl, algorithm]
         command += [str(seeds), str(arguments.num_envs), str(arguments.total_steps), str(arguments.repeats)]
-        # The processes share the card: none may reserve all of it.
+        # The processes share the GPU: none may preallocate all memory.
         environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
         processes.append(
             subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)

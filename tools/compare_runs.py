@@ -24,7 +24,7 @@ def columns(run: Path) -> dict[str, list[str]]:
 
 
 def differences(first: dict[str, list[str]], second: dict[str, list[str]]) -> list[str]:
-    """Names the columns that differ, with the first row in which they do."""
+    """Returns the columns that differ, with the first differing row."""
     found = [f"{name}: only in one run" for name in first.keys() ^ second.keys()]
     for name in first.keys() & second.keys():
         if len(first[name]) != len(second[name]):
@@ -35,7 +35,7 @@ def differences(first: dict[str, list[str]], second: dict[str, list[str]]) -> li
 
 
 def main() -> int:
-    """Prints what differs; returns the exit status."""
+    """Prints the differences; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs=2, type=Path)
     parser.add_argument("--rename", nargs="*", default=[], metavar="OLD=NEW")

@@ -1,6 +1,6 @@
-"""Pages of the documentation that are generated from the code, and repairs of links and formulas: hooks of MkDocs.
+"""MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
-Generated: one page for each task (picture, clip, sizes, observation, rewards, parameters) with their overview, and the
+Generated: one page per task (image, clip, sizes, observation, rewards, parameters) with an overview, and the
 API reference. Links to files outside docs/ become their paths, and LaTeX becomes MathML, so that the built site needs
 neither the repository nor another host.
 """
@@ -59,7 +59,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Repairs links and formulas of a page."""
+    """Converts links and formulas of a page."""
     return formulas(links(markdown))
 
 
@@ -101,7 +101,7 @@ def pages() -> dict[str, str]:
 
 
 def reference_page(module: str, members: tuple[str, ...]) -> str:
-    """Returns the page of a module, which mkdocstrings fills."""
+    """Returns the page of a module, to be filled by mkdocstrings."""
     if not members:
         return f"# {module}\n\n::: {module}\n"
     return f"# {module}\n\n" + "\n".join(f"::: {module}.{name}\n" for name in members)
@@ -109,10 +109,10 @@ def reference_page(module: str, members: tuple[str, ...]) -> str:
 
 def overview(tasks: Mapping[str, Any]) -> str:
     """Returns the page that lists all tasks."""
-    kinds: dict[str, list[str]] = {"Collaborative": [], "Competitive": [], "For tests": []}
+    kinds: dict[str, list[str]] = {"Cooperative": [], "Competitive": [], "For tests": []}
     for name, task in tasks.items():
         env = _make(task)
-        kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Collaborative"
+        kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
         style = '{ style="min-width: 9em" }'
         image = f"[![{task.title}]({_image(name)}){style}]({name}.md)" if _image(name) else ""
         sizes = f"{env.num_agents} | {env.observation_size} | {env.privileged_observation_size}"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs Debian's Chromium, for the test of the viewer's page, where it may; never fails.
+# Installs Debian's Chromium for the browser test of the viewer, where permitted; never fails.
 has_chromium() {
   [ -n "$MQE_CHROMIUM" ] || command -v chromium chromium-browser google-chrome >/dev/null
 }

@@ -1,11 +1,11 @@
-"""Writes tests/data/rliable.json: what the `rliable` package says of random matrices.
+"""Writes tests/data/rliable.json: results of the `rliable` package on random matrices.
 
-The package is a dependency of neither the project nor its tests. Made once with
+The package is a dependency of neither the project nor its tests. Generated once with
 
     python -m venv VENV && VENV/bin/pip install rliable==1.2.0 'pandas<3'
     VENV/bin/python tools/rliable_fixture.py
 
-The package draws its bootstrap from numpy's global state, which is seeded before each interval.
+The package samples its bootstrap from numpy's global state, which is seeded before each interval.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ THRESHOLDS = [-1.0, -0.25, 0.0, 0.5, 1.5]
 
 
 def interval(scores, statistic) -> list:
-    """Returns lower and upper end of the package's 95% interval."""
+    """Returns the bounds of the package's 95% interval."""
     np.random.seed(SEED)  # noqa: NPY002
     _, ends = library.get_interval_estimates({"x": scores}, lambda *s: np.atleast_1d(statistic(*s)), reps=SAMPLES)
     return np.asarray(ends["x"]).T.squeeze().tolist()

@@ -1,7 +1,7 @@
 """Adapters to the interfaces of other libraries: Gymnasium, PettingZoo, Brax, JaxMARL.
 
-Each is a module of its own and needs the library that it is named after; importing it without that library raises an
-InputError that names the extra to install.
+Each module needs the library of the same name; without that library, importing it raises an InputError that names the
+extra to install.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def missing(library: str, error: ImportError) -> InputError:
 
 
 def task_env(task: str | QuadrupedEnv, *, max_steps: int | None = None, **overrides: Any) -> QuadrupedEnv:
-    """Returns the environment of a task, or the one given, which takes no overrides.
+    """Returns the environment of a task; a given environment is returned unchanged and accepts no overrides.
 
     Args:
         task: id, or an environment.

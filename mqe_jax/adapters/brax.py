@@ -1,7 +1,7 @@
 """Brax: `Env` over the joint observations and actions of all agents, flattened, and a wrapper for training.
 
 `ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length)` trains with automatic resets to new
-episodes. Brax's own wrapper works too, except on Warp, but starts every episode of an environment from one state.
+episodes. Brax's own wrapper also works, except on Warp, but restarts an environment from the same initial state.
 """
 
 from __future__ import annotations
@@ -26,18 +26,17 @@ try:
 except ImportError as error:
     raise missing("brax", error) from None
 
-# Named as Playground's users ask for it (google-deepmind/mujoco_playground, issue 305).
+# Key proposed in google-deepmind/mujoco_playground, issue 305.
 FINAL_OBS = "AutoResetWrapper_final_obs"
 
 
 class Env(BraxEnv):
     """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after agent.
 
-    The reward is the mean over the agents of team 0: all agents in cooperative tasks. `done` is 1 where the task's
-    rules end the episode. The time limit is left to Brax's EpisodeWrapper, which would otherwise treat it as a
-    termination: pass it `episode_length`. `info["truncation"]` is 1 in the step that reaches the time limit,
-    `info[FINAL_OBS]` is the observation at the end of the step, also after an automatic reset. `pipeline_state` is
-    the task's own state.
+    The reward is the mean over the agents of team 0: all agents in cooperative tasks. `done` is 1 on termination.
+    Truncation is left to Brax's EpisodeWrapper, which needs `episode_length` and would otherwise treat the time limit
+    as a termination. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is the
+    observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's `State`.
     """
 
     env: QuadrupedEnv
@@ -46,7 +45,7 @@ class Env(BraxEnv):
     """Time limit, environment steps."""
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
-        """Makes the environment of a task, from its id or given; `overrides` are those of `mqe_jax.make`."""
+        """Creates the environment from a task id or an environment; `overrides` are arguments of `mqe_jax.make`."""
         self.env = task_env(task, **overrides)
         self.episode_length = self.env.max_steps
 
@@ -55,7 +54,7 @@ class Env(BraxEnv):
         state = self.env.reset(rng)
         obs = state.obs.reshape(-1)
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
-        pipeline: Any = state  # any pytree, whatever Brax's annotation
+        pipeline: Any = state  # any pytree, although Brax's annotation is narrower
         zero = jnp.zeros(())
         return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=state.metrics, info=info)
 
@@ -121,7 +120,7 @@ def wrap(
     """Wraps an `Env` for Brax's trainers: batch, time limit, automatic reset to new episodes; pass it as `wrap_env_fn`.
 
     Raises:
-        InputError: for a `randomization_fn`; the task's parameter `randomization` is its place here.
+        InputError: for a `randomization_fn`; use the task parameter `randomization` instead.
     """
     if not isinstance(env.unwrapped, Env):
         raise InputError(f"env: {type(env.unwrapped).__name__} is not a mqe_jax.adapters.brax.Env")

@@ -1,10 +1,10 @@
 """Gymnasium: `Env` and `VectorEnv` over the joint observations and actions of all agents.
 
 Importing this module registers every task as `mqe/TASK-v0`, for `gymnasium.make` and `gymnasium.make_vec`. Gymnasium
-1.x loads no plug-ins by itself; `gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1gate-v0")` imports it too.
+1.x does not load plug-ins; `gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1gate-v0")` also imports this module.
 
-The reward is the mean over the agents of team 0: all agents in cooperative tasks. `info["agent_rewards"]` has those of
-all agents (A,), and `info` the metrics of the step.
+The reward is the mean over the agents of team 0: all agents in cooperative tasks. `info` holds the metrics of the step
+and, as `info["agent_rewards"]`, the rewards of all agents (A,).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Makes the environment.
+        """Creates the environment.
 
         Args:
             task: id, or an environment.
@@ -73,10 +73,10 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; without a seed it continues the random numbers of the one before."""
+        """Starts an episode; without a seed the PRNG stream continues."""
         super().reset(seed=seed)
         if seed is None and self._host.state is None:
-            seed = _drawn_seed(self.np_random)
+            seed = _sample_seed(self.np_random)
         return self._host.reset([seed])[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -109,13 +109,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Makes the environments.
+        """Creates the environments.
 
         Args:
             task: id, or an environment.
             num_envs: N.
             autoreset_mode: Gymnasium's convention for environments whose episodes have ended: NEXT_STEP (Gymnasium's
-                default), SAME_STEP, which has the last observation in `infos["final_obs"]`, or DISABLED.
+                default), SAME_STEP, which stores the last observation in `infos["final_obs"]`, or DISABLED.
             max_episode_steps: time limit, instead of the task's.
             render_mode: None or 'rgb_array'.
             render_size: width and height, pixels.
@@ -146,7 +146,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Starts episodes.
 
         Args:
-            seed: of environment 0, others count up; or one per environment. Without one, the random numbers continue.
+            seed: of environment 0 (environment i: seed + i), or one per environment; None continues the PRNG stream.
             options: `reset_mask` (N,) bool selects the environments to reset.
         """
         super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
@@ -161,7 +161,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             seeds = [None] * self.num_envs
         if self._host.state is None:
-            seeds = [_drawn_seed(self.np_random) if one is None else one for one in seeds]
+            seeds = [_sample_seed(self.np_random) if one is None else one for one in seeds]
         self._ended &= ~mask
         return self._host.reset(seeds, mask), {}
 
@@ -169,7 +169,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Advances all environments by one step; actions are clipped to [-1, 1]."""
         if self.autoreset_mode is AutoresetMode.DISABLED:
             if self._ended.any():
-                raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, by options reset_mask")
+                raise InputError(
+                    f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask"
+                )
             out = self._host.step(actions)
         else:
             same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
@@ -213,7 +215,7 @@ def _team_reward(env: QuadrupedEnv, out: Step) -> np.ndarray:
     return out.reward[:, list(env.teams[0])].mean(-1, dtype=np.float64)
 
 
-def _drawn_seed(generator: np.random.Generator) -> int:
+def _sample_seed(generator: np.random.Generator) -> int:
     return int(generator.integers(2**31))
 
 

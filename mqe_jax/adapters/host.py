@@ -1,4 +1,4 @@
-"""A batch of environments stepped from the host: numpy in, numpy out. The Gymnasium and PettingZoo adapters use it."""
+"""A batch of environments stepped from the host with numpy arrays, for the Gymnasium and PettingZoo adapters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
 from mqe_jax.viz.cameras import Camera, default_camera
-from mqe_jax.viz.geometry import drawn_model
+from mqe_jax.viz.geometry import rendering_model
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.render import render_frames
 
@@ -22,7 +22,7 @@ RENDER_SIZE = (640, 360)
 
 
 class Step(NamedTuple):
-    """One step of N environments, as arrays that belong to the caller.
+    """Output of one step of N environments; the arrays are writable copies.
 
     `final_obs`, `metrics` and all flags and rewards describe the step itself; `obs` is that of the new episode where an
     environment was reset in this call.
@@ -48,8 +48,7 @@ class _Functions(NamedTuple):
 class HostEnvs:
     """N environments of one task. Environment i, reset with seed s, starts as `env.reset(jax.random.PRNGKey(s))`.
 
-    A reset without a seed continues the environment's own random numbers, so that it gives the same episode as an
-    automatic reset.
+    A reset without a seed continues the environment's PRNG stream and starts the same episode as an automatic reset.
     """
 
     env: QuadrupedEnv
@@ -72,7 +71,7 @@ class HostEnvs:
         """Resets the environments of the mask (N,) bool, all by default; returns observations (N, A, O).
 
         Args:
-            seeds: one per environment; None continues the random numbers of the state, which must exist.
+            seeds: one per environment; None continues the PRNG stream of the state, which must exist.
             mask: environments to reset.
 
         Raises:
@@ -105,20 +104,20 @@ class HostEnvs:
 
         Args:
             action: in [-1, 1], clipped to it.
-            same_step: whether an environment is reset in the call in which its episode ends, or in the next one,
-                which then ignores its action and has no reward.
+            same_step: whether an environment is reset in the call that ends its episode; otherwise the next call
+                resets it, ignores its action and returns a zero reward.
         """
         return self._advance(self._functions.step_and_reset, self._checked(action), np.bool_(same_step))
 
     def render(self, index: int = 0, size: tuple[int, int] = RENDER_SIZE) -> np.ndarray:
-        """Returns an image (H, W, 3) uint8 of one environment; the camera stays where the first image put it."""
+        """Returns an image (H, W, 3) uint8 of one environment; the first image sets the camera."""
         if self.state is None:
             raise InputError("render: reset the environment first")
         data = self.state.data
         pose = (np.asarray(x)[index : index + 1] for x in (data.qpos, data.mocap_pos, data.mocap_quat))
         episode = Episode(*pose, dt=self.env.dt)
         if self._camera is None:
-            model = drawn_model(self.env.mj_model, episode)
+            model = rendering_model(self.env.mj_model, episode)
             self._camera = default_camera(model, episode, size[0] / size[1])
         return np.array(next(iter(render_frames(self.env, episode, [self._camera], size))))
 
@@ -127,7 +126,7 @@ class HostEnvs:
             raise InputError("step: reset the environment first")
         state, out, metrics = function(self.state, *arguments)
         self.state = state
-        # Copies: an array of JAX cannot be written to.
+        # Copies, as JAX arrays are read-only.
         obs, final_obs, reward, terminated, truncated = (np.array(x) for x in out)
         named = dict(zip(sorted(state.metrics), np.array(metrics), strict=True))
         return Step(obs, final_obs, reward, terminated, truncated, named)
@@ -143,13 +142,13 @@ class HostEnvs:
 
 
 def _restarted(env: QuadrupedEnv, state: State) -> State:
-    """Returns the state of a new episode that continues the random numbers of `state`, as `autoreset` does."""
+    """Returns the state of a new episode that continues the PRNG stream of `state`, as `autoreset` does."""
     key, reset_key = jax.random.split(state.key)
     return dataclasses.replace(env.reset(reset_key, state.assistance), key=key)
 
 
 def _selected(env: QuadrupedEnv, choose: jax.Array, first: State, second: State) -> State:
-    """Returns `first` where `choose` () is true, else `second`, without touching buffers shared by environments."""
+    """Returns `first` where `choose` () is true, else `second`; buffers that environments share are not selected."""
     data = env.physics.merge(choose, first.data, second.data)
     first = dataclasses.replace(first, data=data)
     names = [field.name for field in dataclasses.fields(State) if field.name != "data"]
@@ -180,7 +179,7 @@ def _compile(env: QuadrupedEnv) -> _Functions:
         def one(state: State, action: jax.Array) -> Any:
             ended_before = state.terminated | state.truncated
             stepped = env.step(state, action)
-            # One reset serves both conventions: of the state before the step, or of the one after it.
+            # A single reset for both conventions, with the key of the state before or after the step.
             source = dataclasses.replace(stepped, key=jnp.where(same_step, stepped.key, state.key))
             fresh = _restarted(env, source)
             shown = _selected(env, ended_before & ~same_step, fresh, stepped)

@@ -24,17 +24,17 @@ Arrays = dict[str, jax.Array]
 
 
 class Env(MultiAgentEnv):
-    """One environment for `jax.vmap`; its state is the task's own `State`, in which `final_obs` survives a reset.
+    """One environment; batch with `jax.vmap`. Its state is the task's `State`, whose `final_obs` is kept by a reset.
 
     Infos have one value per agent (A,), the shape that JaxMARL's baselines expect: `truncation`, and the metrics. Dones
-    are true for terminations and truncations alike.
+    are true on termination and on truncation.
     """
 
     env: QuadrupedEnv
     """The task."""
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
-        """Makes the environment of a task, from its id or given; `overrides` are those of `mqe_jax.make`."""
+        """Creates the environment from a task id or an environment; `overrides` are arguments of `mqe_jax.make`."""
         self.env = task_env(task, **overrides)
         super().__init__(self.env.num_agents)
         self.agents = [f"robot_{i}" for i in range(self.num_agents)]

@@ -1,6 +1,6 @@
 """PettingZoo: `ParallelEnv` over the agents `robot_0`, `robot_1`, ...
 
-`parallel_env(task)` makes the parallel environment, `env(task)` the same one agent after another (AEC).
+`parallel_env(task)` creates the parallel environment, `env(task)` its turn-based form (AEC).
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> Quadr
 
 
 def env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> AECEnv[str, np.ndarray, Any]:
-    """Returns the same environment with one agent acting after another; all of them move after the last one."""
+    """Returns the turn-based (AEC) environment; the physics advances after the last agent's action."""
     return OrderEnforcingWrapper(parallel_to_aec(parallel_env(task, **settings)))
 
 
 class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     """One environment as a parallel environment; all agents end together.
 
-    A copy or pickle is a new environment with the same settings, as vectorisers such as SuperSuit make them.
+    A copied or unpickled instance is a new environment with the same settings, as SuperSuit's vectorisers require.
     """
 
     teams: Any
@@ -63,7 +63,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Makes the environment.
+        """Creates the environment.
 
         Args:
             task: id, or an environment.
@@ -109,7 +109,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Starts an episode; without a seed it continues the random numbers of the one before."""
+        """Starts an episode; without a seed the PRNG stream continues."""
         if seed is None and self._host.state is None:
             seed = int(self._generator.integers(2**31))
         obs = self._host.reset([seed])[0]
@@ -125,7 +125,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         if not self.agents:
             return {}, {}, {}, {}, {}
         if set(actions) != set(self.agents):
-            raise InputError(f"actions: of {sorted(actions)}; expected one of each of {', '.join(self.agents)}")
+            raise InputError(f"actions: for {sorted(actions)}; expected one for each of {', '.join(self.agents)}")
         out = self._host.step(np.stack([np.asarray(actions[agent], np.float32) for agent in self.agents])[None])
         terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.metrics.items()}
@@ -152,7 +152,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         return self._host.render(0, self._size) if self.render_mode else None
 
     def close(self) -> None:
-        """Does nothing: there is nothing to release."""
+        """No-op: no resources are held."""
 
     def _by_agent(self, values: np.ndarray) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, values, strict=True))

@@ -43,7 +43,7 @@ First steps:
   mqe train go1gate --config demo             train two robots to pass a gate (minutes on a CPU)
   mqe eval runs/go1gate                       evaluate the trained policy
   mqe render runs/go1gate -o gate.mp4         render the trained policy
-  mqe view go1gate                            watch and drive in the browser
+  mqe view go1gate                            live view and teleoperation in the browser
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
@@ -63,22 +63,22 @@ class Tasks:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a team on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
+    """Train a policy on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
 
     task: tyro.conf.Positional[str]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
     """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
-    settings of the algorithm given, else the task's tuned ones, else the paper's MAPPO."""
+    settings of --algorithm if given, else the task's tuned settings, else the paper's MAPPO."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings in which they differ."""
+    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Folder of the run. Default: runs/TASK."""
+    """Run folder. Default: runs/TASK."""
     resume: bool = False
     """Continue exactly from the newest checkpoint in the run folder."""
     num_seeds: int = 1
-    """Train this many seeds at once, the given one and those after it, into run folders seed0, seed1, ... of the
-    folder of the run."""
+    """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
+    --run-dir."""
     impl: Impl = "auto"
     control: Control = None
     robot: TaskRobot = None
@@ -95,7 +95,7 @@ class Eval:
     """Evaluate a trained run, or a scripted policy on a task, over complete episodes from fresh resets."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN|TASK")]
-    """Folder of a run, or id of a task (then with --planner or --policy)."""
+    """Run folder, or id of a task (then with --planner or --policy)."""
     json: Json = False
     episodes: int = 512
     """Number of evaluation episodes, split evenly over environments."""
@@ -113,7 +113,7 @@ class Eval:
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Folder of the run whose policy is used. Default: the run given."""
+    """Run folder of the policy. Default: the given run."""
     set: Set = field(default_factory=list)
     dump_diverged: DumpDiverged = None
 
@@ -126,31 +126,31 @@ class Render:
     """Render an episode of a task or of a trained run to a .mp4, .gif or .png file."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
-    """Id of a task, or folder of a run."""
+    """Id of a task, or run folder."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .gif or .png."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    (straight on at half speed). Default for a task: scripted if available, else forward."""
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Folder of the run whose policy is used. Default: the run given."""
+    """Run folder of the policy. Default: the given run."""
     best_of: int = 1
     """Number of episodes, of which the best is rendered (by success, then reward)."""
     seconds: float = 20.0
     """Maximum length of the clip, s."""
     width: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Picture width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .gif, 1280 for .png."""
+    """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .gif, 1280 for .png."""
     fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Frames per second. Default: 25 for .mp4, 12.5 for .gif."""
     view: Literal["follow", "near", "scene", "side"] | None = None
     """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
-    side (tracks the first robot). Default: follow in a clip, scene in a picture."""
+    side (tracks the first robot). Default: follow for a clip, scene for an image."""
     speed: float = 1.0
-    """Playing speed of a clip; 0.5 is slow motion."""
+    """Playback speed of a clip; 0.5 is slow motion."""
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Time of a picture in the episode, s. Default: its middle."""
+    """Time of an image in the episode, s. Default: its middle."""
     impl: Impl = "auto"
     control: Control = None
     robot: TaskRobot = None
@@ -165,12 +165,12 @@ class Render:
 
 @dataclass(frozen=True)
 class Replay:
-    """Replay a recording of a divergence, and render it on request."""
+    """Replay a recording of diverged physics, and render it with --output."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Recording that `--dump-diverged` wrote (.npz)."""
+    """Recording written by `--dump-diverged` (.npz)."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """Clip or picture to write: .mp4, .gif or .png."""
+    """Clip or image to write: .mp4, .gif or .png."""
     impl: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Engine: jax, warp or c. Default: the recorded one."""
     json: Json = False
@@ -181,7 +181,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure environment steps per second, with walk policy and resets, and of the bare physics."""
+    """Measure environment steps per second, including walk policy and resets, and of the physics alone."""
 
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""
@@ -197,7 +197,7 @@ class Bench:
     robot: TaskRobot = None
     seed: Seed = 0
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Append the figures as a row to this file."""
+    """Append the results as a row to this file."""
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
@@ -209,11 +209,11 @@ class Demo:
     """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and video."""
 
     run_dir: Path = Path("runs/demo")
-    """Folder of the run; an interrupted demo resumes from there."""
+    """Run folder; an interrupted demo resumes from it."""
     config: str = "demo"
     """Settings, as in `mqe train --config`."""
     episodes: int = 256
-    """Number of episodes of each evaluation."""
+    """Number of episodes per evaluation."""
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
@@ -222,7 +222,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train tasks x algorithms x settings x seeds into one folder, and report; resumes interrupted runs."""
+    """Train all combinations of tasks, algorithms, settings and seeds, and report; resumes interrupted runs."""
 
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""
@@ -239,7 +239,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Report:
-    """Write figures and tables of a sweep from its raw data, beside the paper's values."""
+    """Write figures and tables of a sweep from its raw data, with the paper's values."""
 
     folder: tyro.conf.Positional[Path]
     """Folder of the sweep, with its raw data in raw/; the report goes into report/."""
@@ -254,7 +254,7 @@ class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
-    """Folder of the run: weights, curve, checkpoints."""
+    """Run folder: weights, metrics.csv, checkpoints."""
     resume: bool = False
     """Resume from the newest checkpoint in the run folder."""
     num_envs: int = 8192
@@ -266,13 +266,13 @@ class WalkTrain:
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Weights to fine-tune, also of another robot. Default: from scratch."""
     initial_std: float = 1.0
-    """Standard deviation of the actions at the start."""
+    """Initial standard deviation of the actions."""
     curriculum: int = 400
-    """Curriculum length: iterations over which slopes, forces and kicks are ramped to their maxima."""
+    """Curriculum length: iterations over which slopes, forces and pushes are ramped to their maxima."""
     critic_warmup: int = 0
     """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
     anneal: float = 0.25
-    """Last fraction of the training over which learning rate and entropy bonus fall linearly to zero."""
+    """Final fraction of training over which learning rate and entropy bonus are annealed linearly to zero."""
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1
@@ -289,9 +289,9 @@ class WalkEval:
     """Weights to evaluate. Default: the shipped ones."""
     json: Json = False
     episodes: int = 1000
-    """Number of episodes of each scenario, run in parallel."""
+    """Number of episodes per scenario, run in parallel."""
     scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
-    """Scenario, such as flat, kicks or slope_up; may be repeated. Default: all."""
+    """Scenario, such as flat, pushes or slope_up; may be repeated. Default: all."""
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 0
@@ -305,9 +305,9 @@ class WalkConvert:
     """Convert official TorchScript checkpoints of walk-these-ways to this package's weights."""
 
     adaptation: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ADAPTATION.jit")]
-    """Such as adaptation_module_latest.jit."""
+    """Adaptation module, such as adaptation_module_latest.jit."""
     body: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY.jit")]
-    """Such as body_latest.jit."""
+    """Policy body, such as body_latest.jit."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """Weights to write (.safetensors)."""
     robot: Robot = "go1"
@@ -357,7 +357,7 @@ def _parser(wanted: Sequence[str]) -> Any:
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """Parses the command line; help exits with 0, anything wrong raises an InputError of one line."""
+    """Parses the command line; help exits with 0, an invalid argument raises a one-line InputError."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         hint = nearest(arguments[0], COMMANDS)
         raise InputError(f"unknown command {arguments[0]!r}{hint}; allowed: {', '.join(COMMANDS)}")

@@ -71,7 +71,7 @@ def bench(
         step = jax.vmap(lambda d: env.physics.step(d, d.ctrl))
         return jax.lax.scan(lambda d, _: (step(d), None), data, None, steps)[0]
 
-    # From a reset: the robots stand or fall under the constant control that it set.
+    # Starts at the reset state, under its constant control.
     _, bare_s, _ = timed(bare, jax.tree.map(jnp.copy, state.data), repeats)
     full_rate, bare_rate = count * steps / full_s, count * steps / bare_s
     return {
@@ -98,7 +98,7 @@ def device_name() -> str:
 
 
 def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a CSV file, written atomically; InputError where the file has other columns."""
+    """Appends a row to a CSV file, written atomically; InputError if the file has other columns."""
     rows: list[dict[str, Any]] = []
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:

@@ -12,7 +12,7 @@ import numpy as np
 from mqe_jax.cli import bench as benchmark
 from mqe_jax.cli.arguments import Bench, Eval, Render, Replay, Tasks, Train
 from mqe_jax.cli.flags import given
-from mqe_jax.cli.output import print_table, say
+from mqe_jax.cli.output import echo, print_table
 from mqe_jax.cli.players import PLANNER_NAMES, Player
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
@@ -30,12 +30,12 @@ from mqe_jax.viz.clips import check_output
 
 
 def is_run(target: str) -> bool:
-    """Returns whether RUN|TASK is the folder of a run."""
+    """Returns whether RUN|TASK is a run folder."""
     return os.sep in target or Path(target).exists()
 
 
 def find_player(arguments: Eval | Render | View, default: str) -> Player:
-    """Returns the player of RUN|TASK, --policy and --planner; `default` is the planner of a task without either."""
+    """Returns the player selected by RUN|TASK, --policy and --planner; `default` applies to a task without either."""
     target = arguments.target
     if arguments.planner is not None and arguments.policy is not None:
         raise InputError("planner: give --planner or --policy, not both")
@@ -64,11 +64,11 @@ def _overrides(arguments: Train | Eval | Render | View | Bench) -> dict[str, Any
 
 
 def _run_config(target: str) -> Any:
-    """Returns the settings of a run's folder."""
+    """Returns the settings in a run folder."""
     if not Path(target).is_dir():
-        raise InputError(f"run: no folder {target!r}; allowed: the folder of a training, or a task's id")
+        raise InputError(f"run: no folder {target!r}; allowed: a run folder, or a task's id")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
-        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not the folder of a training")
+        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder")
     config = runner.load_run_config(target)
     if config.task is None:
         raise InputError(f"{target}: {runner.CONFIG_FILE} has no 'task' entry")
@@ -79,10 +79,10 @@ def _recorder(env: Any, folder: Path | None) -> DivergenceRecorder | None:
     return None if folder is None else DivergenceRecorder(env, folder)
 
 
-def _say_recorded(recorder: DivergenceRecorder | None) -> None:
+def _echo_recorded(recorder: DivergenceRecorder | None) -> None:
     if recorder is not None and recorder.written:
         first = recorder.written[0]
-        say(f"mqe: recorded {len(recorder.written)} divergences; replay the first with: mqe replay {first}")
+        echo(f"mqe: recorded {len(recorder.written)} divergences; replay the first with: mqe replay {first}")
 
 
 def tasks(arguments: Tasks) -> dict[str, Any] | None:
@@ -128,12 +128,12 @@ def train(arguments: Train) -> None:
     try:
         runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
     except KeyboardInterrupt:
-        say(f"mqe: stopped; resume with the same command and --resume; the run is in {run_dir}")
+        echo(f"mqe: stopped; resume with the same command and --resume; the run is in {run_dir}")
         raise
     finally:
-        _say_recorded(recorder)
+        _echo_recorded(recorder)
     curves.draw_curve(folders, run_dir / "curve.png", arguments.task)
-    say(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
+    echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 
 
 def evaluate(arguments: Eval) -> dict[str, Any]:
@@ -152,9 +152,9 @@ def evaluate(arguments: Eval) -> dict[str, Any]:
         memory=player.memory(num_envs),
         recorder=recorder,
     )
-    _say_recorded(recorder)
+    _echo_recorded(recorder)
     if result.overflow:
-        say(
+        echo(
             f"mqe: warning: the engine may have dropped contacts in {result.overflow} environment steps; "
             "raise --set contacts_per_robot and --set constraints_per_robot"
         )
@@ -185,7 +185,7 @@ def replay(arguments: Replay) -> dict[str, Any]:
         finite = np.all(np.isfinite(recorded.states["data/qpos"]), axis=1)
         qpos, position, turn = (recorded.states[f"data/{name}"][finite] for name in ("qpos", "mocap_pos", "mocap_quat"))
         rendering.render_episode(env, recording.Episode(qpos, position, turn, env.dt), arguments.output)
-        say(f"mqe: wrote {arguments.output}")
+        echo(f"mqe: wrote {arguments.output}")
     if not arguments.json:
         print_table(result)
     return result
@@ -218,7 +218,7 @@ def render(arguments: Render) -> None:
         speed=arguments.speed,
         at=arguments.at,
     )
-    say(f"mqe: wrote {arguments.output} ({renderer})")
+    echo(f"mqe: wrote {arguments.output} ({renderer})")
 
 
 def draw(

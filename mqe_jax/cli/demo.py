@@ -11,7 +11,7 @@ import jax
 
 from mqe_jax.cli.arguments import Demo
 from mqe_jax.cli.commands import draw
-from mqe_jax.cli.output import say
+from mqe_jax.cli.output import echo
 from mqe_jax.cli.players import Player
 from mqe_jax.cli.setup import make_env, train_config
 from mqe_jax.envs import VectorEnv
@@ -35,19 +35,19 @@ def demo(arguments: Demo) -> None:
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
     _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
-    say(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
+    echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
     untrained = make_learner(vector_env, config)
     state = jax.jit(untrained.init)(runner.initial_key(config))
     before = policy.policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
     del state
-    say("mqe demo: evaluating the untrained policy")
+    echo("mqe demo: evaluating the untrained policy")
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
     try:
         runner.train(training_env, config, run_dir, resume=True)
     except KeyboardInterrupt:
-        say("mqe: stopped; the same command resumes from here")
+        echo("mqe: stopped; the same command resumes from here")
         raise
     after = policy.load_policy(run_dir)
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
@@ -58,7 +58,7 @@ def demo(arguments: Demo) -> None:
         check_output(video)
     except InputError:
         video = run_dir / "video.gif"
-    say("mqe demo: rendering an episode")
+    echo("mqe demo: rendering an episode")
     draw(
         env,
         Player(DEMO_TASK, dict(config.env), after),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from typing import Any
 
-from mqe_jax.cli.output import print_table, say
+from mqe_jax.cli.output import echo, print_table
 from mqe_jax.cli.setup import make_env
 from mqe_jax.cli.view_arguments import Export
 from mqe_jax.errors import InputError
@@ -23,8 +23,8 @@ def export(arguments: Export) -> dict[str, Any]:
     if task is None:
         raise InputError(f"{arguments.run_dir}: its settings have no 'task' entry")
 
+    from mqe_jax.export.actor import check_network
     from mqe_jax.export.check import largest_error
-    from mqe_jax.export.planner import check_network
     from mqe_jax.export.policy import save_onnx, shapes, to_onnx
 
     check_network(policy)
@@ -35,7 +35,7 @@ def export(arguments: Export) -> dict[str, Any]:
         error = largest_error(model, policy, env)
     save_onnx(model, arguments.onnx)
     sizes = shapes(model)
-    say(f"mqe: wrote {arguments.onnx}, {arguments.onnx.stat().st_size / 1e6:.1f} MB")
+    echo(f"mqe: wrote {arguments.onnx}, {arguments.onnx.stat().st_size / 1e6:.1f} MB")
     result = {"task": task, "control": env.control, "largest_error": error, **sizes}
     if not arguments.json:
         for kind, values in sizes.items():

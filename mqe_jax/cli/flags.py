@@ -32,7 +32,8 @@ def given(flags: Any) -> dict[str, Any]:
 def _flags(kinds: Collection[type[Any]], hidden: Collection[str] = ()) -> Any:
     """Returns a dataclass of optional flags for the fields of records; docstrings are those of the records.
 
-    Of several records (the registered networks), every field is a flag; flags of those not chosen fail validation.
+    Every field of several records (the registered networks) becomes a flag; validation rejects the flags of records
+    that are not selected.
     """
     fields = {}
     for kind in kinds:
@@ -49,7 +50,7 @@ def _flags(kinds: Collection[type[Any]], hidden: Collection[str] = ()) -> Any:
     return dataclasses.make_dataclass(
         "Flags",
         [(name, hint, dataclasses.field(default=default)) for name, (hint, default) in fields.items()],
-        bases=tuple(kinds),  # where tyro finds the docstrings
+        bases=tuple(kinds),  # tyro reads their docstrings
         namespace={"__post_init__": lambda self: None},
         frozen=True,
         kw_only=True,

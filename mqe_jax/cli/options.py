@@ -22,7 +22,7 @@ class Command(Protocol):
 
 
 def implementation(module: str = "commands") -> Any:
-    """Returns a module of `mqe_jax.cli`, imported only now."""
+    """Imports and returns a module of `mqe_jax.cli`."""
     with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note about a missing warp-lang
         return importlib.import_module(f"mqe_jax.cli.{module}")
 
@@ -47,15 +47,13 @@ Control = Annotated[
     tyro.conf.arg(
         metavar="MODE",
         help="Action mode: command (velocities for the walk policy), position (joint targets), torque. "
-        "Default: command, or what the run was trained with.",
+        "Default: command, or the run's mode.",
     ),
 ]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
 TaskRobot = Annotated[
     str | None,
-    tyro.conf.arg(
-        metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or what the run was trained with."
-    ),
+    tyro.conf.arg(metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or the run's robot."),
 ]
 
 

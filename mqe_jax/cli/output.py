@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, TextIO
 
 
-def say(text: str) -> None:
+def echo(text: str) -> None:
     """Prints a line to standard error."""
     print(text, file=sys.stderr, flush=True)
 

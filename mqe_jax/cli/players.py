@@ -35,7 +35,7 @@ class Player:
         """Returns the batched `act` of all agents.
 
         Raises:
-            InputError: where the policy or the opponent does not fit the task.
+            InputError: if the policy or the opponent does not fit the task.
         """
         act = self._own_act(env, deterministic)
         if self.opponent is not None and len(env.teams) < 2:
@@ -45,7 +45,7 @@ class Player:
         return against(act, planner(self.opponent or "idle", env), env)
 
     def memory(self, num_envs: int) -> Any:
-        """Returns the policy's memory at an episode's start."""
+        """Returns the policy's initial recurrent state."""
         return () if isinstance(self.policy, str) else self.policy.initial_memory(num_envs)
 
     def _own_act(self, env: Any, deterministic: bool) -> Act:
@@ -66,7 +66,7 @@ class Player:
 
 
 def against(act: Act, opponent: Act, env: Any) -> Act:
-    """Returns `act` for team 0 with `opponent`, which has no memory, for team 1."""
+    """Combines `act` for team 0 with `opponent`, which has no recurrent state, for team 1."""
     second = jnp.asarray([agent in env.teams[1] for agent in range(env.num_agents)])[:, None]
 
     def both(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
@@ -78,7 +78,7 @@ def against(act: Act, opponent: Act, env: Any) -> Act:
 
 
 def planner(name: str, env: Any) -> Act:
-    """Returns the `act` of a scripted or trivial policy; InputError where the task has no scripted one."""
+    """Returns the `act` of a scripted or trivial policy; InputError if the task has no scripted one."""
     shape = (env.num_agents, env.action_size)
     plan = _scripted(env) if name == "scripted" else None
 

@@ -14,9 +14,9 @@ from mqe_jax.files import check_folder
 from mqe_jax.train.types import Trace
 
 STEPS = 64
-"""Number of steps up to a divergence that a recording holds at most."""
+"""Maximum number of steps in a recording, the last of which diverges."""
 LIMIT = 100
-"""Number of recordings that one command writes at most."""
+"""Maximum number of recordings per command."""
 
 
 class DivergenceRecorder:
@@ -36,7 +36,7 @@ class DivergenceRecorder:
         return content(env_state)
 
     def add(self, trace: Trace) -> None:
-        """Writes the environments that diverged in a trace, with steps of the one before where needed."""
+        """Writes a recording of each environment that diverged in a trace, with steps of the previous one if needed."""
         for step, index in np.argwhere(np.asarray(trace.diverged) > 0.0)[: LIMIT - len(self.written)]:
             parts = [trace] if self._previous is None else [self._previous, trace]
             steps, actions = jax.tree.map(

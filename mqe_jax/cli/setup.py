@@ -20,7 +20,7 @@ CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
 
 
 def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
-    """Parses KEY=VALUE pairs, values as YAML; raises an InputError naming the pair that is not one."""
+    """Parses KEY=VALUE pairs, values as YAML; raises an InputError naming the malformed pair."""
     values = {}
     for pair in pairs:
         name, equals, text = pair.partition("=")
@@ -36,7 +36,7 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 def make_env(
     task: str, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
 ) -> tuple[Any, VectorEnv]:
-    """Returns a task and its vectorised environment with automatic reset; `copies` as of `VectorEnv`."""
+    """Returns a task and its vectorised environment with automatic reset; `copies` as in `VectorEnv`."""
     for name in ("impl", "num_envs"):
         if name in overrides:
             flag = name.replace("_", "-")
@@ -58,13 +58,13 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[VectorEnv,
 
 
 def platform() -> str:
-    """Returns the platform of JAX; raises an InputError where JAX_PLATFORMS names one that is missing."""
+    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable one."""
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        asked = os.environ.get("JAX_PLATFORMS", "")
-        said = str(error) or "no such device"
-        raise InputError(f"JAX_PLATFORMS: {asked!r} cannot be used here ({said}); try cpu") from None
+        requested = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error) or "no such device"
+        raise InputError(f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu") from None
 
 
 def find_config(name: str) -> Path:
@@ -91,8 +91,7 @@ def train_config(
 ) -> TrainConfig:
     """Returns the settings of a training run: a file, the algorithm's preset, then `settings` and task parameters.
 
-    Without a file an algorithm starts from its paper's settings (paper/ALGORITHM), and a task without an algorithm
-    from its tuned ones (tuned/TASK), else from the paper's MAPPO.
+    The default file is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else paper/mappo.
 
     Raises:
         InputError: for a file, an algorithm or a setting that is not allowed.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mqe_jax.cli.arguments import Report, Sweep
-from mqe_jax.cli.output import say
+from mqe_jax.cli.output import echo
 from mqe_jax.cli.setup import environments, train_config
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.errors import InputError, nearest
@@ -38,21 +38,21 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
     try:
         others = sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
     except KeyboardInterrupt:
-        say(f"mqe: stopped; continue with: mqe sweep {arguments.file} --folder {folder}")
+        echo(f"mqe: stopped; resume with: mqe sweep {arguments.file} --folder {folder}")
         raise
     if others:
         cells = ", ".join(job.cell.path.as_posix() for job in others)
-        say(f"mqe: left to other processes that train this sweep: {cells}")
+        echo(f"mqe: skipped, in use by other processes: {cells}")
     files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
     if files:
-        say(f"mqe: {files[-1]} and {len(files) - 1} more files beside it")
+        echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
     return {"left": _estimate(folder, sweeps.plan(settings, folder, config_of)), "report": [str(f) for f in files]}
 
 
 def report(arguments: Report) -> dict[str, Any]:
-    """Writes the report of a study's folder from its raw data."""
+    """Writes the report of a study folder from its raw data."""
     files = reports.report(arguments.folder)
-    say(f"mqe: {files[-1]} and {len(files) - 1} more files beside it")
+    echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
     return {"report": [str(file) for file in files]}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 
 from mqe_jax.cli.commands import find_player
-from mqe_jax.cli.output import say
+from mqe_jax.cli.output import echo
 from mqe_jax.cli.setup import make_env
 from mqe_jax.cli.view_arguments import View
 from mqe_jax.errors import InputError
@@ -31,6 +31,6 @@ def view(arguments: View) -> None:
 
     viewer = Viewer(Session(env, vector_env, act, memory, arguments.seed), arguments.host, arguments.port)
     if arguments.host not in _LOCAL:
-        say(f"mqe: warning: anyone who reaches {arguments.host} can open this page and drive the robots")
-    say(f"mqe: open {viewer.url} in a browser; Ctrl-C ends")
+        echo(f"mqe: warning: every machine that reaches {arguments.host} can open this page and control the robots")
+    echo(f"mqe: open {viewer.url} in a browser; Ctrl-C ends")
     viewer.run()

@@ -13,23 +13,23 @@ from mqe_jax.cli.options import Control, Impl, Json, Seed, Set, TaskRobot, imple
 
 @dataclass(frozen=True)
 class View:
-    """Show a task or a trained run in the browser: pause, step, follow, drive a robot, live plots."""
+    """Show a task or a trained run in the browser, with teleoperation and live plots."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
-    """Id of a task, or folder of a run."""
+    """Id of a task, or run folder."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: scripted where there is one, else forward."""
+    (straight on at half speed). Default for a task: scripted if available, else forward."""
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Folder of the run whose policy is used. Default: the run given."""
+    """Run folder of the policy. Default: the given run."""
     num_envs: int = 1
     """Number of environments, side by side: 1 to 16."""
     host: str = "127.0.0.1"
     """Address to listen on; the default is reachable from this machine only. There is no authentication."""
     port: int = 8080
-    """Port to listen on; the next free one where it is taken."""
+    """Port to listen on, or the next free one if it is in use."""
     impl: Impl = "auto"
     control: Control = None
     robot: TaskRobot = None
@@ -44,10 +44,10 @@ class View:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a trained run's policy, with the walk policy under it, as one ONNX graph."""
+    """Write a trained policy, together with the walk policy, as one ONNX graph."""
 
     run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Folder of the run, or its policy file."""
+    """Run folder, or policy file."""
     onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write (.onnx)."""
     json: Json = False

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mqe_jax.cli.arguments import WalkConvert, WalkEval, WalkTrain
-from mqe_jax.cli.output import print_table, say
+from mqe_jax.cli.output import echo, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.files import locked
 from mqe_jax.train.checkpoint import prepare_folder
@@ -44,7 +44,7 @@ def walk_train(arguments: WalkTrain) -> None:
     def report(iteration: int, row: dict[str, float]) -> None:
         shown = ("reward", "episode_length", "kl", "difficulty")
         numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
-        say(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
+        echo(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
 
     with locked(arguments.run_dir):
         walk.train_walk(
@@ -56,16 +56,16 @@ def walk_train(arguments: WalkTrain) -> None:
             max_seconds=arguments.max_seconds,
             report=report,
         )
-    say(f"mqe: {arguments.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
+    echo(f"mqe: {arguments.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 
 def walk_eval(arguments: WalkEval) -> dict[str, Any]:
-    """Measures the walk policy and prints a table, or gives the object for `--json`."""
+    """Evaluates the walk policy; prints a table, or returns the object for `--json`."""
     from mqe_jax import robots, walk_policy
     from mqe_jax.walk.evaluation import evaluate_walk
 
     def report(name: str, figures: Mapping[str, float]) -> None:
-        say(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
+        echo(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
 
     robot = robots.get(arguments.robot)
     result = evaluate_walk(
@@ -94,4 +94,4 @@ def walk_convert(arguments: WalkConvert) -> None:
             raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
     params = convert.convert(arguments.adaptation, arguments.body)
     walk_policy.save_params(params, arguments.output, {"robot": robots.get(arguments.robot).name})
-    say(f"mqe: wrote {arguments.output}")
+    echo(f"mqe: wrote {arguments.output}")

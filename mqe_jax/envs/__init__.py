@@ -1,4 +1,4 @@
-"""The environments: `make` creates one by the id of its task."""
+"""The environments: `make` creates one from a task id."""
 
 from __future__ import annotations
 

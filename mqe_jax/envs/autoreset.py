@@ -36,7 +36,7 @@ def autoreset(env: QuadrupedEnv, state: State) -> State:
 
 
 class VectorEnv:
-    """A batch of environments that are reset when their episodes end: the environment of trainers."""
+    """A batch of environments with automatic reset, as used for training and evaluation."""
 
     env: QuadrupedEnv
     """The task."""
@@ -48,7 +48,7 @@ class VectorEnv:
     """Environment steps until the time limit."""
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
-        """Makes the batch; `copies` such batches may be stepped together by a further `vmap`, as seeds are."""
+        """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs} must be at least 1")
         self.env = env.with_num_envs(num_envs * copies)

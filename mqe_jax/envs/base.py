@@ -1,8 +1,8 @@
 """The environment core: one environment of several robots as pure `reset` and `step` functions, batched by `jax.vmap`.
 
-A task is a subclass in a file of its own; `mqe_jax.envs.task` lists what it defines. Everything that tasks share is
-here: spawning, control, physics, randomisation, falls, collisions, the time limit and the guard against diverged
-physics.
+A task is a subclass in its own file that implements the interface in `mqe_jax.envs.task`. This module implements what
+all tasks share: spawning, control, physics, randomisation, falls, collisions, the time limit and the detection of
+diverged physics.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class QuadrupedEnv(Task):
         self.params = self.Params() if params is None else params
         expected = self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
-            raise InputError(f"num_agents: {self.params.num_agents}; {self.name} is for {expected} robots")
+            raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
         self.control = check_mode(control)
         if num_envs < 1:
             raise InputError(f"num_envs: {num_envs} must be at least 1")

@@ -24,9 +24,9 @@ class BridgeRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     win: float = 10.0
-    """Paid when the opponent is off the bridge or has fallen."""
+    """In steps in which the opponent is off the bridge or has fallen."""
     far_side: float = 1.0
-    """Paid while the robot is on the opponent's platform."""
+    """In steps in which the robot is on the opponent's platform."""
 
 
 @record

@@ -1,4 +1,4 @@
-"""go1revolvingdoor, the paper's Revolving Door: two robots race through a door that one robot can pass at a time."""
+"""go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a door that is wide enough for one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mqe_jax.terrain import DoorGap, EndWall, Plane, SpawnArea, Track
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_WALL_LENGTH = 1.0  # m along x, of the block whose middle holds the door
+_WALL_LENGTH = 1.0  # m along x, of the block with the door at its centre
 
 
 @record
@@ -30,7 +30,7 @@ class DoorRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     win: float = 10.0
-    """Paid for crossing the line first, or if the opponent falls."""
+    """In the step in which the robot crosses the line first, or the opponent falls."""
     approach: float = 1.0
     """Per m of decrease of the distance to the midpoint of the line."""
 

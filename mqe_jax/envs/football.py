@@ -119,13 +119,13 @@ class FootballMatchRewards:
     """
 
     goal: float = 10.0
-    """Paid when the ball is in the goal that the team attacks, which ends the episode."""
+    """When the ball is in the goal that the team attacks, which ends the episode."""
     progress: float = 0.3
     """Per m of decrease of the ball's distance to the midpoint of that goal."""
     approach: float = 0.1
     """Per m of decrease of the distance between the ball and the team's nearest robot."""
     fall: float = -10.0
-    """Paid when a robot of the team has fallen, which ends and loses the match."""
+    """When a robot of the team has fallen, which ends the match as a loss."""
 
 
 @record
@@ -160,8 +160,8 @@ class FootballMatch(Football, Match):
     """Base of the football matches.
 
     - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at x 2.
-    - Observation, in the team's own frame: one-hot within the team, own base info 6, mate's, opponents', ball
-      position 3, ball velocity 3.
+    - Observation, in the team's own frame: one-hot within the team, own base info 6, teammate's, opponents',
+      ball position 3, ball velocity 3.
     - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
     - End: a goal, a fall, or 20 s. Win: a goal, or the opponents' fall.
 
@@ -186,12 +186,12 @@ class FootballMatch(Football, Match):
     @property
     def observation_layout(self) -> ObservationLayout:
         team = self.num_agents // 2
-        mate = (Block("mate", 6 * (team - 1), BASE_INFO),) if team > 1 else ()
+        teammate = (Block("teammate", 6 * (team - 1), BASE_INFO),) if team > 1 else ()
         return ObservationLayout(
             (
                 one_hot(team, "agent's id within its team"),
                 Block("base", 6, BASE_INFO),
-                *mate,
+                *teammate,
                 Block("opponents", 6 * team, BASE_INFO),
                 *BALL_BLOCKS,
             )
@@ -210,7 +210,7 @@ class FootballMatch(Football, Match):
             "ball_velocity": self.view_vectors(self.ball_velocity(state.data))[side],
         }
         if team > 1:
-            blocks["mate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
+            blocks["teammate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
         return blocks
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:

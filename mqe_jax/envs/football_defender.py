@@ -27,7 +27,7 @@ class DefenderRewards:
     """Weights of the reward terms."""
 
     goal: float = 10.0
-    """Paid while the ball is in the goal."""
+    """In steps in which the ball is in the goal."""
     nearness: float = 3.0
     """Per exp(-distance of the ball to the goal's midpoint / 3 m)."""
 
@@ -55,7 +55,7 @@ class Go1FootballDefender(Football):
     """Football (2 vs 1).
 
     - Scene: the field, a ball, and a third robot that defends the goal at x 12 (see `mqe_jax.npc.defend`).
-    - Observation: one-hot 2, own base info 6, mate's base info 6, ball position 3, ball velocity 3.
+    - Observation: one-hot 2, own base info 6, teammate's base info 6, ball position 3, ball velocity 3.
     - Reward: see `DefenderRewards`; shared.
     - End: a fall, or 20 s. Success: a goal, at any time in the episode.
 

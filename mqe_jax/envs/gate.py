@@ -34,7 +34,7 @@ class GateRewards:
     crowding: float = -0.025
     """Per robot and 1 / d^2 while the distance d between the robots is below 0.5 m."""
     collision: float = -2.0
-    """Paid in steps with any trunk contact."""
+    """In steps with any trunk contact."""
 
 
 @record
@@ -81,7 +81,7 @@ class Go1Gate(QuadrupedEnv):
     """Narrow Gate.
 
     - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is sampled at reset.
-    - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2.
+    - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2.
     - Reward: see `GateRewards`; shared.
     - End: a fall, a collision, or 10 s. Success: both are through without a collision.
 

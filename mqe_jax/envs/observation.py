@@ -97,13 +97,13 @@ def one_hot(agents: int, meaning: str = "agent's id") -> Block:
 
 
 # The first blocks of two cooperating robots; `pair` fills them.
-PAIR = (one_hot(2), Block("base", 6, BASE_INFO), Block("mate", 6, BASE_INFO))
+PAIR = (one_hot(2), Block("base", 6, BASE_INFO), Block("teammate", 6, BASE_INFO))
 GATE = Block("gate", 2, "centre of the gap, m")
 
 
 def pair(info: jax.Array) -> dict[str, jax.Array]:
     """Returns the blocks of `PAIR` from the base information (2, 6) of both robots."""
-    return {"one_hot": jnp.eye(2), "base": info, "mate": others(info)}
+    return {"one_hot": jnp.eye(2), "base": info, "teammate": others(info)}
 
 
 def others(values: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""The parameters that all tasks have."""
+"""Parameters common to all tasks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mqe_jax.settings import NonNegative, Positive, PositiveInt, Range, fail, re
 
 @record
 class TaskParams:
-    """Parameters that all tasks have; a task adds its own."""
+    """Parameters common to all tasks; a task adds its own."""
 
     num_agents: PositiveInt = 2
     """Number of controlled robots."""
@@ -30,10 +30,10 @@ class TaskParams:
     spawn_velocity: NonNegative = 0.5
     """Half-width of the uniform noise on all six base velocities, m/s and rad/s."""
     max_roll: Positive = 0.8
-    """An episode ends when any |roll| is greater, rad."""
+    """Maximum |roll|, rad; above it the episode terminates."""
     max_pitch: Positive = 1.6
-    """An episode ends when any |pitch| is greater, rad. Pitch is an arcsine, so a limit above pi / 2, as in the
-    released system, is never reached: a robot that turns over by pitching shows a roll of pi.
+    """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so a limit above pi / 2, as in the
+    released system, is never reached: a robot that pitches over has a roll of pi.
     """
     min_height: float = -1.0
     """Minimum trunk height, m; below it the episode terminates."""
@@ -48,7 +48,7 @@ class TaskParams:
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
     """Walk commands that the action sets, in order."""
     walk_policy: str | None = None
-    """Weights file of the walk policy; the package's own if None."""
+    """Weights file of the walk policy; the shipped one if None."""
     actuator_network: str | None = None
     """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: Positive = 1.0
@@ -56,7 +56,7 @@ class TaskParams:
     solver_iterations: PositiveInt = 4
     """Maximum solver iterations per physics step."""
     contacts: Literal["full", "minimal"] = "full"
-    """Set of the robots' collision shapes: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
+    """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
     and disables limb collisions.
     """
     contacts_per_robot: PositiveInt = 12
@@ -73,7 +73,7 @@ class TaskParams:
     """Domain randomisation."""
     frozen_time: NonNegative = 4.0
     """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
-    first learn sequential subtasks one at a time. Off unless a trainer sets assistance.
+    first learn sequential subtasks one at a time. Inactive at assistance 0.
     """
 
     def __post_init__(self) -> None:
@@ -91,7 +91,9 @@ def check_above(spawn_height: float, top: float, robot: str) -> None:
     """
     least = top + robots.get(robot).stand_height
     if spawn_height < least:
-        raise InputError(f"spawn_height: {spawn_height} must be at least {least:.2f}, as the ground is at {top}")
+        raise InputError(
+            f"spawn_height: {spawn_height} must be at least {least:.2f}, as the supporting surface is at {top}"
+        )
 
 
 def check_gap(name: str, width: float, track_width: float) -> None:

@@ -78,13 +78,13 @@ class Go1Plane(QuadrupedEnv):
     def observation_layout(self) -> ObservationLayout:
         agents = self.num_agents
         blocks = [one_hot(agents), Block("base", 6, BASE_INFO)]
-        blocks += [Block("mates", 6 * (agents - 1), BASE_INFO)] if agents > 1 else []
+        blocks += [Block("teammates", 6 * (agents - 1), BASE_INFO)] if agents > 1 else []
         return ObservationLayout(tuple(blocks))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         info = robot_state.base_info
         blocks = {"one_hot": jnp.eye(self.num_agents), "base": info}
-        return blocks | ({"mates": others(info)} if self.num_agents > 1 else {})
+        return blocks | ({"teammates": others(info)} if self.num_agents > 1 else {})
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         x = robot_state.position_w[:, 0]

@@ -29,18 +29,17 @@ _ROBOT = (
 
 
 class PrivilegedObservation:
-    """State of the R robots and all other moving bodies, anchors, randomised physics, gait phases, contact forces.
+    """State of the R robots and all other moving bodies, anchors, physics parameters, gait phases, contact forces.
 
-    The randomised physics is included whether it is randomised or not, so that the layout does not depend on the
-    ranges.
+    Physics parameters are included even if they are not randomised, so that the layout does not depend on the ranges.
 
     Args:
-        robot: all robots of the task.
-        model: the compiled model.
-        index: its robots.
+        robot: robot type shared by all robots.
+        model: compiled model.
+        index: index tables of the robots.
         num_anchors: G.
-        gait: whether the robots walk by the walk policy, whose gait phases are then included.
-        contact_forces: whether the scene measures the feet's contact forces, which are then included with the trunks'.
+        gait: whether to include the gait phases of the walk policy.
+        contact_forces: whether to include contact forces on trunks and feet; requires the scene's foot sensors.
     """
 
     layout: ObservationLayout
@@ -74,10 +73,10 @@ class PrivilegedObservation:
                     Block("anchors", 2 * num_anchors, "x, y of each, m"),
                     Block("friction", count, "sliding friction of each robot"),
                     Block("payload", count, "of each robot, kg"),
-                    Block("center_of_mass", 3 * count, "shift of each robot's, m"),
+                    Block("center_of_mass", 3 * count, "shift of each trunk's centre of mass, m"),
                     Block("motor_strength", count, "factor on each robot's torques"),
                     Block("action_lag", 1, "environment steps"),
-                    Block("gait_phase", 2 * count if gait else 0, "sine and cosine of each robot's"),
+                    Block("gait_phase", 2 * count if gait else 0, "sine and cosine of each robot's gait phase"),
                     Block("contact_force", 5 * count if contact_forces else 0, "on each robot's trunk and feet, N"),
                 )
                 if block.width
@@ -92,7 +91,7 @@ class PrivilegedObservation:
         randomized: RandomizedParams,
         walk: WalkMemory | None,
     ) -> jax.Array:
-        """Returns the observation of one environment (P,); `walk` is the memory of the walk policy, leading axis R."""
+        """Returns the observation of one environment (P,); `walk` is the walk policies' recurrent state (R, ...)."""
         robots = jnp.concatenate(
             [
                 robot_state.position_w,

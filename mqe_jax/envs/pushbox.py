@@ -32,7 +32,7 @@ class PushBoxRewards:
     progress: float = 10.0
     """Per m of the box's displacement along x."""
     success: float = 1.0
-    """Paid while the box is past the gate."""
+    """In steps in which the box is past the gate."""
 
 
 @record
@@ -82,7 +82,7 @@ class Go1PushBox(QuadrupedEnv):
     """Push Box.
 
     - Scene: a track 5 m wide with a box of 1 m and 6 kg in front of a gate of 1.5 m.
-    - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2, box x, y, box quaternion 4.
+    - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2, box x, y, box quaternion 4.
     - Reward: see `PushBoxRewards`; shared.
     - End: a fall, or 15 s. Success: the box is past the gate.
 

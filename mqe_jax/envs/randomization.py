@@ -21,7 +21,7 @@ class Randomization:
     """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables."""
 
     friction: Range | None = None
-    """Sliding friction of the robots' collision shapes (lowest, highest)."""
+    """Sliding friction of the robots' collision geoms (lowest, highest)."""
     payload: Range | None = None
     """Additional mass of the trunk, kg; its inertia is scaled by the same factor as its mass."""
     center_of_mass: Range | None = None
@@ -65,7 +65,7 @@ class Randomizer:
     """Samples randomised physics parameters and applies them to the model.
 
     Raises:
-        InputError: if the lowest payload leaves a trunk without mass.
+        InputError: if the lowest payload makes a trunk's mass zero or negative.
     """
 
     def __init__(self, random: Randomization, model: mujoco.MjModel, index: RobotIndex, friction: float) -> None:

@@ -1,4 +1,4 @@
-"""The tasks by id, with their scripted policies: a new task is one line of `_SHIPPED`."""
+"""Registry of tasks and their scripted policies; a new task is one line in `_SHIPPED`."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ TASKS: dict[str, type[QuadrupedEnv]] = {}
 """Task classes by id."""
 
 PLANNERS: dict[str, Planner | str] = {}
-"""Scripted policies by the id of their task; a shipped one by name, as this package imports no planner."""
+"""Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
 
 
 def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
-    Also a decorator of a task without a scripted policy.
+    Usable as a class decorator for a task without a scripted policy.
 
     Raises:
         InputError: if the class has no name, or another class is registered under it.
@@ -53,7 +53,7 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None
         raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
     known = TASKS.get(task.name)
     if known is not None and (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
-        raise InputError(f"task {task.__name__}: the id {task.name!r} is taken by {known.__name__}")
+        raise InputError(f"task {task.__name__}: the id {task.name!r} is already registered by {known.__name__}")
     TASKS[task.name] = task
     if planner is not None:
         PLANNERS[task.name] = planner

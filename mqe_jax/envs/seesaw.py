@@ -1,4 +1,4 @@
-"""go1seesaw, the paper's Climb on Seesaw: one robot holds a seesaw down while the other walks up to a platform."""
+"""go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted while the other walks up to a platform."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class SeesawRewards:
     """Per m of the robots' summed heights above `height_base`."""
     progress: float = 5.0
     """Per m of the robots' summed displacement along x."""
-    aside: float = -0.5
-    """Per m^2 of the robots' summed squared distances from the centre line above `aside_base`."""
+    lateral_offset: float = -0.5
+    """Per m^2 of the robots' summed squared distances from the centre line above `lateral_offset_base`."""
     collision: float = -2.0
-    """Paid in steps with any trunk contact."""
+    """In steps with any trunk contact."""
     fall: float = -2.0
     """In steps in which any robot exceeds the roll or pitch limit."""
     crowding: float = -0.25
@@ -79,8 +79,8 @@ class SeesawParams(TaskParams):
     """X and z beyond which a robot counts as on the platform, m."""
     height_base: float = 0.56
     """Summed height of the robots at which the height term is zero, m."""
-    aside_base: float = 0.5
-    """Summed squared distance from the centre line at which the aside term is zero, m^2."""
+    lateral_offset_base: float = 0.5
+    """Summed squared distance from the centre line at which the `lateral_offset` term is zero, m^2."""
     rewards: SeesawRewards = SeesawRewards()
     """Weights of the reward terms."""
 
@@ -104,7 +104,7 @@ class Go1Seesaw(QuadrupedEnv):
 
     - Scene: a track 3 m wide with a balanced plank whose near end is on the ground and whose far end reaches a
       platform 1 m high. A robot beyond the hinge tips the plank unless another stands on the near end.
-    - Observation: one-hot 2, own base info 6, mate's base info 6.
+    - Observation: one-hot 2, own base info 6, teammate's base info 6.
     - Reward: see `SeesawRewards`; shared.
     - End: a fall, a trunk below 0.08 m, a collision, or 10 s. Success: a robot stands on the platform at the end.
 
@@ -161,7 +161,7 @@ class Go1Seesaw(QuadrupedEnv):
             "success": jnp.sum(self.on_platform(robot_state)).astype(jnp.float32),
             "height": jnp.sum(z) - params.height_base,
             "progress": jnp.sum(x - state.task.x),
-            "aside": jnp.sum(jnp.square(y)) - params.aside_base,
+            "lateral_offset": jnp.sum(jnp.square(y)) - params.lateral_offset_base,
             "collision": collision.astype(jnp.float32),
             "fall": jnp.any((roll > params.max_roll) | (pitch > params.max_pitch)).astype(jnp.float32),
             "crowding": reward.crowding(robot_state.position_w[:, :2]) / 2,

@@ -109,7 +109,7 @@ class Go1SheepEasy(QuadrupedEnv):
     """Sheep Dog: sheep flee from nearby robots and must be herded through a gate.
 
     - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front of it.
-    - Observation: one-hot 2, own base info 6, mate's base info 6, gate centre 2, each sheep's x, y.
+    - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2, each sheep's x, y.
     - Reward: see `SheepRewards`; shared.
     - End: a fall, a collision, or 15 s. Success: the fraction of the sheep that are past the gate.
 
@@ -129,7 +129,7 @@ class Go1SheepEasy(QuadrupedEnv):
     def scene(self) -> Scene:
         params = self.params
         before, middle, behind = params.lengths
-        spawn = SpawnArea(before, spawn_x=params.spawn_x, room_width=params.spawn_apart)
+        spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_apart)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))

@@ -32,9 +32,9 @@ class State:
     reward: jax.Array
     """Reward (A,)."""
     terminated: jax.Array
-    """Whether the episode ended by its rules () bool."""
+    """Whether the episode terminated () bool."""
     truncated: jax.Array
-    """Whether the episode ended by the time limit () bool."""
+    """Whether the episode was truncated at the time limit () bool."""
     metrics: dict[str, jax.Array]
     """`reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the physics
     engine dropped contacts or constraints in this step) and the task's own, () each.

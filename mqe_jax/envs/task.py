@@ -1,4 +1,4 @@
-"""What a task defines, in this order: parameters, scene, initial state, observation, reward terms, ending."""
+"""Interface of a task, in this order: parameters, scene, initial state, observation, reward terms, ending."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 class Task:
     """Interface of a task and its defaults; `QuadrupedEnv` steps it.
 
-    A task overrides `scene`, `observation_layout`, `observe`, `rewards`, and of the rest what it needs. All methods are
-    functions of one environment.
+    A task must override `scene`, `observation_layout`, `observe` and `rewards`, and may override the others. All
+    methods are functions of one environment.
     """
 
     name: ClassVar[str] = ""
@@ -35,7 +35,7 @@ class Task:
     Params: ClassVar[type[TaskParams]] = TaskParams
     """Class of the task's parameters."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
-    """Metrics that are not 0 in a step in which the physics diverged."""
+    """Non-zero values of metrics in a step in which the physics diverged."""
     variable_num_agents: ClassVar[bool] = False
     """Whether `num_agents` may differ from the task's default."""
 

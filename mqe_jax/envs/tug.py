@@ -127,8 +127,8 @@ class Go1Tug(Duel):
     def spawn(self, key: jax.Array) -> jax.Array:
         """Samples spawn poses as the base class does, with a wider range along x."""
         params = self.params
-        aside = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
-        return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(aside)
+        shift = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
+        return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(shift)
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> TugState:
         y = self.cylinder_y(data)

@@ -24,7 +24,7 @@ class WrestlingRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     win: float = 10.0
-    """Paid when the opponent falls or leaves the ring."""
+    """When the opponent falls or leaves the ring, which ends the episode."""
 
 
 @record

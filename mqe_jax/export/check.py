@@ -1,4 +1,4 @@
-"""Compares an exported graph in onnxruntime with the JAX functions that it was made from."""
+"""Compares an exported graph in onnxruntime with the exported JAX functions."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from mqe_jax.train.policy import Policy
 
 
 def largest_error(model: onnx.ModelProto, policy: Policy, env: Any, *, num_envs: int = 3, steps: int = 5) -> float:
-    """Returns the largest absolute difference of any output over steps with random inputs and carried memories."""
+    """Returns the largest absolute error of any output over several steps with random inputs and recurrent states."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     sizes = shapes(model)["inputs"]
     random = np.random.default_rng(0)
     compute = jax.jit(functools.partial(reference, policy, env))
-    ours, theirs = _memory(sizes, num_envs), _memory(sizes, num_envs)
+    jax_memory, onnx_memory = _memory(sizes, num_envs), _memory(sizes, num_envs)
     worst = 0.0
     for _ in range(steps):
         inputs = {
             name: random.normal(size=(num_envs, *shape[1:])).astype(np.float32)
             for name, shape in sizes.items()
-            if name not in ours
+            if name not in jax_memory
         }
         names = [output.name for output in session.get_outputs()]
-        found = dict(zip(names, session.run(names, {**inputs, **theirs}), strict=True))
-        expected = jax.device_get(compute({**inputs, **ours}))
+        found = dict(zip(names, session.run(names, {**inputs, **onnx_memory}), strict=True))
+        expected = jax.device_get(compute({**inputs, **jax_memory}))
         worst = max(worst, *(float(np.abs(found[name] - expected[name]).max()) for name in names))
-        ours = {name: expected[f"next_{name}"] for name in ours}
-        theirs = {name: found[f"next_{name}"] for name in theirs}
+        jax_memory = {name: expected[f"next_{name}"] for name in jax_memory}
+        onnx_memory = {name: found[f"next_{name}"] for name in onnx_memory}
     return worst
 
 
 def reference(policy: Policy, env: Any, inputs: Mapping[str, Any]) -> dict[str, jax.Array]:
-    """Returns the graph's outputs by name, computed by the package's own functions."""
+    """Returns the graph's outputs by name, computed in JAX."""
     memory = jnp.asarray(inputs["memory"]) if "memory" in inputs else ()
     action, memory = policy.act(inputs["obs"], memory, deterministic=True)
     outputs: dict[str, Any] = {"action": action}

@@ -1,4 +1,4 @@
-"""A small builder of ONNX graphs: nodes by operator name, constants, matrix products. N is the batch axis."""
+"""A minimal builder of ONNX graphs: nodes by operator name, constants, matrix products. N is the batch axis."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class Graph:
         return name
 
     def output(self, name: str, value: str, shape: Sequence[int]) -> None:
-        """Declares a value as a float32 output of shape (N, *shape) under a name of its own."""
+        """Declares a value as a float32 output `name` of shape (N, *shape)."""
         self._nodes.append(helper.make_node("Identity", [value], [name]))
         self._outputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", *shape]))
 
     def clip(self, x: str, low: Any, high: Any) -> str:
-        """Limits x to constants, which may be arrays."""
+        """Clips x to constant bounds, which may be arrays."""
         return self.op("Min", self.op("Max", x, self.constant(low)), self.constant(high))
 
     def affine(self, x: str, weight: np.ndarray, bias: np.ndarray) -> str:

@@ -1,10 +1,10 @@
-"""A team's policy as one ONNX graph: planner, and in `command` control the walk policy under it.
+"""A team's policy as one ONNX graph: the high-level policy and, in `command` control, the walk policy.
 
-Every input and output has a leading batch axis N. Memories start as zeros, and each output `next_X` is the input `X`
-of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is the network's, in
-that frame, and commands and joint targets are the robots'.
+Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
+the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in
+that frame, commands and joint targets are in the robots' frame.
 
-| control | outputs beside `action` (N, A, D) and the memories |
+| control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
 | `command` | `commands` (N, A, 15), `joint_target` (N, A, 12), rad |
 | `position` | `joint_target` (N, A, 12), rad |
@@ -25,8 +25,8 @@ import onnx
 import mqe_jax
 from mqe_jax import walk_policy
 from mqe_jax.errors import InputError
+from mqe_jax.export.actor import add_actor
 from mqe_jax.export.graph import OPSET, Graph
-from mqe_jax.export.planner import add_planner
 from mqe_jax.export.walk import add_commands, add_joint_targets, add_walk
 from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import Policy
@@ -36,11 +36,11 @@ def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
     """Returns the graph of a policy on its task.
 
     Args:
-        policy: of a network `actor_critic`.
-        env: the task that it was trained on, whose control, robot and walk policy are used.
+        policy: with the network `actor_critic`.
+        env: the policy's task, which defines control mode, robot and walk policy.
 
     Raises:
-        InputError: for another network, or a task whose sizes are not the policy's.
+        InputError: for another network, or a task whose sizes differ from the policy's.
     """
     sizes = (env.num_agents, env.observation_size, env.action_size)
     trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
@@ -48,7 +48,7 @@ def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
         raise InputError(f"policy: trained for (agents, observation, action) {trained}, but {env.name} has {sizes}")
     graph = Graph(env.name.replace("-", "_"))
     agents, robot = env.num_agents, env.robot
-    action = add_planner(graph, policy)
+    action = add_actor(graph, policy)
     graph.output("action", action, (agents, env.action_size))
     own = _unmirrored(graph, action, env)
     if env.control == "command":
@@ -65,7 +65,7 @@ def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
-    """Writes a model atomically; InputError where the file cannot be written."""
+    """Writes a model atomically; InputError if the file cannot be written."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,7 +97,7 @@ def _unmirrored(graph: Graph, action: str, env: Any) -> str:
 
 
 def _properties(policy: Policy, env: Any) -> dict[str, str]:
-    """What a user of the file needs beside the graph, as strings (JSON where not plain)."""
+    """Returns the metadata of the model as strings, JSON-encoded where structured."""
     layout = [[block.name, block.width, block.meaning] for block in env.observation_layout.blocks]
     return {
         "mqe_jax": mqe_jax.__version__,

@@ -12,7 +12,7 @@ from mqe_jax.export.graph import Graph
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 
 _COMMANDS = len(walk_policy.COMMANDS)
-# Positions of phase, offset, bound; each foot's phase (FL FR RL RR) is the gait's plus the sum of its row's.
+# Rows: feet FL FR RL RR; columns: whether phase, offset, bound are added to the gait phase.
 _SHIFTS = np.array([[1, 1, 1], [0, 1, 0], [0, 0, 1], [1, 0, 0]], np.float32)
 
 
@@ -27,10 +27,10 @@ def add_commands(graph: Graph, action: str, names: tuple[str, ...], default: np.
 
 
 def add_walk(graph: Graph, robot: Robot, params: walk_policy.Params, commands: str, agents: int) -> str:
-    """Adds the walk policy's inputs, outputs and memory; returns the joint targets (N, A, 12), rad.
+    """Adds the walk policy's inputs, outputs and recurrent state; returns the joint targets (N, A, 12), rad.
 
-    Inputs (N, A, ...): `gravity` 3, `joint_position` 12, `joint_velocity` 12, and the memory `walk_history` (30, 70),
-    `walk_action` 12, `walk_previous_action` 12, `walk_gait` 1. Outputs: the memory's next values, `next_walk_...`.
+    Inputs (N, A, ...): `gravity` 3, `joint_position` 12, `joint_velocity` 12, and the recurrent state: `walk_history`
+    (30, 70), `walk_action` 12, `walk_previous_action` 12, `walk_gait` 1. Outputs: its next values, `next_walk_...`.
     """
     history_shape = (agents, walk_policy.HISTORY, walk_policy.OBSERVATION_SIZE)
     gravity = graph.input("gravity", (agents, 3))

@@ -1,4 +1,4 @@
-"""Scripted policies, one per task, with the observations and actions of a learned policy."""
+"""Scripted policies (`--planner scripted`), one per task, with the observations and actions of a learned policy."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from mqe_jax.planners.steering import Observation, go_to, pose
 
 _LEAD = 1.0  # m, distance of the goal ahead of the robot, for full speed while it pushes
-_NEAR = 1.0  # m, distance of the opponent ahead within which the robot aims at its middle, so as not to slip past it
-_MAX_AIM = 0.1  # m, y; the feet are 0.15 m from the robot's middle, the bridge's edges 0.35 m
+_NEAR = 1.0  # m, distance of the opponent ahead below which the robot aims at its centre, to avoid slipping past it
+_MAX_AIM = 0.1  # m, y; the feet are 0.15 m from the robot's centre, the bridge's edges 0.35 m
 _OFF_BRIDGE = 7.25  # m, x, beyond which the hind feet are on the far platform
 _REST = (7.6, 0.6)  # m, x and |y| of the goal on the far platform, on the side away from the opponent
 

@@ -1,4 +1,4 @@
-"""Scripted policy of Revolving Door: push the own half of the door open, far from the hinge, and walk through."""
+"""Scripted policy of Revolving Door: push the near half of the door open, far from the hinge, and walk through."""
 
 from __future__ import annotations
 

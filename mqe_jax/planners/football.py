@@ -1,4 +1,4 @@
-"""Scripted policies of football: move behind the ball on the line to an open part of the goal, then walk through it."""
+"""Scripted policies of football: move behind the ball, facing an open part of the goal, then push it."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from mqe_jax.planners.steering import Observation, go_to
 
 _GOAL_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, points in the goal
 _GOAL = jnp.array([12.0, 0.0])  # m
-# Against the defender: the ball passes it on the flank at this point (x, distance from the middle), m. On the straight
-# line to the goal it touches the defender and is deflected beyond the post.
+# Against the defender: the ball passes it on the flank at this point (x, distance from the centre line), m. On the
+# straight line to the goal it touches the defender and is deflected beyond the post.
 _FLANK = (10.0, 1.5)
 _INNER_AIMS = jnp.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]])  # m, points in the goal further from the posts
-_TURN_IN = 9.4  # m, x of the ball from which it is played towards the goal
+_TURN_IN = 9.4  # m, x of the ball from which it is pushed towards the goal
 _LEAD = 0.3  # s, over which the ball's motion is predicted
-_KEEP_BACK = 2.0  # m, from the ball back to the supporting robot, which stays in the middle
+_KEEP_BACK = 2.0  # m, distance behind the ball of the supporting robot, which stays on the centre line
 
 
 def plan_defender(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3): one dribbles past the defender on the flank, then turns in to the goal.
 
-    The unobserved defender is assumed where its control law steers to. The robot that is nearer to the place from which
-    the ball is played towards the goal attacks; a robot on the far side of the ball leaves it to a better placed mate.
+    The defender is not observed; it is assumed at the target of its control law. The robot nearer to the point behind
+    the ball, as seen from the goal, attacks; the other supports.
     """
     ball, velocity = obs["ball"][0, :2], obs["ball_velocity"][0, :2]
     opponents = (0.6 * ball + 0.4 * _GOAL)[None]
@@ -33,33 +33,33 @@ def plan_defender(obs: Observation) -> jax.Array:
     start = ahead - 0.6 * way / jnp.maximum(jnp.linalg.norm(way), 1e-3)
     support = jnp.array([jnp.minimum(ahead[0] - _KEEP_BACK, 9.5), 0.0])
 
-    def play(own: jax.Array, mate: jax.Array) -> jax.Array:
+    def play(own: jax.Array, teammate: jax.Array) -> jax.Array:
         attack, way = _attack(own, opponents, ball, velocity, aims)
-        nearer = jnp.linalg.norm(own[:2] - start) < jnp.linalg.norm(mate[:2] - start)
+        nearer = jnp.linalg.norm(own[:2] - start) < jnp.linalg.norm(teammate[:2] - start)
         return _walk(own, jnp.where(nearer, attack, support), way)
 
-    return jax.vmap(play)(obs["base"], obs["mate"])
+    return jax.vmap(play)(obs["base"], obs["teammate"])
 
 
 def plan_1vs1(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3), each in its own frame."""
-    far_mate = jnp.full((2, 6), 1e3)
+    far_teammate = jnp.full((2, 6), 1e3)
     opponents = obs["opponents"][:, None, :2]
-    return jax.vmap(_play)(obs["base"], far_mate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
+    return jax.vmap(_play)(obs["base"], far_teammate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
 def plan_2vs2(obs: Observation) -> jax.Array:
     """Returns all robots' actions (4, 3), each in its own frame."""
     opponents = obs["opponents"].reshape(-1, 2, 6)[..., :2]
-    return jax.vmap(_play)(obs["base"], obs["mate"], opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
+    return jax.vmap(_play)(obs["base"], obs["teammate"], opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
-def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
+def _play(own: jax.Array, teammate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
     """Returns one robot's action (3,): the nearer of two attacks the ball, the other supports from behind it.
 
     Args:
         own: base information (6,).
-        mate: base information (6,).
+        teammate: base information (6,), of the teammate.
         opponents: positions (K, 2), m.
         ball: position (2,), m.
         velocity: of the ball (2,), m/s.
@@ -69,21 +69,21 @@ def _play(own: jax.Array, mate: jax.Array, opponents: jax.Array, ball: jax.Array
     left = way[::-1] * jnp.array([-1.0, 1.0])
     offset = own[:2] - ball
     support = ball - 1.5 * way + 0.8 * jnp.sign(offset @ left) * left
-    nearer = jnp.linalg.norm(offset) < jnp.linalg.norm(mate[:2] - ball)
+    nearer = jnp.linalg.norm(offset) < jnp.linalg.norm(teammate[:2] - ball)
     return _walk(own, jnp.where(nearer, attack, support), way)
 
 
 def _attack(
     own: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array, aims: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns where to walk in order to play the ball (2,), m, and the unit vector towards the chosen aim (2,).
+    """Returns the goal position of an attacker (2,), m, and the unit vector from the ball to the chosen aim (2,).
 
     Args:
         own: base information (6,).
         opponents: positions (K, 2), m.
         ball: position (2,), m.
         velocity: of the ball (2,), m/s.
-        aims: points to play the ball to (M, 2), m.
+        aims: candidate target points of the ball (M, 2), m.
     """
     position, yaw = own[:2], own[5]
     near = jnp.linalg.norm(position - ball) < 0.35
@@ -100,14 +100,14 @@ def _attack(
     straight = ways @ (facing - offset / jnp.maximum(distance, 1.0))
     best = jnp.argmax(2 * free + straight)
     way, left = ways[best], lefts[best]
-    along, aside = offset @ way, offset @ left
-    lined_up = (along < -0.2) & (jnp.abs(aside) < 0.1 + 0.3 * jnp.maximum(-along - 0.3, 0.0))
-    between_legs = near & (jnp.abs(aside) < 0.25) & (facing @ way > 0.5)
-    push = position + 0.8 * way - 1.5 * aside * left
+    along, lateral = offset @ way, offset @ left
+    lined_up = (along < -0.2) & (jnp.abs(lateral) < 0.1 + 0.3 * jnp.maximum(-along - 0.3, 0.0))
+    between_legs = near & (jnp.abs(lateral) < 0.25) & (facing @ way > 0.5)
+    push = position + 0.8 * way - 1.5 * lateral * left
     behind = ball - 0.5 * way
     # From in front of the ball: first to the side, then back.
-    side = jnp.sign(aside) * left
-    around = jnp.where(jnp.abs(aside) < 0.3, position + 0.6 * side, behind + 0.45 * side)
+    side = jnp.sign(lateral) * left
+    around = jnp.where(jnp.abs(lateral) < 0.3, position + 0.6 * side, behind + 0.45 * side)
     return jnp.where(lined_up | between_legs, push, jnp.where(along > -0.3, around, behind)), way
 
 

@@ -1,4 +1,4 @@
-"""Scripted policy of Narrow Gate: the first robot passes the gate while the second waits until the way is clear."""
+"""Scripted policy of Narrow Gate: the first robot passes the gate while the second waits until the gate is clear."""
 
 from __future__ import annotations
 

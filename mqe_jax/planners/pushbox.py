@@ -1,4 +1,4 @@
-"""Scripted policy of Push Box: both robots push the box side by side, straightening it on the way."""
+"""Scripted policy of Push Box: both robots push the box side by side and correct its heading."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def plan_pushbox(obs: Observation) -> jax.Array:
     turned = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     turned = (turned + jnp.pi / 4) % (jnp.pi / 2) - jnp.pi / 4  # the box is symmetric under quarter turns
     side = jnp.array([-1.0, 1.0])
-    # If the box is about to be off to one side of the gate's centre, the robots push from further to that side.
-    aside = jnp.clip(gate[1] - box[1] - _LOOKAHEAD * jnp.sin(turned), -0.5, 0.5)
+    # Predicted lateral offset of the gate's centre from the box.
+    offset = jnp.clip(gate[1] - box[1] - _LOOKAHEAD * jnp.sin(turned), -0.5, 0.5)
     along = jnp.array([jnp.cos(turned), jnp.sin(turned)])
     across = jnp.array([-jnp.sin(turned), jnp.cos(turned)])
     place = box - _BEHIND * along + (side * _APART)[:, None] * across
@@ -29,8 +29,8 @@ def plan_pushbox(obs: Observation) -> jax.Array:
     lined_up = behind & (jnp.abs(apart @ across - side * _APART) < 0.15)
     both = jnp.all(lined_up)
     # The robot on the side to which the box should turn pushes less.
-    wish = jnp.clip(1.2 * aside, -0.35, 0.35)
-    lead = jnp.clip(4.0 * (wish - turned), -0.7, 0.7) * -side
+    heading = jnp.clip(1.2 * offset, -0.35, 0.35)
+    lead = jnp.clip(4.0 * (heading - turned), -0.7, 0.7) * -side
     walk = go_to(position, yaw, place, turned)
     push = walk.at[:, 0].set(jnp.clip(0.4 + 0.5 * lead, 0.1, 0.5))
     return jnp.where(both, push, walk)

@@ -21,8 +21,8 @@ _EDGE = 0.3  # m, distance from the centre line at which the outer feet are near
 def plan_seesaw(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3)."""
     position, yaw = pose(obs["base"])
-    x, aside = position[0, 0], jnp.abs(position[0, 1])
-    off = ((x < _ENTRY) & (aside > _CENTRED)) | ((x < _LOW) & (aside > _EDGE))
+    x, offset = position[0, 0], jnp.abs(position[0, 1])
+    off = ((x < _ENTRY) & (offset > _CENTRED)) | ((x < _LOW) & (offset > _EDGE))
     climb = jnp.where(off, _FOOT, _TOP)
     follow = jnp.minimum(x - _BEHIND, _NEAR_END)
     goal = jnp.zeros((2, 2)).at[:, 0].set(jnp.stack([climb, follow]))

@@ -1,4 +1,4 @@
-"""Scripted policy of Push Cylinder: align with the cylinder's axis, then push a little faster than it moves."""
+"""Scripted policy of Push Cylinder: align with the cylinder's axis, then push slightly faster than it moves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def plan_tug(obs: Observation) -> jax.Array:
     x, y = position.T
     # Align first: a robot that pushes off-axis slides along the cylinder.
     before = jnp.minimum(cylinder - _BEFORE, y)
-    # Full speed against a blocked cylinder turns the robot aside and tips it over.
+    # Full speed against a blocked cylinder deflects the robot and tips it over.
     push = jnp.minimum(cylinder, y + (jnp.maximum(speed, 0.0) + _EXCESS) / GAIN)
     ahead = jnp.where(jnp.abs(x - _AXIS_X) < _ALIGNED, push, before)
     goal = jnp.stack([jnp.full(2, _AXIS_X), ahead], axis=-1)

@@ -1,4 +1,4 @@
-"""Scripted policy of Sumo Wrestling: push the opponent out of the ring sideways, so as not to slip past it."""
+"""Scripted policy of Sumo Wrestling: push the opponent out of the ring sideways, to avoid slipping past it."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def plan_wrestling(obs: Observation) -> jax.Array:
     apart = position - opponent
     along, across = jnp.sum(apart * outward, axis=-1), jnp.sum(apart * left, axis=-1) + _AHEAD
     side_on = (jnp.abs(jnp.sin(yaw - heading)) < 0.4) & (jnp.abs(across) < 0.12)
-    shoving = (side_on | ((along > -0.5) & (jnp.abs(across) < 0.25))) & (along < 0.05)
+    pushing = (side_on | ((along > -0.5) & (jnp.abs(across) < 0.25))) & (along < 0.05)
     # A robot beyond the opponent walks around it.
-    aside = jnp.where((along > -0.35) & ~shoving, jnp.where(across > 0, 0.7, -0.7), 0.0) - _AHEAD
-    reach = jnp.where(shoving, 0.6, -_STAND_OFF)
-    goal = opponent + reach[:, None] * outward + aside[:, None] * left
+    lateral = jnp.where((along > -0.35) & ~pushing, jnp.where(across > 0, 0.7, -0.7), 0.0) - _AHEAD
+    reach = jnp.where(pushing, 0.6, -_STAND_OFF)
+    goal = opponent + reach[:, None] * outward + lateral[:, None] * left
     back = go_to(position, yaw, jnp.broadcast_to(_CENTER, position.shape), yaw)
     at_edge = jnp.linalg.norm(position - _CENTER, axis=-1) > jnp.clip(far - 0.08, *_EDGE)
     return jnp.where(at_edge[:, None], back, go_to(position, yaw, goal, heading))

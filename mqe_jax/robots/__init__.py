@@ -1,4 +1,4 @@
-"""Robots: their type, data, body tree, index tables and kinematics."""
+"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics."""
 
 from mqe_jax.robots.build import build_robot
 from mqe_jax.robots.index import RobotIndex, RobotState, add_sensors, index_robots, prefix, read_robots

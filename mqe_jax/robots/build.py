@@ -26,7 +26,7 @@ _GEOM_TYPES = {
 }
 
 
-# Contact settings of all collision shapes of robots, which take precedence over those of the other geom.
+# Contact settings of the robots' collision geoms, which take precedence over those of the other geom.
 # The time constant (s) is the shortest that is stable at a physics step of 0.005 s; the second number is the damping
 # ratio. Contacts begin MARGIN before the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
 SOLREF = (0.01, 1.0)
@@ -66,9 +66,9 @@ def build_robot(
     Args:
         robot: robot type.
         number: robot index in the scene, for its collision bits.
-        contacts: set of its collision shapes, one of `CONTACTS`.
+        contacts: set of its collision geoms, one of `CONTACTS`.
         visual: whether to add the visual geoms.
-        friction: sliding friction of its shapes, which takes precedence over the other shape's.
+        friction: sliding friction of its collision geoms, which takes precedence over the other geom's.
         torque_control: actuators take torques (N m) instead of PD joint targets (rad).
         color: index of its colour in `COLORS`; `number` if None.
     """

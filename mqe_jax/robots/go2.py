@@ -4,7 +4,7 @@ Source: MuJoCo Menagerie's inertial parameters and limits of the Go2 and Unitree
 collision shapes are spheres and capsules, which all three engines support.
 
 Choices for position control and the walk policy: default angles as on the Go1, whose legs have the same lengths; gains
-grow with the mass (15.2 kg against 11.3 kg), kp 30 (Go1: 20) and kd 0.75 (Go1: 0.5), so that sag and damping
+scale with the mass (15.2 kg against 11.3 kg), kp 30 (Go1: 20) and kd 0.75 (Go1: 0.5), so that sag and damping
 are alike; action scale as on the Go1; torques up to the motors' limits.
 """
 

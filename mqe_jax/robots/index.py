@@ -34,12 +34,12 @@ class RobotIndex:
     bodies: np.ndarray
     """All body ids of each robot (R, 13)."""
     foot_geom: np.ndarray
-    """Foot shape ids (R, 4)."""
+    """Foot geom ids (R, 4)."""
     geoms: np.ndarray
-    """Collision shape ids of each robot (R, G)."""
+    """Collision geom ids of each robot (R, G)."""
     trunk_force: np.ndarray
-    """Addresses in sensordata of the strongest contact force on each of the trunk's T shapes (R, T, 3), contact frame,
-    N.
+    """Addresses in sensordata of the strongest contact force on each of the trunk's T collision geoms (R, T, 3),
+    contact frame, N.
     """
     foot_force: np.ndarray
     """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless the scene has foot
@@ -62,7 +62,7 @@ def _geom_names(robot: Robot, part: str) -> list[str]:
 
 
 def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: bool = False) -> None:
-    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines compute alike."""
+    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines support."""
     force_bits, strongest = 1 << 1, 2
     names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
     for number in range(num_robots):

@@ -1,4 +1,4 @@
-"""The robots by name."""
+"""Registry of robots by name."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def get(name: str) -> Robot:
 
 
 def register(robot: Robot) -> Robot:
-    """Adds a robot under its name, so that `mqe_jax.make(task, robot=name)` finds it; returns it.
+    """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it.
 
     Raises:
         InputError: if another robot has that name.
     """
     if ROBOTS.setdefault(robot.name, robot) is not robot:
-        raise InputError(f"robot: the name {robot.name!r} is taken; choose another")
+        raise InputError(f"robot: the name {robot.name!r} is already registered")
     return robot

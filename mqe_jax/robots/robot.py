@@ -1,8 +1,8 @@
-"""The type of a robot: a quadruped with twelve joints as one immutable value.
+"""The `Robot` type: an immutable description of a quadruped with twelve joints.
 
 All values are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y left and z up at
-zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf everywhere in this package. Legs are
-described once, for the left front one; the others are its mirror images.
+zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf everywhere in this package. One leg
+is described, the front left; the others are its mirror images.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NUM_LEGS = len(LEGS)
 NUM_JOINTS = NUM_LEGS * len(JOINTS)
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
 LINKS = ("trunk", *JOINTS)
-# Parts of the body that collision shapes belong to.
+# Body parts of collision shapes.
 PARTS = ("trunk", "hip", "thigh", "calf", "foot")
 
 # Sets of collision shapes: the whole body, or trunk and feet alone.
@@ -45,7 +45,7 @@ class Link:
 
     @classmethod
     def from_principal(cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]) -> Link:
-        """Returns a link whose principal `moments` (kg m^2) hold in the frame of a quaternion wxyz."""
+        """Returns a link from principal `moments` of inertia (kg m^2) and the orientation of their axes, wxyz."""
         w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
         axes = np.array(
             [
@@ -125,7 +125,7 @@ def ellipsoid(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitiv
 
 @dataclasses.dataclass(frozen=True)
 class CollisionShape:
-    """Collision geometry; a leg's shape exists once on each leg."""
+    """A collision shape: one geom on the trunk, or one on each leg."""
 
     part: str
     """Part that the shape belongs to: one of `PARTS`."""
@@ -142,7 +142,7 @@ class CollisionShape:
 
     @property
     def link(self) -> str:
-        """The link that carries it: a foot is part of the calf."""
+        """Link of the shape; a foot belongs to the calf."""
         return "calf" if self.part == "foot" else self.part
 
     @property
@@ -153,23 +153,23 @@ class CollisionShape:
 
 @dataclasses.dataclass(frozen=True)
 class VisualShape:
-    """A massless shape without contacts, for rendering only."""
+    """A massless, non-colliding shape for rendering."""
 
     link: str
     """Link that the shape is fixed to: trunk, hip, thigh or calf."""
     primitive: Primitive
     """Its geometry, in the frame of `link`."""
     color: Color = (0.0, 0.0, 0.0, 1.0)
-    """Own colour."""
+    """Base colour."""
     tint: float = 0.0
-    """Fraction of the agent's colour mixed into it, in [0, 1]."""
+    """Fraction of the agent's colour mixed into the base colour, in [0, 1]."""
 
     def __post_init__(self) -> None:
         if self.link not in LINKS:
             raise InputError(f"VisualShape.link: unknown link {self.link!r}; allowed: {', '.join(LINKS)}")
 
     def tinted(self, agent_color: Color) -> Color:
-        """Returns the colour of the shape on a robot of an agent's colour."""
+        """Returns the base colour mixed with the agent's colour."""
         own, agent = np.asarray(self.color), np.asarray(agent_color)
         r, g, b, a = ((1.0 - self.tint) * own + self.tint * agent).tolist()
         return r, g, b, a
@@ -186,9 +186,9 @@ class WalkSettings:
     stance_length: float
     """Default distance between front and rear feet, m."""
     min_knee_height: float
-    """Knee height below which contact of thigh and calf with the ground is assumed, m."""
+    """Minimum knee height, m; below it the leg is counted as touching the ground with thigh or calf."""
     min_trunk_height: float
-    """A trunk origin below it counts as a fall, m."""
+    """Minimum height of the trunk origin, m; below it the robot has fallen."""
 
 
 _JOINT_FIELDS = ("default_joints", "joint_lower", "joint_upper", "joint_speed_limit", "torque_limit", "action_scale")
@@ -205,13 +205,13 @@ class Robot:
     trunk: Link
     """Inertial parameters of the trunk."""
     hip: Link
-    """Inertial parameters of the left front hip; y is mirrored for the right legs, x for the rear ones."""
+    """Inertial parameters of the front left hip; y is mirrored for the right legs, x for the rear ones."""
     thigh: Link
-    """Inertial parameters of the left front thigh; y is mirrored for the right legs."""
+    """Inertial parameters of the front left thigh; y is mirrored for the right legs."""
     calf: Link
-    """Inertial parameters of the left front calf with its foot; y is mirrored for the right legs."""
+    """Inertial parameters of the front left calf with its foot; y is mirrored for the right legs."""
     leg_root: tuple[float, float]
-    """Hip joint of the left front leg in the trunk frame (x, y), m."""
+    """Hip joint of the front left leg in the trunk frame (x, y), m."""
     hip_length: float
     """Distance from hip joint to thigh joint, outward, m."""
     thigh_length: float
@@ -221,13 +221,13 @@ class Robot:
     foot_radius: float
     """Radius of the foot, m."""
     default_joints: np.ndarray
-    """Angles around which position control and the walk policy act (12,), rad."""
+    """Default joint angles: the targets of zero joint actions (12,), rad."""
     joint_lower: np.ndarray
     """Lower joint limits (12,), rad."""
     joint_upper: np.ndarray
     """Upper joint limits (12,), rad."""
     joint_speed_limit: np.ndarray
-    """Speed limits of the motors (12,), rad/s; data for users, not enforced by the physics."""
+    """Speed limits of the motors (12,), rad/s; informative, not enforced by the physics."""
     torque_limit: np.ndarray
     """Torque limits of the controller (12,), N m."""
     kp: float
@@ -237,13 +237,13 @@ class Robot:
     action_scale: np.ndarray
     """Scale of joint actions (12,), rad: joint target = default + scale x action."""
     stand_height: float
-    """Trunk origin above the ground when standing at the default angles, m: the walk policy's height at a zero height
+    """Height of the trunk origin when standing at the default angles, m; the walk policy's target at a zero height
     command.
     """
     collision: tuple[CollisionShape, ...]
-    """Collision geometry."""
+    """Collision shapes."""
     visuals: tuple[VisualShape, ...]
-    """Shapes for rendering."""
+    """Visual shapes."""
     walk: WalkSettings
     """Walk-policy settings."""
 
@@ -258,7 +258,7 @@ class Robot:
             raise InputError(f"Robot.default_joints: {self.default_joints} must lie between the joint limits")
         repeated = [name for name, count in Counter(shape.name for shape in self.collision).items() if count > 1]
         if repeated:
-            raise InputError(f"Robot.collision: names must differ; {', '.join(repeated)} is there more than once")
+            raise InputError(f"Robot.collision: duplicate names {', '.join(repeated)}")
         parts = [shape.part for shape in self.collision]
         if parts.count("foot") != 1 or "trunk" not in parts:
             raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")

@@ -12,9 +12,8 @@ METRICS = ("average_step_reward", "success_rate")
 def to_marl_eval(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns environment -> task -> algorithm -> run -> step_k -> {step_count, metric: [value]}, absolute_metrics.
 
-    `runs` are evaluation records (`mqe_jax.study.records`) of trainings that have ended. Each list holds one value,
-    the mean over the evaluation's episodes under sampled actions: the format allows one value in place of one for each
-    episode.
+    `runs` are evaluation records (`mqe_jax.study.records`) of finished training runs. Each list holds one value, the
+    mean over the evaluation's episodes under sampled actions; the format allows this instead of one value per episode.
     """
     tree: dict[str, Any] = {}
     for run in runs:

@@ -1,4 +1,4 @@
-"""What the paper reports (arXiv 2403.16015): average step reward after 40 M environment steps, read off its figures."""
+"""The paper's results (arXiv 2403.16015): average step reward after 40 M environment steps, read from its figures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TITLES: Mapping[str, str] = {
     "go1pushbox": "Push Box",
     "go1football-defender": "Football (2 vs 1)",
 }
-"""Tasks of the paper's figure, in its order: rows from top to bottom, two to a row."""
+"""Tasks of the paper's figure, in its order: rows from top to bottom, two per row."""
 
 ALGORITHMS: Mapping[str, str] = {"jrpo": "JRPO", "mat": "MAT", "mappo": "MAPPO"}
 """Algorithms of the paper's figure by id, in the order of its legend."""

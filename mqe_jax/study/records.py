@@ -1,4 +1,4 @@
-"""Raw data of a study: for each run a small CSV of its curve and a JSON of its evaluations.
+"""Raw data of a study: per run, a CSV file with its curve and a JSON file with its evaluations.
 
 FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    at most 100 rows, 10 columns, 6 digits
 FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, evaluations during training, absolute metric
@@ -25,7 +25,7 @@ from mqe_jax.study.paper import HIERARCHICAL
 
 MAX_ROWS, MAX_COLUMNS, DIGITS = 100, 10, 6
 COLUMNS = ("env_steps", "seconds", "average_step_reward", "success", "episode_length")
-"""Columns that every curve keeps; reward terms fill the rest, largest mean size first."""
+"""Columns that every curve keeps; reward terms fill the rest, largest mean magnitude first."""
 
 Curve = dict[str, NDArray[np.float64]]
 
@@ -47,7 +47,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Record:
-    """One run: its cell and seed, its thinned curve by column, and what its evaluations measured.
+    """One run: its cell and seed, its thinned curve by column, and its evaluation results.
 
     `evaluation` holds `evaluations`, a list of {env_steps, episodes, sampled, deterministic}, and `absolute`, one such
     entry or None; `sampled` and `deterministic` map names such as average_step_reward and success_rate to numbers.
@@ -60,9 +60,9 @@ class Record:
 
 
 def thin(curve: Curve) -> Curve:
-    """Returns a curve of at most `MAX_ROWS` rows: means over consecutive rows of about equal number.
+    """Returns a curve of at most `MAX_ROWS` rows: means over groups of consecutive rows of about equal size.
 
-    `env_steps` and `seconds` are those at a part's end; NaN entries are left out of the means.
+    `env_steps` and `seconds` are those at the end of a group; means ignore NaN.
     """
     steps = len(curve["env_steps"])
     ends = np.unique(np.linspace(0, steps, min(steps, MAX_ROWS) + 1).round().astype(int))
@@ -88,7 +88,7 @@ def read_curve(path: Path) -> Curve:
     """Reads the columns of a metrics.csv or of a thinned curve.
 
     Raises:
-        InputError: naming the file, where it is missing or not such a table.
+        InputError: naming the file, if it is missing or malformed.
     """
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -105,7 +105,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def number(value: float) -> str:
-    """Returns a number with `DIGITS` significant digits; whole ones, such as steps, in full."""
+    """Returns a number with `DIGITS` significant digits; integers, such as steps, in full."""
     value = float(value)
     whole = math.isfinite(value) and value.is_integer() and abs(value) < 1e15
     return str(int(value)) if whole else f"{value:.{DIGITS}g}"
@@ -136,11 +136,11 @@ def read_records(folder: Path) -> list[Record]:
     """Reads every run below FOLDER/raw, ordered by path and seed.
 
     Raises:
-        InputError: where there is none, or a file of one is missing or damaged.
+        InputError: if there is none, or a run's file is missing or damaged.
     """
     paths = sorted((folder / "raw").glob("*/*/seed*.json"))
     if not paths:
-        raise InputError(f"{folder}: holds no raw/TASK/ALGORITHM/seed*.json; it must be the folder of a study")
+        raise InputError(f"{folder}: holds no raw/TASK/ALGORITHM/seed*.json; it must be a study folder")
     records = []
     for path in paths:
         try:
@@ -156,7 +156,7 @@ def read_records(folder: Path) -> list[Record]:
 
 
 def _rounded(value: Any) -> Any:
-    """Returns JSON values with floats of at most `DIGITS` significant digits; not finite ones become null."""
+    """Returns JSON values with floats of at most `DIGITS` significant digits; non-finite ones become null."""
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):

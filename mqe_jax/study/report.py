@@ -1,6 +1,6 @@
-"""The report of a study: figures, tables and aggregates beside the paper's values, generated from raw data alone.
+"""The report of a study: figures, tables and aggregates with the paper's values, generated from raw data alone.
 
-The same raw data give the same files: intervals are drawn from a fixed seed, and figures contain no timestamp.
+The output is deterministic: bootstrap intervals use a fixed seed, and figures contain no timestamp.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def report(folder: Path) -> list[Path]:
     """Writes FOLDER/report from FOLDER/raw; returns the files.
 
     Raises:
-        InputError: where the raw data are missing or damaged.
+        InputError: if the raw data are missing or damaged.
     """
     records = read_records(folder)
     cells: dict[Cell, list[Record]] = {}
@@ -70,13 +70,13 @@ def report(folder: Path) -> list[Path]:
 
 
 _EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% stratified bootstrap interval.
-`training`: average step reward over the last {_LAST:.0%} of the training's steps, as in the paper's figure. `absolute`:
+`training`: average step reward over the last {_LAST:.0%} of training steps, as in the paper's figure. `absolute`:
 average step reward of the best checkpoint over the final evaluation's episodes, actions sampled; `success` likewise.
-`paper`: read off the paper's figure after 40 M steps (from scratch: the best algorithm's value)."""
+`paper`: read from the paper's figure after 40 M steps (from scratch: the best algorithm's value)."""
 _SETTINGS = {paper.HIERARCHICAL: "walk policy", paper.SCRATCH: "from scratch"}
 _HEADINGS = {
     "aggregate": "Over all tasks, as fractions of each task's range of scores",
-    "improvement": "Probability that a run of the first algorithm beats one of the second",
+    "improvement": "Probability of improvement of the first algorithm over the second",
 }
 
 
@@ -102,7 +102,7 @@ def _flat(record: Record) -> dict[str, Any]:
 
 
 def _estimate(scores: Array) -> tuple[Array, Array, Array]:
-    """Returns interquartile mean over runs and ends of its interval, per column: (runs, K) -> (K,) each."""
+    """Returns interquartile mean over runs and its interval, per column: (runs, K) -> (K,) each."""
 
     def per_column(x: Array) -> Array:
         return statistics.interquartile_mean(np.moveaxis(x, -1, -2)[..., None])
@@ -113,9 +113,9 @@ def _estimate(scores: Array) -> tuple[Array, Array, Array]:
 
 
 def band(records: Sequence[Record], column: str = _REWARD) -> tuple[Array, Array, Array, Array]:
-    """Returns steps (K,), interquartile mean and interval ends (K,) of a column over a cell's seeds.
+    """Returns steps (K,), interquartile mean and interval bounds (K,) of a column over a cell's seeds.
 
-    Curves of other steps than the first seed's are interpolated to those that all seeds have reached.
+    Curves are interpolated to the first seed's steps, up to the last step that all seeds have reached.
     """
     steps = records[0].curve["env_steps"]
     steps = steps[steps <= min(record.curve["env_steps"][-1] for record in records)]
@@ -136,7 +136,7 @@ def _absolute(record: Record, name: str) -> float:
 
 
 def _one(values: Sequence[float]) -> tuple[float, float, float]:
-    """Returns estimate and interval of one number over seeds, NaN where a seed has none."""
+    """Returns estimate and interval of one number over seeds, NaN if a seed has no value."""
     scores = np.array(values)[:, None]
     if not np.isfinite(scores).all():
         return math.nan, math.nan, math.nan
@@ -171,10 +171,10 @@ def final_table(cells: Cells) -> dict[str, list[Any]]:
 
 
 def score_matrices(cells: Cells, setting: str) -> dict[str, Array]:
-    """Returns each algorithm's scores (runs, tasks) of a setting as fractions of each task's range, or nothing.
+    """Returns each algorithm's scores (runs, tasks) of a setting as fractions of each task's range.
 
-    Only tasks and seeds that every algorithm has count; the score is the absolute metric where all runs have it,
-    otherwise the end of the training. Fewer than two algorithms give nothing to compare.
+    Only tasks and seeds common to all algorithms are used; the score is the absolute metric if all runs have it,
+    otherwise the final training reward. Empty for fewer than two algorithms.
     """
     chosen = {cell: records for cell, records in cells.items() if cell.setting == setting}
     algorithms = list(dict.fromkeys(cell.algorithm for cell in chosen))
@@ -252,7 +252,7 @@ def _short(value: float) -> str:
     return number(value) if float(value).is_integer() else f"{value:.3g}"
 
 
-# -- pictures --------------------------------------------------------------------------------------------------------
+# -- figures ---------------------------------------------------------------------------------------------------------
 
 
 def _figure(width: float, height: float) -> Any:
@@ -280,7 +280,7 @@ def _label(algorithm: str) -> str:
 
 
 def draw_curves(cells: Cells) -> bytes:
-    """Returns the paper's figure as PNG: for each setting a block of tasks, two to a row, with bands over seeds.
+    """Returns the paper's figure as PNG: for each setting a block of tasks, two per row, with bands over seeds.
 
     Dashed lines are the paper's final values, in the algorithm's colour (dark: its best algorithm from scratch).
     """
@@ -305,7 +305,7 @@ def draw_curves(cells: Cells) -> bytes:
                 if name in algorithms or name == "best":
                     color = _INK if name == "best" else _color(name, algorithms)
                     axes.axhline(value, color=color, lw=1.0, ls=(0, (4, 3)), alpha=0.8)
-            _dress(axes, paper.TITLES.get(task, task))
+            _style_axes(axes, paper.TITLES.get(task, task))
         block.suptitle(_SETTINGS.get(setting, setting), color=_INK, fontsize=11)
     _legend(figure, algorithms, paper_line=True)
     return _png(figure)
@@ -317,7 +317,7 @@ def _draw_band(axes: Any, records: Sequence[Record], column: str, color: str, la
     axes.plot(steps / 1e6, middle, color=color, lw=1.5, label=label)
 
 
-def _dress(axes: Any, title: str, ylabel: str = "average step reward") -> None:
+def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> None:
     axes.set_title(title, color=_INK, fontsize=10, style="italic")
     axes.set_xlabel("environment steps (millions)", fontsize=8)
     axes.set_ylabel(ylabel, fontsize=8)
@@ -337,7 +337,7 @@ def _legend(figure: Any, algorithms: Sequence[str], paper_line: bool) -> None:
 
 
 def draw_profiles(cells: Cells) -> bytes:
-    """Returns performance profiles of each setting as PNG: the fraction of runs above a fraction of the range."""
+    """Returns performance profiles of each setting as PNG: the fraction of runs above each score."""
     settings = [s for s in dict.fromkeys(cell.setting for cell in cells) if score_matrices(cells, s)]
     algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
     thresholds = np.linspace(0.0, 1.0, 101)
@@ -352,7 +352,7 @@ def draw_profiles(cells: Cells) -> bytes:
             color = _color(name, algorithms)
             axes.fill_between(thresholds, low, high, color=color, alpha=0.15, lw=0)
             axes.plot(thresholds, profile(scores), color=color, lw=1.5)
-        _dress(axes, _SETTINGS.get(setting, setting), "fraction of runs above")
+        _style_axes(axes, _SETTINGS.get(setting, setting), "fraction of runs above")
         axes.set_xlabel("score, fraction of each task's range", fontsize=8)
         axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
     _legend(figure, algorithms, paper_line=False)
@@ -372,6 +372,6 @@ def gate_terms(records: Sequence[Record]) -> tuple[bytes, dict[str, list[Any]]]:
         axes.plot(steps / 1e6, middle, color=color, lw=1.5, label=label)
         for name, items in zip(columns, ([column] * len(steps), steps, middle, low, high), strict=True):
             columns[name].extend(items)
-    _dress(axes, "Narrow Gate, MAPPO", "reward per step")
+    _style_axes(axes, "Narrow Gate, MAPPO", "reward per step")
     axes.legend(frameon=False, fontsize=8)
     return _png(figure), columns

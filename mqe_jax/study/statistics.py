@@ -28,7 +28,7 @@ class Random(Protocol):
 def interquartile_mean(scores: ArrayLike) -> Array:
     """Returns the mean of the middle half of all scores: (..., runs, tasks) -> (...).
 
-    The lowest and the highest quarter, rounded down to whole scores, are left out.
+    The lowest and the highest quarter, rounded down to whole scores, are discarded.
     """
     flat = _flat(np.asarray(scores, np.float64))
     cut = flat.shape[-1] // 4
@@ -47,7 +47,7 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
-    """Returns P(a run of x beats a run of y), mean over tasks; ties count half.
+    """Returns P(score of x > score of y), mean over tasks; ties count half.
 
     Shapes: x (..., runs of x, tasks), y (..., runs of y, tasks) -> (...). Per task it is the Mann-Whitney U statistic
     over the number of pairs.
@@ -64,20 +64,20 @@ def bootstrap_interval(
     samples: int = 2000,
     confidence: float = 0.95,
 ) -> tuple[Array, Array]:
-    """Returns lower and upper end of a percentile bootstrap interval; runs are resampled within each task.
+    """Returns the bounds of a percentile bootstrap interval; runs are resampled within each task.
 
     Several score arrays (of one statistic, such as `probability_of_improvement`) are resampled independently.
-    Tasks are the strata: they stay fixed. With a single run both ends are the statistic itself.
+    Tasks are the strata and stay fixed. With a single run both bounds equal the statistic.
 
     Raises:
-        InputError: where scores are not (runs, tasks), or not finite.
+        InputError: if scores are not (runs, tasks), or not finite.
     """
     groups = [np.asarray(group, np.float64) for group in ([scores] if isinstance(scores, np.ndarray) else scores)]
     for group in groups:
         if group.ndim != 2 or not group.size:
             raise InputError(f"scores: shape {group.shape} is not allowed; it must be (runs, tasks), both at least 1")
         if not np.isfinite(group).all():
-            raise InputError("scores: not all finite; leave out runs without a value")
+            raise InputError("scores: not all finite; omit runs without a value")
     resampled = []
     for group in groups:
         runs, tasks = group.shape

@@ -1,9 +1,9 @@
 """Sweeps: tasks x algorithms x settings x seeds in one folder, resumed after any interruption.
 
-FOLDER/sweep.yaml    what the folder holds
+FOLDER/sweep.yaml    settings of the sweep
 FOLDER/runs/...      run folders, with checkpoints
-FOLDER/raw/...       raw data of the runs that have ended (`mqe_jax.study.records`)
-FOLDER/report/...    the report, remade when the sweep ends (`mqe_jax.study.report`)
+FOLDER/raw/...       raw data of finished runs (`mqe_jax.study.records`)
+FOLDER/report/...    the report, regenerated when the sweep ends (`mqe_jax.study.report`)
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Environments = Callable[[TrainConfig, int], tuple[VectorEnv, VectorEnv | None]]
 
 @record
 class Sweep:
-    """What a sweep trains: every combination of tasks, algorithms, variants and seeds."""
+    """Settings of a sweep, which trains every combination of tasks, algorithms, variants and seeds."""
 
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
-    """Names of the algorithms, as of `mqe train --algorithm`."""
+    """Names of the algorithms, as in `mqe train --algorithm`."""
     seeds: Annotated[tuple[NonNegativeInt, ...], MinLen(1)] = (0, 1, 2, 3, 4)
     """Random seeds."""
     seeds_together: PositiveInt | None = None
@@ -86,7 +86,7 @@ def load_sweep(path: Path) -> Sweep:
     """Reads a sweep's YAML file.
 
     Raises:
-        InputError: naming the file, for anything that is wrong in it.
+        InputError: naming the file, for invalid content.
     """
     try:
         return build(Sweep, load_yaml(path))
@@ -160,7 +160,7 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     """Creates the folder and writes sweep.yaml into it; tasks, algorithms, variants and seeds may be added later.
 
     Raises:
-        InputError: where the folder holds a sweep of other settings.
+        InputError: if the folder holds a sweep of other settings.
     """
     check_folder(folder)
     path = folder / SWEEP_FILE
@@ -177,13 +177,13 @@ def prepare(sweep: Sweep, folder: Path) -> None:
 
 
 def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> list[Job]:
-    """Trains the jobs sequentially; each continues from its checkpoints and leaves raw data when it ends.
+    """Trains the jobs sequentially; each resumes from its checkpoints and writes raw data at its end.
 
     Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
-    first. Returns the jobs left to other processes.
+    first. Returns the jobs skipped because other processes hold their cells.
 
     Raises:
-        InputError: where a run cannot be continued.
+        InputError: if a run cannot be resumed.
     """
     left = []
     for job in jobs:
@@ -196,7 +196,7 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
                 left.append(job)
                 continue
             if all(_raw(folder, job.cell, config.seed).is_file() for config in job.configs):
-                continue  # ended by another process since the jobs were planned
+                continue  # finished by another process since the jobs were planned
             env, eval_env = environments(job.configs[0], len(job.configs))
             train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
             for config, run_dir in zip(job.configs, job.folders, strict=True):

@@ -1,4 +1,4 @@
-"""The network `actor_critic`: feed-forward or recurrent actors and a centralised or own critic."""
+"""The network `actor_critic`: feed-forward or recurrent actors, centralised or decentralised critic."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class ActorCritic(GaussianSettings):
     critic_input: Literal["privileged", "observations", "own"] = "privileged"
     """Critic input: the privileged observation, all agents' observations, or each agent's own."""
     share_policy: bool = True
-    """One actor for all agents (told apart only where the observation has the agent's id), or one for each."""
+    """Share one actor between all agents, distinguished only by an id in their observations; else one per agent."""
     hidden_sizes: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64,)
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"
     """Activation after each hidden layer."""
     recurrent: bool = True
-    """Gated recurrent unit after the hidden layers of actor and critic."""
+    """Use a gated recurrent unit after the hidden layers of actor and critic."""
     gru_size: PositiveInt = 64
     """Width of the recurrent unit."""
     chunk_length: PositiveInt = 2
@@ -45,7 +45,7 @@ class ActorCritic(GaussianSettings):
     action_gain: Positive = 0.01
     """Gain of the orthogonal initialisation of the action layer."""
     action_mean: Literal["linear", "tanh"] = "linear"
-    """Output of the mean action: unbounded, or within -1 and 1."""
+    """Output activation of the mean action: linear (unbounded) or tanh."""
 
     def build(self, dims: EnvDims) -> Network:
         """Returns the network; see `Network`."""
@@ -70,7 +70,7 @@ def _trunk(
 ) -> tuple[jax.Array, Memory]:
     """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ..., n_out), memory.
 
-    Only the recurrent unit is sequential; the layers around it take all steps at once.
+    `memory` is the recurrent state. Only the recurrent unit is sequential; the other layers are batched over all steps.
     """
     x = nn.mlp(params["hidden"], x, _ACTIVATIONS[settings.activation], activate_last=True)
     if "gru" in params:
@@ -97,9 +97,7 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
     if own and dims.values != agents:
         fail("network.critic_input", "own", "'privileged' or 'observations' when ppo.value is 'joint'")
     if settings.critic_input == "privileged" and not dims.privileged:
-        fail(
-            "network.critic_input", "privileged", "'observations' or 'own': the environment has none that is privileged"
-        )
+        fail("network.critic_input", "privileged", "'observations' or 'own': there is no privileged observation")
     critic_rows = agents if own else 1
     critic_in = {
         "privileged": dims.privileged,

@@ -1,4 +1,4 @@
-"""Algorithms by name: the settings in which they differ; everything else is common. See docs/algorithms.md."""
+"""Presets of the algorithms: only the settings in which they differ. See docs/algorithms.md."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALGORITHMS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset(algorithm: str) -> dict[str, Any]:
-    """Returns the settings that make the algorithm, as nested names and values for `mqe_jax.settings.override`.
+    """Returns the settings of an algorithm, as nested names and values for `mqe_jax.settings.override`.
 
     Raises:
         InputError: for an unknown name, with the nearest known one.

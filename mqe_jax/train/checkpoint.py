@@ -92,7 +92,7 @@ def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
     Raises:
-        InputError: in one line naming the file, for a missing, damaged, truncated or foreign file, another format
+        InputError: in one line naming the file, for a missing, damaged or truncated file, another format or format
             version, and leaves that are missing, unknown or of another shape or dtype.
     """
     path = Path(path)
@@ -115,7 +115,7 @@ def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
 
 
 def checkpoint_folder(run_dir: str | Path) -> Path:
-    """Returns the folder of a run that holds its checkpoints."""
+    """Returns the checkpoint folder of a run."""
     return Path(run_dir) / "checkpoints"
 
 
@@ -138,15 +138,15 @@ def latest(run_dir: str | Path) -> Path | None:
 
 
 def prepare_folder(run_dir: Path, resume: bool, files: Sequence[str]) -> Path | None:
-    """Creates the folder of a run and returns the checkpoint to resume from, or None for a new run.
+    """Creates a run folder and returns the checkpoint to resume from, or None for a new run.
 
     Args:
         run_dir: the folder.
-        resume: whether a run in it is to be continued.
-        files: names of the files that a run leaves in it, besides its checkpoints.
+        resume: whether to resume a run in it.
+        files: names of a run's files, besides its checkpoints.
 
     Raises:
-        InputError: where the folder cannot be written, holds a run that is not to be resumed, or one without a
+        InputError: if the folder cannot be written, holds a run that is not to be resumed, or one without a
             checkpoint. Nothing in it is changed.
     """
     check_folder(run_dir)
@@ -171,7 +171,7 @@ def nonfinite(tree: Any) -> list[str]:
 def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:
     """Writes a checkpoint of environment step `step`, then removes all but the newest `keep`.
 
-    Partial files of a killed writer are removed too.
+    Partial files of interrupted writes are removed too.
     """
     folder = checkpoint_folder(run_dir)
     folder.mkdir(parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ class PPO:
     """Clips advantages to this many times their median magnitude, and divides them by it, so that rare large losses
     do not dominate; none disables it."""
     advantage_clip_until: Positive = 1.0
-    """Fraction of the training during which `advantage_clip` applies."""
+    """Fraction of training during which `advantage_clip` applies."""
 
 
 @record
@@ -72,7 +72,7 @@ class OptimizerSettings:
     learning_rate: Positive = 7e-4
     """Learning rate of actor and critic."""
     schedule: Literal["constant", "linear"] = "constant"
-    """Learning-rate schedule: constant, or linear to zero over the training."""
+    """Learning-rate schedule: constant, or linear to zero over the run."""
     target_kl: Positive | None = None
     """Target KL divergence per minibatch of the adaptive learning rate; none uses the schedule alone."""
     eps: Positive = 1e-5
@@ -88,12 +88,12 @@ class Curriculum:
     assistance: Fraction = 0.0
     """Initial assistance of the environment (its state's `assistance`), annealed linearly to 0."""
     assistance_until: Positive = 0.5
-    """Fraction of the training after which the assistance is 0."""
+    """Fraction of training after which the assistance is 0."""
     failure_bootstrap: Fraction = 0.0
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
     failure_bootstrap_until: Positive = 0.5
-    """Fraction of the training over which `failure_bootstrap` is annealed to 0."""
+    """Fraction of training over which `failure_bootstrap` is annealed to 0."""
 
 
 @record
@@ -103,7 +103,7 @@ class Normalization:
     observations: bool = False
     """Normalise observations by running statistics."""
     values: bool = True
-    """Normalise value targets by recent statistics."""
+    """Normalise value targets by exponentially averaged statistics."""
     value_decay: Annotated[float, Ge(0), Lt(1)] = 0.99
     """Decay per rollout of the statistics of value targets."""
     advantages: bool = True
@@ -117,24 +117,24 @@ class Checkpointing:
     every: PositiveInt = 20
     """Updates between two checkpoints."""
     kept: PositiveInt = 2
-    """Number of the newest checkpoints to keep."""
+    """Number of checkpoints to keep, the newest ones."""
     environments: bool = True
-    """Keep the environments' states, so that a resumed training continues exactly. Without them a checkpoint holds
-    weights, optimiser, statistics and keys alone (under 1 MB), and environments are reset when a run resumes."""
+    """Include the environments' states, so that a resumed run continues exactly. Without them a checkpoint holds only
+    weights, optimiser state, statistics and keys (under 1 MB), and environments are reset when a run resumes."""
 
 
 @record
 class EvaluationSettings:
     """Evaluation during training, on separate environments of the unmodified task (Gorsane et al., arXiv 2209.10485).
 
-    Actions are sampled in half of the environments and means in the others. The policy of the best evaluation is kept,
-    and the training ends with its absolute metric, over ten times as many episodes.
+    Half of the environments use sampled actions, the others mean actions. The policy of the best evaluation is kept,
+    and the run ends with its absolute metric, over ten times as many episodes.
     """
 
     every: PositiveInt | None = None
     """Updates between two evaluations; none disables evaluation."""
     episodes: PositiveInt = 32
-    """Episodes of each evaluation under sampled actions, and as many under mean actions; one in each environment."""
+    """Episodes per evaluation under sampled actions, and as many under mean actions; one per environment."""
 
 
 @record
@@ -146,13 +146,13 @@ class TrainConfig:
     env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Further overrides during training only; evaluations are without them."""
+    """Further overrides during training only, not in evaluation."""
     seed: NonNegativeInt = 0
     """Random seed."""
     num_envs: PositiveInt = 500
     """Number of parallel environments."""
     total_steps: PositiveInt = 40_000_000
-    """Environment steps of the whole training, summed over environments."""
+    """Total environment steps of the run, summed over environments."""
     rollout_steps: PositiveInt = 200
     """Steps of each environment between two updates."""
     stagger_episodes: bool = False
@@ -178,7 +178,7 @@ class TrainConfig:
 
     @property
     def training_env(self) -> dict[str, Any]:
-        """Overrides of the task's parameters while training."""
+        """Overrides of the task's parameters during training."""
         return {**self.env, **self.train_env}
 
     @property
@@ -188,7 +188,7 @@ class TrainConfig:
 
     @property
     def num_updates(self) -> int:
-        """Updates of the whole training: `total_steps` in whole rollouts, rounded up."""
+        """Total number of updates: `total_steps` in whole rollouts, rounded up."""
         return -(-self.total_steps // self.steps_per_update)
 
 
@@ -196,7 +196,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
     """Reads settings from a YAML file, with overrides by nested or dotted names.
 
     Raises:
-        InputError: naming the file, for anything that is wrong in it; for an override, naming the setting.
+        InputError: naming the file, for invalid content; for an invalid override, naming the setting.
     """
     values = load_yaml(path)
     try:

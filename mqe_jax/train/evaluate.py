@@ -18,7 +18,7 @@ from mqe_jax.settings import fail
 from mqe_jax.train.types import Memory, PyTree, Recorder, Trace, VectorEnv, join_traces, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
-"""`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable by JAX."""
+"""`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
 
 
 @dataclass(frozen=True)
@@ -88,13 +88,13 @@ def evaluate(
         act: the policy.
         episodes: number of episodes.
         key: random key.
-        memory: of `act` at an episode's start, leading axis N.
+        memory: initial recurrent state of `act`, leading axis N.
         block: steps per compiled call.
         max_steps: limit on the steps of an environment.
         recorder: receives all steps, block by block.
 
     Raises:
-        InputError: for `episodes` < 1, or where the environments do not finish within `max_steps`.
+        InputError: for `episodes` < 1, or if the episodes do not end within `max_steps`.
     """
 
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
@@ -105,7 +105,7 @@ def evaluate(
 
 
 class Evaluator:
-    """Evaluations of many policies by one compiled program, B at a time; see `evaluate`.
+    """Evaluates B policies in one compiled program; see `evaluate`.
 
     `act(params, obs (N, A, O), memory, key) -> (action, memory)` is the policy; `params` has a leading axis B, one
     set for each evaluation, or is None if all evaluations share one policy.
@@ -138,7 +138,7 @@ class Evaluator:
         self._run = jax.jit(run)
 
     def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[EvalResult]:
-        """Returns the results of B evaluations, for random keys (B, 2); errors as of `evaluate`."""
+        """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate`."""
         if episodes < 1:
             fail("episodes", episodes, "at least 1")
         count = self._env.num_envs

@@ -1,4 +1,4 @@
-"""The standard deviation of Gaussian policies: settings and bounds that the networks share."""
+"""Settings and bounds of the standard deviation of Gaussian policies."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class GaussianSettings(NetworkSettings):
             fail("log_std_init", self.log_std_init, f"at least log_std_min ({self.log_std_min})")
 
     def bounded_log_std(self, parameter: jax.Array) -> jax.Array:
-        """Returns the parameter within the bounds, with gradients that point back into them."""
+        """Returns the parameter clipped to the bounds by `nn.bounded`."""
         low = -math.inf if self.log_std_min is None else self.log_std_min
         high = math.inf if self.log_std_max is None else self.log_std_max
         return nn.bounded(parameter, low, high)

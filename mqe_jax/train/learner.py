@@ -1,7 +1,7 @@
-"""PPO for teams: one pure function from a learner state to the next.
+"""Multi-agent PPO as one pure function from a learner state to the next.
 
 A rollout of all environments, advantages, then epochs of minibatches. MAPPO, JRPO, independent PPO and their variants
-differ in the ratio that PPO clips, the kind of value, and the network; all three are settings.
+differ in the ratio that PPO clips, the value (per agent or per team) and the network; all three are settings.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Learner(NamedTuple):
 
 
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
-    """Returns the sizes that a network is built for."""
+    """Returns the sizes from which a network is built."""
     agents = env.num_agents
     teams = teams_of(env)
     return EnvDims(
@@ -87,7 +87,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], 
     With `snapshot` (see `Recorder`), the metrics of an update also hold `trace`, a `Trace` of the rollout.
 
     Raises:
-        InputError: where the settings do not fit the environment.
+        InputError: if the settings do not fit the environment.
     """
     _check_environment(env, config)
     dims = env_dims(env, config)
@@ -167,7 +167,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], 
 
 
 def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
-    """Checks the shapes of the environment's state, and that it has what the settings need."""
+    """Checks the shapes of the environment's state, and the fields that the settings require."""
     if env.num_envs != config.num_envs:
         fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
@@ -224,9 +224,9 @@ def _strongly_typed(state: TrainState) -> TrainState:
 def _prepare(
     network: Network, config: TrainConfig, teams: Teams, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
-    """Computes values, advantages and targets of a rollout and cuts it into chunks (L, C, ...).
+    """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
-    The critic takes each step's observation and that of the state reached as a chunk of two, all steps at once: the
+    The critic evaluates each step's observation and final observation as a chunk of two, batched over all steps: the
     next value uses the recurrent state after the step's observation, whether or not the episode ended there.
     """
     obs, privileged = normalize_obs(
@@ -289,7 +289,7 @@ def _prepare(
 
 
 def _chunks(x: jax.Array, length: int) -> jax.Array:
-    """Cuts time into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
+    """Splits the time axis into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
     parts, envs = x.shape[0] // length, x.shape[1]
     x = x.reshape(parts, length, *x.shape[1:])
     return jnp.swapaxes(x, 0, 1).reshape(length, parts * envs, *x.shape[3:])

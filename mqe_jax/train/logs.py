@@ -51,7 +51,7 @@ class CsvLog:
             self._path.unlink(missing_ok=True)
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Appends one row and flushes it; a name not seen before adds a column."""
+        """Appends one row and flushes it; a new name adds a column."""
         new = [name for name in row if name not in self._columns]
         if new and self._columns:
             _, rows = _read_rows(self._path, None)
@@ -85,7 +85,7 @@ def _text(value: float) -> str:
 
 
 def _read_rows(path: Path, env_steps: int | None) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns columns and complete rows up to `env_steps`; a partial last row is left out."""
+    """Returns columns and complete rows up to `env_steps`; a partial last row is dropped."""
     if not path.is_file():
         return [], []
     with path.open(encoding="utf-8", newline="") as file:
@@ -133,7 +133,7 @@ class TensorBoardLog:
 class WandbLog:
     """A Weights & Biases run, written to `run_dir/wandb` without a network unless WANDB_MODE=online is set.
 
-    `wandb sync` uploads it later. A resumed training continues the same run id.
+    `wandb sync` uploads it later. A resumed training run keeps its run id.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -150,7 +150,7 @@ class WandbLog:
             dir=str(run_dir),
             mode=os.environ.get("WANDB_MODE", "offline"),
             resume="allow",
-            reinit="create_new",  # several seeds in one program are runs of their own
+            reinit="create_new",  # several seeds in one program are separate runs
             settings=wandb.Settings(console="off", silent=True),
         )
 
@@ -168,7 +168,7 @@ LOGGERS: dict[str, Callable[[Path, int], MetricsLog]] = {"tensorboard": TensorBo
 
 
 def check_loggers(names: tuple[str, ...]) -> None:
-    """Raises an InputError where a logger needs a package that is not installed; TensorBoard is optional."""
+    """Raises an InputError if a logger needs a package that is not installed; TensorBoard is optional."""
     if "wandb" in names and importlib.util.find_spec("wandb") is None:
         raise InputError("loggers: 'wandb' needs the package wandb; pip install 'mqe-jax[log]'")
 

@@ -1,4 +1,4 @@
-"""The terms of the PPO loss, element by element; the caller takes the mean."""
+"""Elementwise terms of the PPO loss; the caller averages them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Returns the log-density of a diagonal Gaussian per dimension, (..., D); their sum is the joint one."""
+    """Returns the log-density of a diagonal Gaussian per dimension, (..., D), to be summed for the joint one."""
     z = (action - mean) * jnp.exp(-log_std)
     return -0.5 * jnp.square(z) - log_std - _LOG_SQRT_2PI
 

@@ -1,7 +1,7 @@
 """The network `mat`: a transformer over agents that act sequentially, conditioned on their predecessors' actions.
 
-An encoder attends over the observations of a team and gives each agent's value; a decoder attends over the actions of
-the agents before. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
+An encoder attends over the observations of a team and outputs each agent's value; a decoder attends over the actions of
+preceding agents. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
 log-probabilities. In a match each team is a separate sequence; the weights are shared.
 
 Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as in OpenRL.
@@ -37,8 +37,8 @@ class Mat(GaussianSettings):
     gain: Positive = 0.01
     """Orthogonal gain of attention, of residual branches' last layers, and of the output layers."""
     deviation: Literal["sigmoid", "free"] = "sigmoid"
-    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 at first (OpenRL), or an unconstrained log,
-    which alone uses the settings log_std_*.
+    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an unconstrained
+    log, the only choice that uses log_std_*.
     """
 
     def __post_init__(self) -> None:
@@ -52,16 +52,16 @@ class Mat(GaussianSettings):
 
 
 class Order(NamedTuple):
-    """Attention masks and sequence positions within teams; agents act in the order in which their team lists them."""
+    """Attention masks and sequence positions within teams; the sequence is the order of agents in `teams`."""
 
     team: np.ndarray
-    """Whether both agents are of one team (A, A) bool: what the encoder attends to."""
+    """Encoder mask (A, A) bool: query agent i attends to key agents j of its own team."""
     causal: np.ndarray
-    """Whether the second is of the same team and not after the first (A, A) bool: what the decoder attends to."""
+    """Decoder mask (A, A) bool: query agent i attends to key agents j of its own team up to and including itself."""
     rank: np.ndarray
-    """Place in the team's sequence (A,)."""
+    """Position in the team's sequence (A,)."""
     previous: np.ndarray
-    """The agent before, itself where there is none (A,)."""
+    """Index of the preceding agent, or of the agent itself if it is first (A,)."""
 
 
 def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:
@@ -93,8 +93,8 @@ def _layer_norm_init(width: int) -> Params:
     return {"scale": jnp.ones((width,)), "shift": jnp.zeros((width,))}
 
 
-def attention(params: Params, query: jax.Array, memory: jax.Array, mask: np.ndarray, heads: int) -> jax.Array:
-    """Attends from `query` to `memory` where `mask` (A, A) allows: (..., A, W), (..., A, W) -> (..., A, W).
+def attention(params: Params, query: jax.Array, context: jax.Array, mask: np.ndarray, heads: int) -> jax.Array:
+    """Multi-head attention of `query` to `context` under `mask` (A, A): (..., A, W), (..., A, W) -> (..., A, W).
 
     Source: Vaswani et al., arXiv 1706.03762, equation 1.
     """
@@ -103,7 +103,7 @@ def attention(params: Params, query: jax.Array, memory: jax.Array, mask: np.ndar
         x = nn.dense(params[name], x)
         return jnp.moveaxis(x.reshape(*x.shape[:-1], heads, -1), -2, -3)  # (..., heads, A, W / heads)
 
-    q, k, v = split("query", query), split("key", memory), split("value", memory)
+    q, k, v = split("query", query), split("key", context), split("value", context)
     weight = jnp.matmul(q, jnp.swapaxes(k, -1, -2), precision=nn.PRECISION) / math.sqrt(q.shape[-1])
     weight = jax.nn.softmax(jnp.where(mask, weight, -jnp.inf), axis=-1)
     mixed = jnp.moveaxis(jnp.matmul(weight, v, precision=nn.PRECISION), -3, -2)
@@ -122,10 +122,10 @@ def _head(params: Params, x: jax.Array) -> jax.Array:
 
 
 def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
-    """Initialises encoder, value head, decoder and the parameter of the deviation."""
+    """Initialises encoder, value head, decoder and the standard-deviation parameter."""
     width, small, large = settings.width, settings.gain, math.sqrt(2.0)
     square_key, *keys = jax.random.split(key, 5)
-    # All square matrices in one program, which compiles in a fraction of the time of one for each.
+    # One vmapped program for all square matrices compiles much faster than one program each.
     count = 2 + settings.blocks * (6 + 10)
     squares = iter(jax.vmap(lambda k: nn.orthogonal(k, (width, width), 1.0))(jax.random.split(square_key, count)))
 
@@ -167,7 +167,7 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
 
 
 def encode(params: Params, obs: jax.Array, order: Order, heads: int) -> jax.Array:
-    """Returns features of every agent from the observations of its team: (..., A, O) -> (..., A, W)."""
+    """Returns features of each agent from the observations of its team: (..., A, O) -> (..., A, W)."""
     x = layer_norm(params["norm"], _gelu(nn.dense(params["embed"], layer_norm(params["norm_in"], obs))))
     for block in params["blocks"]:
         x = layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.team, heads))
@@ -176,7 +176,7 @@ def encode(params: Params, obs: jax.Array, order: Order, heads: int) -> jax.Arra
 
 
 def decode(params: Params, features: jax.Array, action: jax.Array, order: Order, heads: int) -> jax.Array:
-    """Returns mean actions given the actions of the agents before: (..., A, W), (..., A, D) -> (..., A, D).
+    """Returns mean actions given the actions of preceding agents: (..., A, W), (..., A, D) -> (..., A, D).
 
     An agent's own and later actions have no effect on its mean; the first agent's token is zero.
     """
@@ -199,7 +199,7 @@ def log_std_of(params: Params, settings: Mat) -> jax.Array:
 
 def _build(settings: Mat, dims: EnvDims) -> Network:
     if dims.values != dims.agents:
-        fail("ppo.value", "joint", "'agent' with the network 'mat', whose encoder gives each agent's value")
+        fail("ppo.value", "joint", "'agent' with the network 'mat', which has one value per agent")
     order, heads = order_of(dims.teams), settings.heads
 
     def act(

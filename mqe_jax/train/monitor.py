@@ -1,4 +1,4 @@
-"""Evaluation during training: the record of a run's evaluations, its best policy, and the absolute metric.
+"""Evaluation during training: records of a run's evaluations, its best policy, and the absolute metric.
 
     RUN/evaluations.json          {"evaluations": [...], "absolute": {...} or null}
     RUN/best/step_*.safetensors   the policy of the best evaluation so far
@@ -28,37 +28,39 @@ from mqe_jax.train.types import Memory, VectorEnv
 
 EVALUATIONS_FILE = "evaluations.json"
 ABSOLUTE_FACTOR = 10
-"""Episodes of the absolute metric, in episodes of an evaluation."""
+"""Number of episodes of the absolute metric, relative to an evaluation."""
 
 _SAMPLED, _DETERMINISTIC = 0, 1
 
 
 class Monitor:
-    """Evaluates the policies of a run's seeds in one program: sampled and mean actions of each."""
+    """Evaluates the policies of several seeds in one program, with sampled and with mean actions."""
 
     def __init__(self, env: VectorEnv, config: TrainConfig) -> None:
         if env.num_envs != config.evaluation.episodes:
-            raise InputError(f"evaluation.episodes: {config.evaluation.episodes}; the environments are {env.num_envs}")
+            raise InputError(
+                f"evaluation.episodes: {config.evaluation.episodes} must equal the env's num_envs, {env.num_envs}"
+            )
         network = config.network.build(env_dims(env, config))
 
         def act(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
             policy, mode = params
             if config.normalization.observations:
                 obs = running_normalize(policy["normalizer"], obs)
-            drawn = network.act(policy["params"], memory, obs, key)
+            sampled = network.act(policy["params"], memory, obs, key)
             mean = network.act(policy["params"], memory, obs, None)
-            action, _, memory = jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), drawn, mean)
+            action, _, memory = jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
             return jnp.clip(config.action_scale * action, -1.0, 1.0), memory
 
         self._config = config
         self._evaluator = Evaluator(env, act, network.initial_memory(env.num_envs).actor)
 
     def evaluate(self, policies: Sequence[Policy], env_steps: Sequence[int], episodes: int) -> list[dict[str, Any]]:
-        """Returns for each policy its evaluation: env_steps, episodes, and results under both kinds of action."""
+        """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with mean actions."""
         trees = [{"params": policy.params, "normalizer": policy.normalizer} for policy in policies]
         stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *trees)
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
-        # The same episodes for every policy and step of a run, apart from what the actions change.
+        # The same random keys for every policy and training step, to reduce the variance of comparisons.
         keys = jnp.tile(jax.random.PRNGKey(self._config.seed), (2 * len(policies), 1))
         results = self._evaluator((stacked, modes), episodes, keys)
         return [
@@ -73,14 +75,14 @@ class Monitor:
 
 
 def _plain(result: EvalResult) -> dict[str, Any]:
-    """Returns a result as JSON values; numbers that are not finite become null."""
+    """Returns a result as JSON values; non-finite numbers become null."""
     values = {k: v for k, v in result.to_dict().items() if k not in ("task", "episodes", "terms")}
     values |= {f"reward/{name}": value for name, value in result.terms.items()}
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
 
 def score(evaluation: dict[str, Any]) -> float:
-    """Returns what makes an evaluation the best: the average step reward under sampled actions."""
+    """Returns the score by which evaluations are ranked: the average step reward under sampled actions."""
     value = evaluation["sampled"]["average_step_reward"]
     return -math.inf if value is None else float(value)
 
@@ -96,7 +98,7 @@ class EvaluationLog:
         self.absolute = before["absolute"] if before["absolute"] and before.get("ended_at") == env_steps else None
 
     def add(self, evaluation: dict[str, Any], policy: Policy) -> None:
-        """Appends an evaluation; its policy is saved where it is the best of those whose policy is on disk."""
+        """Appends an evaluation, and saves its policy if it scores higher than those on disk."""
         best = self.best()
         if best is None or score(evaluation) > score(best):
             path = _best_path(self._run_dir, evaluation)
@@ -142,7 +144,7 @@ def read_evaluations(run_dir: Path) -> dict[str, Any]:
     """Reads a run's evaluations; without the file there are none.
 
     Raises:
-        InputError: where the file is damaged.
+        InputError: if the file is damaged.
     """
     path = run_dir / EVALUATIONS_FILE
     if not path.is_file():

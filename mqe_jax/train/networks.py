@@ -1,7 +1,7 @@
 """The network protocol and the registry of networks.
 
 A network is one registered settings record whose `build` returns the functions that the learner, the rollout and a
-saved policy use. Another architecture, such as a transformer over agents, is one more entry:
+saved policy use. A further architecture is one more entry:
 
     @register_network("mine")
     class MyNetwork(NetworkSettings):
@@ -27,7 +27,7 @@ from mqe_jax.train.types import Memory, NetworkMemory, Params, Teams
 
 
 class EnvDims(NamedTuple):
-    """Sizes that an environment and the kind of value set."""
+    """Sizes given by the environment and by `ppo.value`."""
 
     agents: int
     observation: int
@@ -54,15 +54,15 @@ class Network(NamedTuple):
     """The functions that make up a network.
 
     `init(key) -> params`
-    `acting(params) -> params`: the part that `act` needs, which a saved policy keeps
-    `initial_memory(num_envs) -> memory`: zeros with leading axis N
+    `acting(params) -> params`: the parameters used by `act`, stored in a saved policy
+    `initial_memory(num_envs) -> memory`: recurrent state of zeros with leading axis N
     `act(acting_params, actor_memory, obs (N, A, O), key or None) -> (action (N, A, D), log_prob (N, A, D),
     actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents may act
     autoregressively within one call.
     `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P)) -> (value (L, N, V),
     critic_memory)`
     `evaluate(params, memory, is_first (L, C), obs, privileged, action) -> Evaluation`, all agents in parallel
-    `chunk_length`: steps through which gradients flow back in time; 1 without memory
+    `chunk_length`: steps of truncated backpropagation through time; 1 for feed-forward networks
     """
 
     init: Callable[[jax.Array], Params]
@@ -81,7 +81,7 @@ class NetworkSettings:
     """Registered name of the network that the other fields configure."""
 
     def build(self, dims: EnvDims) -> Network:
-        """Returns the network for an environment; InputError where the settings do not fit it."""
+        """Returns the network for an environment; InputError if the settings do not fit it."""
         raise NotImplementedError
 
 
@@ -91,7 +91,7 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings record (see `mqe_jax.settings.record`) and enters it in the registry."""
+    """Makes a class a settings record (see `mqe_jax.settings.record`) and registers it."""
 
     def register(cls: type[Any]) -> type[Any]:
         cls.__annotations__ = {"name": Literal[name], **cls.__annotations__}
@@ -118,7 +118,7 @@ def network_settings(value: Any) -> Any:
 
 
 def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
-    """Zeroes the memory of the environments that start an episode: leaves (N, ...), is_first (N,) bool."""
+    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
 
     def zero(leaf: jax.Array) -> jax.Array:
         return jnp.where(is_first.reshape(is_first.shape + (1,) * (leaf.ndim - is_first.ndim)), 0.0, leaf)

@@ -15,7 +15,7 @@ PRECISION = "highest"
 
 
 def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Array:
-    """Draws a matrix with orthonormal rows or columns, whichever are fewer, times `scale`.
+    """Samples a matrix with orthonormal rows or columns, whichever are fewer, times `scale`.
 
     Shapes: (n_in, n_out) float32. Source: Saxe et al., arXiv 1312.6120.
     """
@@ -35,7 +35,7 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
 
 
 def dense_init(key: jax.Array, n_in: int, n_out: int, scale: float = math.sqrt(2.0)) -> Params:
-    """Makes an affine layer: orthogonal weight (n_in, n_out) of gain `scale`, zero bias (n_out,)."""
+    """Initialises an affine layer: orthogonal weight (n_in, n_out) of gain `scale`, zero bias (n_out,)."""
     return {"weight": orthogonal(key, (n_in, n_out), scale), "bias": jnp.zeros((n_out,), jnp.float32)}
 
 
@@ -47,7 +47,7 @@ def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) ->
 def mlp_init(
     key: jax.Array, sizes: Sequence[int], *, scale: float = math.sqrt(2.0), final_scale: float = 1.0
 ) -> Params:
-    """Makes a chain of affine layers `"0"`, `"1"`, ... of widths `sizes`; the last has gain `final_scale`.
+    """Initialises a chain of affine layers `"0"`, `"1"`, ... of widths `sizes`; the last has gain `final_scale`.
 
     Shapes: layer i is (sizes[i], sizes[i + 1]). `sizes` holds at least two widths.
     """
@@ -82,7 +82,7 @@ def mlp(
 
 
 def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
-    """Makes a gated recurrent unit: gates reset, update, candidate side by side, each orthogonal.
+    """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each orthogonal.
 
     Shapes: `input.weight` (n_in, 3 n_hidden), `hidden.weight` (n_hidden, 3 n_hidden), biases (3 n_hidden,).
     """
@@ -111,10 +111,10 @@ def gru(params: Params, h: jax.Array, x: jax.Array, *, precision: str | None = P
 
 @jax.custom_vjp
 def bounded(x: jax.Array, low: float, high: float) -> jax.Array:
-    """Clips a parameter to [low, high], with gradients that point back into the bounds.
+    """Clips a parameter to [low, high] with a custom gradient.
 
-    The gradient is that of the identity within the bounds. Beyond them it is passed on where a descent step
-    reduces the violation, and is 0 where it would increase it.
+    Within the bounds the gradient is that of the identity. Outside, it is passed where a descent step reduces the
+    violation and zero where it would increase it.
     """
     return jnp.clip(x, low, high)
 

@@ -1,4 +1,4 @@
-"""Running statistics: of observations over the whole training, of value targets over the recent past."""
+"""Running statistics: of all observations, and exponentially averaged ones of value targets."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
 def running_normalize(statistics: RunningStatistics, x: jax.Array, limit: float = 10.0) -> jax.Array:
     """Returns x (..., size) normalised to mean 0 and standard deviation 1, clipped to +-limit.
 
-    The standard deviation is floored at 0.01, so that a constant entry becomes 0 and not noise.
+    The standard deviation is floored at 0.01, so that a constant entry becomes 0.
     """
     std = jnp.maximum(jnp.sqrt(statistics.variance), _OBSERVATION_MIN_STD)
     return jnp.clip((x - statistics.mean) / std, -limit, limit)
@@ -67,7 +67,7 @@ class ValueStatistics(NamedTuple):
 def value_init(enabled: bool = True) -> ValueStatistics:
     """Returns statistics before the first update; if not `enabled`, those that leave values unchanged.
 
-    Before the first update the scale of rewards is unknown, and every value counts as 0 in units of reward.
+    Before the first update the reward scale is unknown, and values denormalise to 0.
     """
     return ValueStatistics(jnp.zeros(()), jnp.float32(not enabled), jnp.float32(not enabled))
 

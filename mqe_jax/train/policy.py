@@ -25,7 +25,7 @@ POLICY_FILE = "policy.safetensors"
 
 @dataclass(frozen=True)
 class Policy:
-    """A team's policy: the acting part of a network, and the statistics that normalise its observations."""
+    """A team's policy: the acting parameters of a network, and its observation statistics."""
 
     params: Params
     """Parameters as `Network.acting` returns them."""
@@ -36,7 +36,7 @@ class Policy:
     """Further entries of the file: task, env_steps."""
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
-        """Returns the memory at an episode's start: leading axis N, or none for a single environment."""
+        """Returns the initial recurrent state: leading axis N, or none for a single environment."""
         memory = self.config.network.build(self.dims).initial_memory(num_envs or 1).actor
         return jax.tree.map(lambda x: x[0], memory) if num_envs is None else memory
 
@@ -45,8 +45,8 @@ class Policy:
     ) -> tuple[jax.Array, Memory]:
         """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or (A, D).
 
-        Without a key, or with `deterministic`, the action is not sampled. The caller resets the memory to
-        `initial_memory` at an episode's start.
+        `memory` is the recurrent state; the caller resets it to `initial_memory` at an episode's start. Without a key,
+        or with `deterministic`, the action is the mean.
 
         Raises:
             InputError: for an observation of another shape.
@@ -84,7 +84,7 @@ def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata:
 
 
 def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE) -> Path:
-    """Writes a policy into a run's folder atomically.
+    """Writes a policy into a run folder atomically.
 
     Raises:
         NonFiniteError: for weights or statistics that are NaN or infinite.
@@ -98,10 +98,10 @@ def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE) ->
 
 
 def load_policy(run: str | Path) -> Policy:
-    """Reads the policy of a run's folder, or a policy file.
+    """Reads the policy of a run folder, or a policy file.
 
     Raises:
-        InputError: in one line naming the file, where it is missing, damaged, foreign or not finite.
+        InputError: in one line naming the file, if it is missing, damaged, of another format or non-finite.
     """
     path = Path(run)
     if path.is_dir():

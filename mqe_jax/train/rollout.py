@@ -22,9 +22,9 @@ class RolloutState(NamedTuple):
     is_first: jax.Array
     """Whether the next step is the first of an episode (N,) bool."""
     episode_steps: jax.Array
-    """Steps since the episode began (N,) int32."""
+    """Steps in this episode (N,) int32."""
     episode_return: jax.Array
-    """Sum of rewards since then, mean over the agents of team 0 (N,)."""
+    """Sum of rewards in this episode, mean over the agents of team 0 (N,)."""
 
 
 class ObservationNormalizer(NamedTuple):

@@ -59,17 +59,17 @@ def train(
         env: the environments.
         config: settings.
         run_dir: folder for config.yaml, metrics.csv, logs of other loggers, checkpoints/ and policy.safetensors.
-        resume: continues a run in the folder exactly from its newest checkpoint; an empty folder starts a new run.
+        resume: resume a run in the folder from its newest checkpoint; an empty folder starts a new run.
         on_update: called after every update with the state and its row of metrics.csv.
         eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
             `config.evaluation.every` is set.
-        recorder: receives the steps of every rollout, but none of evaluations.
+        recorder: receives the steps of every rollout, not those of evaluations.
 
     Raises:
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
-            training, or holds a run that is not to be resumed, has no checkpoint, or has other settings.
+            process, or holds a run that is not to be resumed, has no checkpoint, or has other settings.
         NonFiniteError: after the first update with a non-finite loss or weight. Checkpoints and policy
-            on disk are those from before.
+            on disk are from before that update.
     """
     return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, recorder)[0]
 
@@ -85,18 +85,18 @@ def train_seeds(
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
 
-    `configs` differ in their seed alone. Runs are resumed together, from the newest checkpoint that all of them have.
+    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all.
     The recorder receives the environments of all seeds as one batch.
     """
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
-        raise InputError("seeds: the settings of seeds trained together may differ in the seed alone")
+        raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
-        fail("evaluation.every", configs[0].evaluation.every, "none where no environments are given to evaluate on")
+        fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
     check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
     learner = make_learner(env, configs[0], None if recorder is None else recorder.snapshot)
-    left_by_a_run = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
-    newest = [prepare_folder(folder, resume, left_by_a_run) for folder in folders]
+    run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
+    newest = [prepare_folder(folder, resume, run_files) for folder in folders]
     with contextlib.ExitStack() as locks:
         for folder in folders:
             locks.enter_context(locked(folder))
@@ -108,7 +108,7 @@ def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
     """Returns each folder's checkpoint at the newest step common to all; None (start from scratch) if any has none.
 
     Raises:
-        InputError: where the folders have no step in common.
+        InputError: if the folders have no step in common.
     """
     by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
     common = set.intersection(*map(set, by_step))
@@ -116,11 +116,13 @@ def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
         return [steps[max(common)] for steps in by_step]
     if all(not steps or 0 in steps for steps in by_step):
         return [None] * len(folders)
-    raise InputError(f"run_dir: {folders[0].parent}: its seeds have no checkpoint of the same step; resume each alone")
+    raise InputError(
+        f"run_dir: {folders[0].parent}: its seeds have no checkpoint of the same step; resume them separately"
+    )
 
 
 class _Training:
-    """A training of S seeds; folders have been checked and locked. The states of several seeds are stacked."""
+    """A training run of S seeds in checked and locked folders. The states of several seeds are stacked."""
 
     def __init__(
         self,
@@ -185,12 +187,12 @@ class _Training:
         return [self._seed(i) for i in range(len(self._configs))]
 
     def _seed(self, i: int, state: TrainState | None = None) -> TrainState:
-        """Returns one seed's state, of the current ones or of those given."""
+        """Returns one seed's state from the current states, or from `state` if given."""
         states = self._state if state is None else state
         return states if self._single else take(states, self._shared, i)
 
     def _step(self, files: Sequence[Sequence[MetricsLog]]) -> list[dict[str, float]]:
-        """Makes one update of every seed and logs it; returns the rows of metrics.csv."""
+        """Performs and logs one update of every seed; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)
         if self._recorder is not None:
@@ -208,7 +210,7 @@ class _Training:
         for logs, row in zip(files, rows, strict=True):
             for log in logs:
                 log.write(row)
-        # Assigned after logging, so that an interrupted training saves no more updates than its logs show.
+        # Assigned after logging, so that an interrupted run saves no update that is not logged.
         self._state, self._env_steps = after, int(rows[0]["env_steps"])
         return rows
 
@@ -259,7 +261,7 @@ class _Training:
 
 
 def _without_environments(state: TrainState) -> dict[str, Any]:
-    """Returns what a checkpoint without environments holds."""
+    """Returns the contents of a checkpoint without environment states."""
     return {**_learned(state), "key": state.key, "updates": state.updates}
 
 
@@ -286,7 +288,7 @@ def _learned(state: TrainState) -> dict[str, Any]:
 
 
 def load_run_config(run_dir: str | Path) -> TrainConfig:
-    """Reads the settings of a run's folder; raises an InputError that names the file."""
+    """Reads the settings of a run folder; raises an InputError that names the file."""
     return load_config(Path(run_dir) / CONFIG_FILE)
 
 
@@ -334,7 +336,7 @@ def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 def _first_state(
     env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
 ) -> tuple[TrainState, float]:
-    """Returns the initial or restored state and the seconds already spent; `shared` as of `shared_leaves`."""
+    """Returns the initial or restored state and the seconds already spent; `shared` from `shared_leaves`."""
     if checkpoint is None:
         return jax.jit(learner.init)(initial_key(config)), 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")

@@ -1,7 +1,7 @@
 """States of several seeds in one pytree, as `jax.vmap` batches them.
 
 Warp keeps contacts of all environments in shared buffers, which `vmap` leaves unbatched. They are
-overwritten in every physics step, so one copy suffices for all seeds, and checkpoints leave them out.
+overwritten in every physics step, so one copy suffices for all seeds, and checkpoints omit them.
 """
 
 from __future__ import annotations

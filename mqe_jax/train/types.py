@@ -14,10 +14,10 @@ PyTree = Any
 Params = dict[str, Any]
 """Nested dict of parameter arrays."""
 Memory = Any
-"""Recurrent state: a pytree of arrays with leading axis N, or an empty one for networks without memory."""
+"""Recurrent state: a pytree of arrays with leading axis N, empty for feed-forward networks."""
 
 Teams = tuple[tuple[int, ...], ...]
-"""Agents of each team; every agent is in one."""
+"""Agents of each team; every agent belongs to exactly one."""
 
 
 class EnvState(Protocol):
@@ -51,7 +51,7 @@ class VectorEnv(Protocol):
     """N environments with automatic reset; `reset` and `step` are pure and may be jitted.
 
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with the fields
-    of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to what it allows.
+    of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to its range.
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default): joint ratios and joint values are
     per team. `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
@@ -75,7 +75,7 @@ class VectorEnv(Protocol):
 
 
 class Trace(NamedTuple):
-    """Consecutive steps of all environments, kept where divergences are recorded (T, N, ...)."""
+    """Consecutive steps of all environments (T, N, ...), from which divergences are recorded."""
 
     snapshot: PyTree
     """Snapshots of the states before the actions."""
@@ -86,10 +86,10 @@ class Trace(NamedTuple):
 
 
 class Recorder(Protocol):
-    """Records the steps that led to a divergence.
+    """Records the steps before a divergence.
 
-    `snapshot(env_state)` returns what to keep of a state (N, ...), inside compiled code; `add(trace)` receives the
-    steps since the last call, and writes those of environments that diverged.
+    `snapshot(env_state)` returns the fields to record (N, ...), inside compiled code; `add(trace)` receives the steps
+    since the last call, and writes those of environments that diverged.
     """
 
     def snapshot(self, env_state: Any) -> PyTree: ...
@@ -97,14 +97,14 @@ class Recorder(Protocol):
 
 
 def join_traces(traces: Trace) -> Trace:
-    """Returns the traces of B batches of environments (B, T, N, ...) as the trace of all of them (T, B * N, ...)."""
+    """Merges the traces of B batches of environments: (B, T, N, ...) -> (T, B * N, ...)."""
     return jax.tree.map(
         lambda x: jnp.swapaxes(x, 0, 1).reshape(x.shape[1], x.shape[0] * x.shape[2], *x.shape[3:]), traces
     )
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
-    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or with a `replace` of its own.
+    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or a class with a `replace` method.
 
     Raises:
         InputError: for another kind of state.
@@ -119,7 +119,7 @@ def replace_fields(state: Any, **fields: jax.Array) -> Any:
 
 
 def teams_of(env: VectorEnv) -> Teams:
-    """Returns the environment's teams; one of all agents where it names none."""
+    """Returns the environment's teams; by default a single team of all agents."""
     return tuple(map(tuple, getattr(env, "teams", (range(env.num_agents),))))
 
 
@@ -129,7 +129,7 @@ def is_outcome(metric: str) -> bool:
 
 
 class NetworkMemory(NamedTuple):
-    """Recurrent state of a network's two roles; leading axis N."""
+    """Recurrent states of actor and critic; leading axis N."""
 
     actor: Memory
     critic: Memory
@@ -139,7 +139,7 @@ class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
     memory: NetworkMemory
-    """Memory before this step, zeroed at an episode's first step."""
+    """Recurrent state before this step, zeroed at an episode's first step."""
     is_first: jax.Array
     """Whether the step is the first of its episode (N,) bool."""
     obs: jax.Array
@@ -157,13 +157,13 @@ class Transition(NamedTuple):
     reward: jax.Array
     """Rewards (N, A)."""
     terminated: jax.Array
-    """Whether the episode ended by its rules (N,) bool."""
+    """Whether the episode terminated (N,) bool."""
     done: jax.Array
     """Whether it was terminated or truncated (N,) bool."""
 
 
 class Batch(NamedTuple):
-    """Chunks of L steps to learn from: (L, C, ...), the memory at each chunk's first step (C, ...)."""
+    """Chunks of L steps (L, C, ...), with the recurrent state at each chunk's first step (C, ...)."""
 
     memory: NetworkMemory
     is_first: jax.Array

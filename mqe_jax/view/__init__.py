@@ -1,1 +1,1 @@
-"""The viewer in the browser: simulation, scene, panel, and the loop that runs them."""
+"""The browser viewer: simulation, scene, control panel, and main loop."""

@@ -1,4 +1,4 @@
-"""The panel in the browser: state, buttons, keys, live plots."""
+"""The control panel in the browser: state, buttons, keys, live plots."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from mqe_jax.view.session import DRIVEN, Session
 
-# Label, direction in fractions of the largest command (vx, vy, yaw rate), key that steps the command.
-# The browser's camera takes W, A, S, D, Q, E and the arrows.
+# Label, direction in fractions of the maximum command (vx, vy, yaw rate), key that increments the command.
+# W, A, S, D, Q, E and the arrow keys are bound to the browser's camera.
 DIRECTIONS = (
     ("Forward", (1.0, 0.0, 0.0), "I"),
     ("Backward", (-1.0, 0.0, 0.0), "K"),
@@ -20,19 +20,19 @@ DIRECTIONS = (
     ("Step right", (0.0, -1.0, 0.0), "O"),
 )
 KEY_STEP = 0.25
-"""Fraction of the largest command that one key press adds."""
-FREE, NOBODY = "free", "nobody"
+"""Increment of a key press, as a fraction of the maximum command."""
+FREE, NONE = "free", "none"
 _COLOURS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
 _POINTS = 200
 
 
 class Panel:
-    """The viewer's controls; changes go to the session, which the loop reads."""
+    """The viewer's controls, which modify the session."""
 
     camera: str
     """Label of the followed body, or `free`."""
     env: int
-    """Index of the environment that plots, state and camera show, and in which a robot is driven."""
+    """Index of the selected environment, for plots, state, camera and teleoperation."""
 
     def __init__(self, server: Any, session: Session, bodies: Sequence[str], on_camera: Callable[[], None]) -> None:
         self._session, self._gui = session, server.gui
@@ -47,24 +47,26 @@ class Panel:
         self._add_plots()
 
     def take_steps(self) -> int:
-        """Returns how many single steps were asked for since the last call."""
+        """Returns the number of single steps requested since the last call."""
         steps, self._wanted_steps = self._wanted_steps, 0
         return steps
 
     def take_reset(self) -> bool:
-        """Returns whether a reset was asked for since the last call."""
+        """Returns whether a reset was requested since the last call."""
         wanted, self._wants_reset = self._wants_reset, False
         return wanted
 
     def show(self, positions: np.ndarray, real_time: float) -> None:
-        """Shows the state: robots' positions (A, 3), m, in the chosen environment, and simulated per real time."""
+        """Shows the robots' positions (A, 3), m, in the selected environment, and the real-time factor."""
         session = self._session
         commands = session.commands[-1][self.env] if session.commands else np.zeros((len(positions), 3))
         rows = []
         for agent, (x, y, z) in enumerate(positions):
             vx, vy, turn = commands[agent]
             driven = (
-                " (you)" if (session.drive.env, session.drive.robot) == (self.env, agent) and session.drivable else ""
+                " (driven)"
+                if (session.drive.env, session.drive.robot) == (self.env, agent) and session.drivable
+                else ""
             )
             rows.append(f"| {agent + 1}{driven} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
         pace = "paused" if session.paused else f"{real_time:.2f} x real time"
@@ -82,7 +84,7 @@ class Panel:
         )
 
     def plot(self) -> None:
-        """Shows the last seconds of the chosen environment in the plots."""
+        """Updates the plots with the recent history of the selected environment."""
         session = self._session
         if len(session.times) < 2:
             return
@@ -103,9 +105,7 @@ class Panel:
             pause = gui.add_button("Pause")
             step = gui.add_button("One step")
             reset = gui.add_button("Reset")
-            speed = gui.add_slider(
-                "Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Simulated per real time"
-            )
+            speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Real-time factor")
 
         def toggle(_: Any) -> None:
             session.paused = not session.paused
@@ -153,7 +153,7 @@ class Panel:
         gui, drive = self._gui, self._session.drive
         names = tuple(f"robot {i + 1}" for i in range(self._session.env.num_agents))
         with gui.add_folder("Drive"):
-            robot = gui.add_dropdown("Driven", (NOBODY, *names), initial_value=NOBODY, hint="Robot driven by hand")
+            robot = gui.add_dropdown("Driven", (NONE, *names), initial_value=NONE, hint="Teleoperated robot")
             keys = " ".join(key for _, _, key in DIRECTIONS)
             gui.add_markdown(f"Hold a button to drive; each press of {keys} changes the command by a quarter, X stops.")
             buttons = [gui.add_button(label, hint=f"Hold, or key {key}") for label, _, key in DIRECTIONS]
@@ -161,7 +161,7 @@ class Panel:
 
         def choose(_: Any) -> None:
             drive.change((0.0, 0.0, 0.0))
-            drive.robot = None if robot.value == NOBODY else names.index(str(robot.value))
+            drive.robot = None if robot.value == NONE else names.index(str(robot.value))
 
         def halt(_: Any) -> None:
             drive.change((0.0, 0.0, 0.0))
@@ -182,7 +182,7 @@ class Panel:
             self._reward_plot = self._uplot((*terms[:-1], "sum"))
         self._command_plot = None
         if session.drivable:
-            with self._gui.add_folder("Commands of the driven (else the first) robot"):
+            with self._gui.add_folder("Commands of the driven robot (default: robot 1)"):
                 self._command_plot = self._uplot(DRIVEN)
 
     def _uplot(self, names: Sequence[str]) -> Any:

@@ -1,4 +1,4 @@
-"""The simulation behind the viewer: environments under policies, and a driven robot. Independent of the browser."""
+"""The simulation behind the viewer: environments, a policy, and a teleoperated robot. Independent of the browser."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from mqe_jax.train.evaluate import Act
 from mqe_jax.walk_policy import command_index
 
 DRIVEN = ("vx", "vy", "yaw_rate")
-"""Commands of a robot driven by hand: m/s, m/s, rad/s."""
+"""Teleoperation commands: m/s, m/s, rad/s."""
 HOLD_TIME = 0.35
-"""s after its last message at which a held button counts as released; the browser sends ten per second."""
+"""Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
 
 
 class Frame(NamedTuple):
-    """What the scene draws of N environments, and the state of their episodes."""
+    """Poses of all bodies in N environments, for rendering."""
 
     qpos: np.ndarray  # (N, nq)
     mocap_pos: np.ndarray  # (N, n_mocap, 3), m
@@ -32,29 +32,29 @@ class Frame(NamedTuple):
 
 @dataclass
 class Drive:
-    """The robot driven by hand: a stepped command, and what buttons add while they are held."""
+    """Teleoperation of one robot: a command set by keys, plus the commands of held buttons."""
 
     env: int = 0
     """Index of its environment."""
     robot: int | None = None
-    """Index of the agent, or None where no robot is driven."""
+    """Index of the agent, or None if no robot is driven."""
     command: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """Vx, vy, yaw_rate that the keys have set (3,), m/s and rad/s."""
+    """Command set by keys: vx, vy, yaw_rate (3,), m/s and rad/s."""
     clock: Callable[[], float] = time.monotonic
-    """Time in s."""
+    """Clock, s."""
 
     def __post_init__(self) -> None:
         self.limit = np.array([COMMAND_RANGES[name][1] for name in DRIVEN])
         self._held: dict[tuple[float, ...], float] = {}
 
     def change(self, step: tuple[float, float, float]) -> None:
-        """Adds fractions of the largest command to the command; zeros stop the robot."""
+        """Adds fractions of the maximum command to the command; zeros stop the robot."""
         self._held.clear()
         moved = self.command + np.asarray(step) * self.limit
         self.command = np.clip(moved, -self.limit, self.limit) if any(step) else np.zeros(3)
 
     def hold(self, direction: tuple[float, float, float]) -> None:
-        """Adds fractions of the largest command until `HOLD_TIME` after the last call."""
+        """Adds fractions of the maximum command until `HOLD_TIME` after the last call."""
         self._held[direction] = self.clock() + HOLD_TIME
 
     def now(self) -> np.ndarray:
@@ -65,27 +65,27 @@ class Drive:
 
 
 class Session:
-    """N environments that step under policies, with the record of their last steps."""
+    """N environments stepped under a policy, with a history of recent steps."""
 
     env: Any
     """The task."""
     num_envs: int
     """N."""
     paused: bool
-    """Whether `advance` is to be called only on request."""
+    """Whether the simulation is paused."""
     speed: float
-    """Simulated per real time."""
+    """Target real-time factor."""
     drive: Drive
-    """The robot driven by hand."""
+    """Teleoperation."""
     terms: tuple[str, ...]
     """Names of the logged rewards: the terms, then their sum."""
     steps: int
     """Environment steps so far."""
     episodes: np.ndarray
-    """Episodes that have ended, of each environment (N,)."""
+    """Number of finished episodes of each environment (N,)."""
 
     def __init__(self, env: Any, vector_env: Any, act: Act, memory: Any, seed: int = 0, history: float = 10.0) -> None:
-        """Makes the environments; `history` is the length of the record, s."""
+        """Creates the environments; `memory` is the initial recurrent state, `history` the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
         self.paused, self.speed, self.drive = False, 1.0, Drive()
         self._vector_env, self._act, self._first_memory = vector_env, act, memory
@@ -113,7 +113,7 @@ class Session:
         self.memory = self._first_memory
 
     def advance(self) -> None:
-        """Advances all environments by one step; those whose episodes end start over."""
+        """Advances all environments by one step, with automatic reset."""
         self._key, key = jax.random.split(self._key)
         mask = np.zeros((self.num_envs, self.env.num_agents), bool)
         driven = np.zeros(self.env.action_size, np.float32)
@@ -128,7 +128,7 @@ class Session:
         self.commands.append(np.asarray(commands))
 
     def frame(self) -> Frame:
-        """Returns what the scene draws."""
+        """Returns the current poses."""
         data = self.state.data
         return Frame(np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat))
 
@@ -137,7 +137,7 @@ class Session:
         action, memory = self._act(state.obs, memory, key)
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
-            # The environment maps the second side's actions to the robot's frame, in which the driver's are already.
+            # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.
             own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, env.action_size)))
             action = jnp.where(mask[..., None], own, action)
             index = np.array([command_index(name) for name in DRIVEN])

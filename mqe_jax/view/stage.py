@@ -1,4 +1,4 @@
-"""The 3-D scene in the browser: environments side by side, one batch of meshes per shape."""
+"""The 3-D scene in the browser: environments side by side, one batch of instances per mesh."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
 from mqe_jax.view.session import Frame
-from mqe_jax.viz.geometry import COLLISION_GROUP, drawn_model, extent, pose
+from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
@@ -28,7 +28,7 @@ class _Batch:
 
 
 class Stage:
-    """Draws frames of N environments below one movable root, which keeps a followed body in place."""
+    """Renders N environments under one movable root frame, which keeps a followed body at the origin."""
 
     bodies: dict[str, int]
     """Ids of the bodies that a camera can follow, by label."""
@@ -38,7 +38,7 @@ class Stage:
         self._data = mujoco.MjData(self._model)
         self._count = len(frame.qpos)
         first = _episode(frame, 0, env.dt)
-        low, high = extent(drawn_model(self._model, first), first)
+        low, high = extent(rendering_model(self._model, first), first)
         self.centre, self.size = (low + high) / 2, high - low
         shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
         self._offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
@@ -53,7 +53,7 @@ class Stage:
         self.draw(frame)
 
     def draw(self, frame: Frame, followed: tuple[int, int] | None = None) -> None:
-        """Draws a frame; `followed` (environment, body) is kept at the origin of the view."""
+        """Renders a frame; `followed` (environment, body) is kept at the origin."""
         positions = np.zeros((self._count, self._model.nbody, 3))
         turns = np.zeros((self._count, self._model.nbody, 4))
         for i in range(self._count):
@@ -69,11 +69,11 @@ class Stage:
             self._draw_walls(frame)
 
     def release(self) -> None:
-        """Puts the scene back where it was before a body was followed."""
+        """Resets the position of the root frame."""
         self._root.position = (0.0, 0.0, 0.0)
 
     def _draw_walls(self, frame: Frame) -> None:
-        """Draws the sampled walls where they have moved, each ending at the side walls of its track."""
+        """Renders the moving walls after a change of their poses, clipped at the side walls of the track."""
         if not self._walls or (self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)):
             return
         self._mocap = frame.mocap_pos.copy()
@@ -103,12 +103,12 @@ class Stage:
             )
 
     def _grouped(self) -> list[list[int]]:
-        """Returns the moving bodies, those with the same mesh together."""
+        """Returns the moving bodies, grouped by mesh."""
         groups: dict[bytes, list[int]] = {}
         for body, geoms in self._moving.items():
             mesh = merge_geoms(self._model, geoms)
-            look = np.round(mesh.vertices, 5).tobytes() + bytes(mesh.visual.vertex_colors)  # type: ignore[attr-defined]
-            groups.setdefault(look, []).append(body)
+            appearance = np.round(mesh.vertices, 5).tobytes() + bytes(mesh.visual.vertex_colors)  # type: ignore[attr-defined]
+            groups.setdefault(appearance, []).append(body)
         return list(groups.values())
 
     def _add_batch(self, index: int, bodies: list[int]) -> _Batch:
@@ -174,11 +174,11 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
 
 
 def _wall_boxes(model: mujoco.MjModel, episode: Episode, geoms: list[int]) -> tuple[np.ndarray, ...]:
-    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, cut at the side walls."""
-    drawn = drawn_model(model, episode)
-    data = mujoco.MjData(drawn)
-    pose(drawn, data, episode, 0)
+    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, clipped at the side walls."""
+    clipped = rendering_model(model, episode)
+    data = mujoco.MjData(clipped)
+    pose(clipped, data, episode, 0)
     turns = np.zeros((len(geoms), 4))
     for row, geom in enumerate(geoms):
         mujoco.mju_mat2Quat(turns[row], data.geom_xmat[geom])
-    return data.geom_xpos[geoms].copy(), turns, drawn.geom_size[geoms].copy()
+    return data.geom_xpos[geoms].copy(), turns, clipped.geom_size[geoms].copy()

@@ -1,4 +1,4 @@
-"""The viewer: a server on this machine, and the loop that steps, draws and keeps time."""
+"""The viewer: a local web server, and the loop that steps and renders in real time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Viewer:
 
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.session = session
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints its addresses in a frame
+        with contextlib.redirect_stdout(io.StringIO()):  # suppresses viser's banner
             self.server = viser.ViserServer(host=host, port=port, label=f"mqe view {session.env.name}", verbose=False)
         self.url = f"http://{self.server.get_host()}:{self.server.get_port()}"
         self.server.gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False)
@@ -45,7 +45,7 @@ class Viewer:
         self._real_time = 0.0
 
     def run(self, stop: threading.Event | None = None) -> None:
-        """Steps and draws at the session's speed until `stop` is set, or Ctrl-C; then closes the server."""
+        """Steps and renders at the session's speed until `stop` is set, or Ctrl-C; then stops the server."""
         stop = stop or threading.Event()
         dt = self.session.env.dt
         due = drawn = shown = time.monotonic()
@@ -85,7 +85,7 @@ class Viewer:
         return True
 
     def _positions(self) -> np.ndarray:
-        """Returns the agents' positions (A, 3), m, in the chosen environment."""
+        """Returns the agents' positions (A, 3), m, in the selected environment."""
         qpos = self.session.frame().qpos[self._panel.env]
         return np.stack([qpos[index[:3]] for index in self._bases()])
 
@@ -101,7 +101,7 @@ class Viewer:
         return self._panel.env, self._stage.bodies[self._panel.camera]
 
     def _view(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns camera position and the point looked at (3,), m: the whole scene, or closely the followed body."""
+        """Returns camera position and look-at point (3,), m, for the whole scene or the followed body."""
         if self._followed() is not None:
             centre, distance = np.array([0.0, 0.0, 0.2]), 3.0
         else:
@@ -110,7 +110,7 @@ class Viewer:
         return centre + distance * np.array([-0.62, -0.28, 0.73]), centre
 
     def _aim(self) -> None:
-        """Points the cameras of all pages anew, after another body was chosen."""
+        """Resets the cameras of all clients after a change of the followed body."""
         if self._followed() is None:
             self._stage.release()
         position, look_at = self._view()

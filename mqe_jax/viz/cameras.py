@@ -1,4 +1,4 @@
-"""Cameras: one that frames the whole scene, those that follow the action, and one from the side."""
+"""Cameras: fixed views of the whole scene or of all trajectories, and views that track robots and objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ class Camera:
     distance: float
     """Distance from that point, m."""
     azimuth: float = 60.0
-    """Azimuth, degrees: 0 looks along +x, 90 along +y."""
+    """Azimuth, degrees: 0 points along +x, 90 along +y."""
     elevation: float = -46.0
-    """Elevation, degrees: -90 looks straight down."""
+    """Elevation, degrees: -90 points straight down."""
 
 
 VIEWS = ("follow", "near", "scene", "side")
@@ -31,7 +31,7 @@ scene; side: tracks the first robot from its side."""
 
 _MARGIN = np.array([0.45, 0.45, 0.3])  # around a followed body, m
 _REACH = 3.0  # distance from the ball within which robots are followed, m
-_TALL = 0.4  # height of walls above the trunks from which the view is from above, m
+_TALL = 0.4  # height of walls above the trunks beyond which the camera is steeper, m
 _SMOOTHING = 0.8  # duration over which a following camera is averaged, s
 
 
@@ -55,7 +55,7 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     data = mujoco.MjData(model)
     pose(model, data, episode, 0)
     robots, objects = robot_bases(model), moving_bodies(model, episode)
-    # Walls well above the robots would hide them from a low camera.
+    # Walls well above the robots would occlude them from a low camera.
     tops = [box_corners(model, data, geom)[:, 2].max() for geom in scenery_geoms(model)]
     tall = max(tops, default=0.0) > min(data.xpos[body][2] for body in robots) + _TALL
     start = Camera((0.0, 0.0, 0.0), 1.0, elevation=-50.0 if tall else -30.0)
@@ -101,7 +101,7 @@ def _smoothed(fitted: Sequence[Camera], width: int) -> list[Camera]:
 def _fitted(
     model: mujoco.MjModel, corners: np.ndarray, camera: Camera, aspect: float, distances: tuple[float, float]
 ) -> Camera:
-    """Returns a camera of the same direction whose image holds and centres the points `corners` (P, 3)."""
+    """Returns a camera of the same direction whose image contains and centres the points `corners` (P, 3)."""
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])

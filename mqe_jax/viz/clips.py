@@ -84,9 +84,9 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
             process.kill()
             raise
         process.stdin.close()
-        said = process.stderr.read().decode(errors="replace")
+        message = process.stderr.read().decode(errors="replace")
     if process.returncode:
-        raise InputError(f"output: ffmpeg could not write the clip ({' '.join(said.split())})")
+        raise InputError(f"output: ffmpeg could not write the clip ({' '.join(message.split())})")
 
 
 def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:

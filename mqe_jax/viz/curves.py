@@ -11,11 +11,11 @@ from pathlib import Path
 from mqe_jax.errors import InputError
 from mqe_jax.study import paper
 
-_INK, _OURS, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
+_INK, _RUN, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:
-    """Returns the columns of a metrics.csv; InputError where it is missing or not one."""
+    """Returns the columns of a metrics.csv; InputError if it is missing or not one."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
@@ -57,8 +57,8 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
     for table in tables:
         steps = [s / 1e6 for s in table["env_steps"]]
         reward = table.get("average_step_reward", [math.nan] * len(steps))
-        axes.plot(steps, reward, color=_OURS, lw=0.6, alpha=0.3)
-        axes.plot(steps, smooth(reward), color=_OURS, lw=1.8, label="ours" if table is tables[0] else None)
+        axes.plot(steps, reward, color=_RUN, lw=0.6, alpha=0.3)
+        axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label="mqe_jax" if table is tables[0] else None)
     last = max((t["env_steps"][-1] for t in tables if t["env_steps"]), default=0.0) / 1e6
     for (name, value), style in zip(
         paper.VALUES[paper.HIERARCHICAL].get(task, {}).items(), ("--", "-.", ":"), strict=False

@@ -35,7 +35,7 @@ def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
     return sorted(set(bodies))
 
 
-def paint(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
+def robot_color(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
     """Returns the colour (red, green, blue, alpha) of a robot: that of the first visible geom of its trunk."""
     geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])
     seen = [geom for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
@@ -85,7 +85,7 @@ def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndar
     return np.min(points, axis=0), np.max(points, axis=0)
 
 
-def drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
+def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     """Returns a rendering copy of the model, in which mocap walls end at the track's side walls.
 
     A gate's walls are long enough for every sampled gap position; the overhang beyond the side walls is hidden.
@@ -106,6 +106,6 @@ def drawn_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
         low, high = max(wall.min(), sides.min() + 0.005), min(wall.max(), sides.max() - 0.005)
         if low < high and (low, high) != (wall.min(), wall.max()):
             model.geom_pos[geom, 1] += (low + high) / 2 - data.geom_xpos[geom, 1]
-            model.geom_sameframe[geom] = 0  # otherwise MuJoCo takes the body's pose for the geom's
+            model.geom_sameframe[geom] = 0  # otherwise MuJoCo reuses the body's pose
             model.geom_size[geom, 1] = model.geom_aabb[geom, 4] = (high - low) / 2
     return model

@@ -1,4 +1,4 @@
-"""Clips and plots inside notebooks, as HTML that needs no other file."""
+"""Inline clips for notebooks, as self-contained HTML."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mqe_jax.viz.render import render_episode
 
 
 class Clip:
-    """A clip that a notebook shows where a cell returns it."""
+    """A clip, displayed inline when a notebook cell returns it."""
 
     data: bytes
     """The file's content."""
@@ -50,7 +50,7 @@ def play(
     Args:
         env: the task.
         act: the policy, batched over the episodes.
-        memory: of the policy at an episode's start, likewise.
+        memory: initial recurrent state of the policy, batched likewise.
         episodes: number of environments.
         seconds: time limit of an episode.
         seed: random seed.

@@ -12,7 +12,7 @@ from mqe_jax.train.evaluate import Act
 
 @dataclass(frozen=True)
 class Episode:
-    """Frames of one episode with all that rendering needs."""
+    """Frames of one episode, with all data needed for rendering."""
 
     qpos: np.ndarray
     """Generalised coordinates (T, nq)."""
@@ -23,7 +23,7 @@ class Episode:
     dt: float
     """Time between frames, s."""
     success: float = 0.0
-    """`success` on the last step; 0 where the time limit of the recording came first."""
+    """`success` on the last step; 0 if the recording was cut at its time limit."""
     reward: float = 0.0
     """Mean over steps of the sum of the reward terms."""
 
@@ -50,7 +50,7 @@ def record(
     Args:
         env: the task.
         act: the policy, batched over the episodes.
-        memory: of the policy at an episode's start, likewise.
+        memory: initial recurrent state of the policy, batched likewise.
         key: random key.
         episodes: number of environments.
         seconds: time limit of an episode; otherwise its last frame is that of the termination or truncation.

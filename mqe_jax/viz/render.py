@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.viz.cameras import Camera, cameras
 from mqe_jax.viz.clips import check_output, write_clip
-from mqe_jax.viz.geometry import drawn_model
+from mqe_jax.viz.geometry import rendering_model
 from mqe_jax.viz.gl import draw_gl, gl_backend
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.top_view import draw_top
@@ -27,11 +27,11 @@ def render_frames(
 ) -> Iterator[np.ndarray]:
     """Yields the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
-    `views` holds a camera for each frame; the whole scene is in view if None.
+    `views` holds a camera for each frame; the view is `scene` if None.
 
     `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
-    model = drawn_model(env.mj_model, episode)
+    model = rendering_model(env.mj_model, episode)
     if backend == "auto":
         backend = gl_backend()
     if backend is None:
@@ -53,8 +53,8 @@ def render_episode(
 ) -> str:
     """Renders an episode to a file by suffix; returns the renderer (`egl`, `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; a following view of a
-    clip, the whole scene in a picture. `speed` below 1 is slow motion; `at` is the time of a picture, s (the middle).
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow` for
+    a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the middle).
     Without GL, one line on standard error names the packages for 3-D images.
     """
     check_output(path)
@@ -70,7 +70,7 @@ def render_episode(
         )
     aspect = size[0] / size[1]
     if suffix == ".png":
-        views = cameras(drawn_model(env.mj_model, episode), episode, view or "scene", aspect)
+        views = cameras(rendering_model(env.mj_model, episode), episode, view or "scene", aspect)
         shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
         if backend is not None:
             views = views[shown : shown + 1]
@@ -83,6 +83,6 @@ def render_episode(
     else:
         episode = episode.every(max(1, round(speed / (fps * episode.dt))))
         fps = speed / episode.dt
-        views = cameras(drawn_model(env.mj_model, episode), episode, view or "follow", aspect)
+        views = cameras(rendering_model(env.mj_model, episode), episode, view or "follow", aspect)
     write_clip(path, render_frames(env, episode, views, size, backend), fps)
     return backend or "matplotlib"

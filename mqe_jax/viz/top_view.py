@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from mqe_jax.viz.geometry import box_corners, extent, paint, pose, robot_bases, scenery_geoms
+from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
 
@@ -50,7 +50,7 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
         scenery.append((geom, axes.add_patch(patch)))
     body_shape = np.array([[-0.25, -0.13], [0.2, -0.13], [0.33, 0.0], [0.2, 0.13], [-0.25, 0.13]])
     for body in bases:
-        colour = paint(model, body)
+        colour = robot_color(model, body)
         (trail,) = axes.plot([], [], color=colour, lw=1.5, alpha=0.5, zorder=3)
         patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
         robots.append((body, patch, trail, []))

@@ -1,4 +1,4 @@
-"""Training and evaluation environment of the walk policy: one robot that follows commands.
+"""Training and evaluation environment of the walk policy: one robot that tracks commands.
 
 Slopes are rotations of gravity: a robot on an infinite slope of angle t behaves, in the frame of the slope, as one on
 flat ground under gravity rotated by t. Each environment thus has its own slope without its own geometry. All positions
@@ -52,7 +52,7 @@ class WalkState:
     terminated: jax.Array
     """Whether the robot has fallen () bool."""
     truncated: jax.Array
-    """Whether the episode ended by the time limit () bool."""
+    """Whether the episode was truncated at the time limit () bool."""
     metrics: dict[str, jax.Array]
     """Reward terms and tracking errors, () each."""
     spec: EpisodeSpec
@@ -64,7 +64,7 @@ class WalkState:
     body: RandomizedBody
     """Randomised parameters of the robot."""
     memory: WalkMemory
-    """Gait phase and last actions; its history is empty."""
+    """Recurrent state of the walk policy: gait phase and last actions; the history is empty."""
     mean_error: jax.Array
     """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
     step: jax.Array
@@ -72,13 +72,13 @@ class WalkState:
     age: jax.Array
     """Steps since the reset () int32."""
     difficulty: jax.Array
-    """Curriculum level () in [0, 1], which scales slopes, forces and kicks."""
+    """Curriculum level () in [0, 1], which scales slopes, forces and pushes."""
     key: jax.Array
     """Random key."""
 
 
 class WalkEnv:
-    """One robot that follows commands on a slope under forces; batch with `jax.vmap`."""
+    """One robot that tracks commands on a slope under external forces; batch with `jax.vmap`."""
 
     def __init__(self, robot: Robot, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
         self.robot = robot
@@ -159,7 +159,7 @@ class WalkEnv:
     def step(self, state: WalkState, action: jax.Array) -> WalkState:
         """Advances by one policy step with an action (12,)."""
         task, index = self.task, self.index
-        key, kick_key, kick_time, kick_size, spec_key, noise_key = jax.random.split(state.key, 6)
+        key, direction_key, time_key, size_key, spec_key, noise_key = jax.random.split(state.key, 6)
         action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
         target = walk_policy.joint_targets(self.robot, action)
         previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
@@ -169,13 +169,13 @@ class WalkEnv:
         slope = state.slope + jnp.clip(state.spec.slope - state.slope, -0.02, 0.02)
         force = state.force + jnp.clip(state.spec.force - state.force, -2.0, 2.0)
         if task.command_period > 0:
-            kicked = jax.random.bernoulli(kick_time, DT / task.kick_period)
-            size = state.spec.kick * jax.random.uniform(kick_size, ())
+            pushed = jax.random.bernoulli(time_key, DT / task.push_period)
+            size = state.spec.push * jax.random.uniform(size_key, ())
         else:
-            kicked = (state.age + 1) % round(task.kick_period / DT) == 0
-            size = state.spec.kick
-        angle = jax.random.uniform(kick_key, (), maxval=2 * jnp.pi)
-        push = jnp.where(kicked, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+            pushed = (state.age + 1) % round(task.push_period / DT) == 0
+            size = state.spec.push
+        angle = jax.random.uniform(direction_key, (), maxval=2 * jnp.pi)
+        push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
 
         ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.body.motor_offset)
@@ -272,7 +272,7 @@ class WalkEnv:
         }
 
     def _forces(self, data: mjx.Data, body: RandomizedBody, slope: jax.Array, force: jax.Array) -> jax.Array:
-        """Returns external forces on all bodies (nbody, 6), N: gravity's change by the slope, force on the trunk."""
+        """Returns external forces on all bodies (nbody, 6), N: the slope's change of gravity, and the trunk force."""
         trunk = int(self.index.trunk_body[0])
         turn = gravity_w(slope) - jnp.array([0.0, 0.0, -GRAVITY])
         mass = jnp.asarray(self._mass, jnp.float32).at[trunk].add(body.payload)
@@ -343,7 +343,7 @@ class WalkEnv:
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:
-    """Returns gravity (3,), m/s^2, in the frame of a ground inclined by `slope` (2,), rad, along x and y."""
+    """Returns gravity (3,), m/s^2, in the frame of ground inclined by `slope` (2,), rad, along x and y."""
     angle = jnp.linalg.norm(slope + 1e-12)
     along = slope / jnp.maximum(angle, 1e-9)
     return GRAVITY * jnp.concatenate([-jnp.sin(angle) * along, -jnp.cos(angle)[None]])

@@ -1,4 +1,4 @@
-"""Evaluation of a walk policy: tracking, falls, kicks, slopes, forces, standing still and gait frequency."""
+"""Evaluation of a walk policy: tracking, falls, pushes, slopes, forces, standing still and gait frequency."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """Settings of one measurement."""
+    """Settings of one evaluation scenario."""
 
     duration: float = 20.0
     """Duration of an episode, s."""
@@ -36,7 +36,7 @@ class Scenario:
     """Inclination of the ground along x, rad."""
     force: tuple[float, float] = (0.0, 0.0)
     """Sustained force along and to the left of the heading, N."""
-    kick: float = 0.0
+    push: float = 0.0
     """Instantaneous change of velocity every 5 s, m/s."""
     meaning: str = ""
     """Description in one line."""
@@ -44,7 +44,7 @@ class Scenario:
 
 SCENARIOS = {
     "flat": Scenario(meaning="random commands on flat ground"),
-    "kicks": Scenario(kick=0.5, meaning="the same with kicks of 0.5 m/s every 5 s"),
+    "pushes": Scenario(push=0.5, meaning="the same with pushes of 0.5 m/s every 5 s"),
     "slope_up": Scenario(velocity=(1.0, 0.0, 0.0), slope=0.25, meaning="vx 1.0 up a slope of 0.25 rad"),
     "slope_down": Scenario(velocity=(1.0, 0.0, 0.0), slope=-0.25, meaning="vx 1.0 down a slope of 0.25 rad"),
     "stand": Scenario(duration=11.0, velocity=(0.0, 0.0, 0.0), meaning="zero command"),
@@ -63,7 +63,7 @@ SCENARIOS = {
 
 def make_env(robot: Robot, impl: str, episodes: int) -> WalkEnv:
     """Returns the evaluation environment: no randomisation, commands kept for the whole episode."""
-    task = WalkTask(randomize=False, command_period=0.0, kick_period=5.0, episode_length=1e6)
+    task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6)
     return WalkEnv(robot, task, impl=impl, num_envs=episodes)
 
 
@@ -79,14 +79,14 @@ def sample_specs(robot: Robot, scenario: Scenario, key: jax.Array, episodes: int
         commands=jnp.concatenate([velocity, full(rest)], axis=1),
         slope=full((scenario.slope, 0.0)),
         force=full(scenario.force),
-        kick=full(scenario.kick),
+        push=full(scenario.push),
     )
 
 
 def measure(
     env: WalkEnv, params: walk_policy.Params, scenario: Scenario, episodes: int, seed: int = 0
 ) -> dict[str, float]:
-    """Runs one scenario and returns its figures.
+    """Runs one scenario and returns its metrics.
 
     Returns:
         rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors after the first second, until a fall;
@@ -131,8 +131,8 @@ def measure(
         memory = jax.vmap(lambda _: walk_policy.initial_memory())(keys)
         return jax.lax.scan(advance, (state, memory), None, steps)[1]
 
-    asked = sample_specs(env.robot, scenario, spec_key, episodes)
-    squares, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), asked))
+    specs = sample_specs(env.robot, scenario, spec_key, episodes)
+    squares, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), specs))
     alive = ~np.logical_or.accumulate(fallen, axis=0)
     counted = alive.copy()
     counted[:warm] = False
@@ -172,10 +172,10 @@ def evaluate_walk(
     scenarios: Sequence[str] | None = None,
     report: Callable[[str, dict[str, float]], None] | None = None,
 ) -> dict[str, Any]:
-    """Measures a robot's walk policy in the named scenarios (all of `SCENARIOS` if None).
+    """Evaluates a robot's walk policy in the named scenarios (all of `SCENARIOS` if None).
 
     Returns:
-        the figures of `flat` at the top difficulty (rms_vx, rms_vy, rms_yaw, fall_rate) and all under `scenarios`.
+        rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under `scenarios`.
 
     Raises:
         InputError: for an unknown scenario, or episodes below 1.

@@ -1,4 +1,4 @@
-"""Rewards of the walk policy's training.
+"""Reward terms for training the walk policy.
 
 They follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238): positive terms times the exponential of the sum
 of the negative ones.
@@ -22,8 +22,8 @@ from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, r
 class WalkRewards:
     """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
 
-    `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground that happens at the knee, so it is
-    read from the knee's height (`WalkSettings.min_knee_height`), which avoids contact sensors.
+    `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground the knee touches first, so contact
+    is inferred from the knee's height (`WalkSettings.min_knee_height`) without sensors.
     """
 
     track_velocity: float = 0.6

@@ -1,4 +1,4 @@
-"""The walking task: its parameters, and what is sampled for one episode."""
+"""Parameters of the walking task, and their sampling."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ class WalkTask:
     command_period: float = 8.0
     """Interval at which commands, slope and force are resampled, s; 0 never resamples."""
     max_vx: float = 1.2
-    """Largest commanded forward velocity, m/s."""
+    """Maximum commanded forward velocity, m/s."""
     max_vy: float = 0.7
-    """Largest commanded lateral velocity, m/s."""
+    """Maximum commanded lateral velocity, m/s."""
     max_yaw: float = 1.2
-    """Largest commanded yaw rate, rad/s."""
+    """Maximum commanded yaw rate, rad/s."""
     slope: float = 0.32
     """Maximum slope, rad."""
     force: float = 40.0
     """Maximum sustained horizontal force on the trunk, N."""
-    kick: float = 0.9
+    push: float = 0.9
     """Maximum instantaneous change of the trunk's velocity, m/s."""
-    kick_period: float = 4.0
-    """Mean time between kicks, s."""
+    push_period: float = 4.0
+    """Mean time between pushes, s."""
     randomize: bool = True
     """Whether friction, payload, centre of mass, motors and observations are randomised."""
     solver_iterations: int = 4
@@ -54,8 +54,8 @@ class EpisodeSpec:
     """Inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x."""
     force: jax.Array
     """Sustained force on the trunk (2,), N, along its heading and to its left, horizontal."""
-    kick: jax.Array
-    """Instantaneous change of the trunk's velocity at each kick (), m/s."""
+    push: jax.Array
+    """Instantaneous change of the trunk's velocity at each push (), m/s."""
 
 
 @jax.tree_util.register_dataclass
@@ -64,9 +64,9 @@ class RandomizedBody:
     """Randomised physical parameters of one environment's robot."""
 
     friction: jax.Array
-    """Sliding friction of its shapes ()."""
+    """Sliding friction of its collision geoms ()."""
     payload: jax.Array
-    """Extra mass of the trunk (), kg."""
+    """Additional mass of the trunk (), kg."""
     com: jax.Array
     """Shift of the trunk's centre of mass (3,), m."""
     strength: jax.Array
@@ -76,7 +76,7 @@ class RandomizedBody:
 
 
 def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Array) -> EpisodeSpec:
-    """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and kicks."""
+    """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and pushes."""
     keys = iter(jax.random.split(key, 24))
     uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
     chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
@@ -115,12 +115,12 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
         commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
         slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
         force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
-        kick=task.kick * difficulty,
+        push=task.push * difficulty,
     )
 
 
 def sample_body(key: jax.Array, task: WalkTask) -> RandomizedBody:
-    """Samples the robot's parameters; the nominal ones without randomisation."""
+    """Samples the robot's physical parameters; nominal values without randomisation."""
     if not task.randomize:
         one, zero = jnp.ones(()), jnp.zeros(())
         return RandomizedBody(one, zero, jnp.zeros(3), one, jnp.zeros(NUM_JOINTS))

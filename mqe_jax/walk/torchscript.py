@@ -1,4 +1,4 @@
-"""Reads the weights of a TorchScript archive without torch and without running anything in it.
+"""Reads the weights of a TorchScript archive without torch and without executing code from it.
 
 The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw storages in
 `<name>/data/<key>`. The unpickler below supports only tensors and containers; every module class becomes a plain

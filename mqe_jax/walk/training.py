@@ -1,4 +1,4 @@
-"""Training of the walk policy: PPO with a 30-step history, as walk-these-ways does it (arXiv 2212.03238).
+"""Training of the walk policy: PPO with a 30-step history, as in walk-these-ways (arXiv 2212.03238).
 
 The rollout stores single observations (70 numbers); the 30-step windows (2100 numbers) are gathered for each minibatch,
 which saves a factor of 30 in memory. The adaptation network is trained by regression on the latent target; the policy
@@ -40,7 +40,7 @@ class WalkEnvironment(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class WalkConfig:
-    """Settings of the walk policy's training; defaults as in walk-these-ways where it has them."""
+    """Settings for training the walk policy; defaults as in walk-these-ways where available."""
 
     num_envs: int = 8192
     """Number of parallel environments."""
@@ -71,15 +71,15 @@ class WalkConfig:
     max_grad_norm: float = 1.0
     """Global gradient-norm clip."""
     initial_std: float = 1.0
-    """Standard deviation of the actions at the start."""
+    """Initial standard deviation of the actions."""
     curriculum: int = 400
-    """Iterations over which slopes, forces and kicks grow to their maxima."""
+    """Iterations over which slopes, forces and pushes are ramped to their maxima."""
     critic_warmup: int = 0
     """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
     anneal: float = 0.0
-    """Last fraction of the training over which learning rate and entropy bonus fall linearly to zero."""
+    """Final fraction of training over which learning rate and entropy bonus are annealed linearly to zero."""
     seed: int = 1
-    """Seed of all random numbers."""
+    """Random seed."""
 
 
 @jax.tree_util.register_dataclass
@@ -118,7 +118,7 @@ def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index:
 def init_learner(
     key: jax.Array, config: WalkConfig, privileged_size: int, policy: walk_policy.Params | None = None
 ) -> WalkLearner:
-    """Samples the initial weights; those of the policy are `policy` where given, for fine-tuning."""
+    """Samples the initial weights; those of the policy are `policy` if given, for fine-tuning."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     params = {
         "policy": walk_policy.init_params(policy_key) if policy is None else policy,
@@ -256,9 +256,9 @@ def make_iteration(
 
 
 def _to_checkpoint(learner: WalkLearner) -> dict[str, Any]:
-    """Returns what a checkpoint holds of a learner: 12 MB instead of 25.
+    """Returns the part of a learner that a checkpoint stores: 12 MB instead of 25.
 
-    Adam's second moments are kept as bfloat16 (bits in uint16), its first moments not at all: these restart from zero
+    Adam's second moments are stored as bfloat16 (bits in uint16), its first moments are omitted: they restart from zero
     and recover within about ten minibatches.
     """
     half = lambda x: jax.lax.bitcast_convert_type(x.astype(jnp.bfloat16), jnp.uint16)  # noqa: E731
@@ -273,7 +273,7 @@ def _to_checkpoint(learner: WalkLearner) -> dict[str, Any]:
 
 
 def _from_checkpoint(saved: dict[str, Any]) -> WalkLearner:
-    """Returns the learner that a checkpoint describes."""
+    """Restores a learner from a checkpoint's contents."""
     full = lambda x: jax.lax.bitcast_convert_type(x, jnp.bfloat16).astype(jnp.float32)  # noqa: E731
     params = saved["params"]
     optimizer = AdamState(
@@ -285,7 +285,7 @@ def _from_checkpoint(saved: dict[str, Any]) -> WalkLearner:
 
 
 def save(run_dir: Path, learner: WalkLearner, robot: Robot, config: WalkConfig) -> Path:
-    """Writes a checkpoint and walk.safetensors into a run's folder; returns the checkpoint's path."""
+    """Writes a checkpoint and walk.safetensors into a run folder; returns the checkpoint's path."""
     iteration = int(learner.iteration)
     about = {"robot": robot.name, "config": dataclasses.asdict(config), "iteration": iteration}
     walk_policy.save_params(learner.params["policy"], run_dir / "walk.safetensors", about)
@@ -293,7 +293,7 @@ def save(run_dir: Path, learner: WalkLearner, robot: Robot, config: WalkConfig) 
 
 
 def restore(run_dir: Path, learner: WalkLearner, robot: Robot) -> WalkLearner:
-    """Returns the learner of a run's newest checkpoint; `learner` itself where there is none.
+    """Returns the learner of a run's newest checkpoint; `learner` itself if there is none.
 
     Raises:
         InputError: if the checkpoint is damaged or of another robot.
@@ -324,7 +324,7 @@ def train_walk(
     Args:
         env: the walking environment.
         config: settings.
-        run_dir: folder of the run.
+        run_dir: run folder.
         resume: continue from the folder's newest checkpoint; the environments are reset.
         policy: weights to fine-tune; sampled if None.
         max_seconds: stop after this time, compilation included, after saving a checkpoint, s.

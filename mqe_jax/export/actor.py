@@ -1,4 +1,4 @@
-"""The acting part of the network `actor_critic` as ONNX nodes."""
+"""The actor of the network `actor_critic` as ONNX nodes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ _ACTIVATIONS = {"relu": "Relu", "elu": "Elu", "tanh": "Tanh"}
 
 
 def check_network(policy: Policy) -> ActorCritic:
-    """Returns the settings of the policy's network; InputError where it is not an exportable one."""
+    """Returns the settings of the policy's network; InputError if it cannot be exported."""
     settings = policy.config.network
     if not isinstance(settings, ActorCritic):
         raise InputError(f"network: {settings.name!r} cannot be exported to ONNX; allowed: 'actor_critic'")
     return settings
 
 
-def add_planner(graph: Graph, policy: Policy) -> str:
+def add_actor(graph: Graph, policy: Policy) -> str:
     """Adds inputs `obs` (N, A, O) and, with a recurrent network, `memory` (N, A, H); returns the action (N, A, D).
 
-    The action is the deterministic one, scaled and clipped to [-1, 1]; the next memory becomes `next_memory`.
+    The action is the deterministic one, scaled and clipped to [-1, 1]. `memory` is the recurrent state; the output
+    `next_memory` is its next value.
     """
     settings, dims = check_network(policy), policy.dims
     actor: Any = policy.params["actor"]
@@ -60,7 +61,7 @@ def _dense(graph: Graph, params: Any, x: str) -> str:
 
 
 def _gru(graph: Graph, params: Any, h: str, x: str) -> str:
-    """The gated recurrent unit of `train.nn.gru`, whose order of gates is reset, update, candidate."""
+    """The gated recurrent unit of `train.nn.gru`: gates in the order reset, update, candidate."""
     reset_x, update_x, candidate_x = graph.split_op("Split", 3, _dense(graph, params["input"], x), axis=-1)
     reset_h, update_h, candidate_h = graph.split_op("Split", 3, _dense(graph, params["hidden"], h), axis=-1)
     reset = graph.op("Sigmoid", graph.op("Add", reset_x, reset_h))
