@@ -227,28 +227,36 @@ class Controller:
         lag: jax.Array,
         fields: dict[str, jax.Array],
         xfrc_applied: jax.Array | None,
-    ) -> tuple[mjx.Data, ControlState]:
-        """Advances the physics by one environment step with targets (R, 12) delayed by `lag` () steps."""
+    ) -> tuple[mjx.Data, ControlState, jax.Array]:
+        """Advances the physics by one environment step with targets (R, 12) delayed by `lag` () steps.
+
+        Returns:
+            Physics state, control state, and whether any physics step may have dropped contacts () bool.
+        """
         delayed = jnp.concatenate([target[None], state.delayed[:-1]])
         target = delayed[lag] if self.lag else target
         state = dataclasses.replace(state, delayed=delayed)
         scatter = lambda values: jnp.zeros(self.physics.model.nu).at[self.index.actuator].set(values)  # noqa: E731
         params = self.actuator_params
         if params is None:
-            return self.physics.step(data, scatter(target), fields=fields, xfrc_applied=xfrc_applied), state
+            step = self.physics.step_with_overflow
+            data, overflow = step(data, scatter(target), fields=fields, xfrc_applied=xfrc_applied)
+            return data, state, overflow
 
         def substep(
             carry: tuple[mjx.Data, jax.Array, jax.Array], _: None
-        ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], None]:
+        ) -> tuple[tuple[mjx.Data, jax.Array, jax.Array], jax.Array]:
             data, errors, velocities = carry
             errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
             velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
             limit = self.robot.torque_limit
             torque = jnp.clip(actuator_torque(params, errors, velocities), -limit, limit)
-            data = self.physics.step(data, scatter(torque), fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
-            return (data, errors[:2], velocities[:2]), None
+            data, overflow = self.physics.step_with_overflow(
+                data, scatter(torque), fields=fields, xfrc_applied=xfrc_applied, num_substeps=1
+            )
+            return (data, errors[:2], velocities[:2]), overflow
 
-        (data, error, velocity), _ = jax.lax.scan(
+        (data, error, velocity), overflow = jax.lax.scan(
             substep, (data, state.error, state.velocity), None, self.physics.num_substeps
         )
-        return data, dataclasses.replace(state, error=error, velocity=velocity)
+        return data, dataclasses.replace(state, error=error, velocity=velocity), jnp.any(overflow)

@@ -176,26 +176,50 @@ class Physics:
             xfrc_applied: external forces and torques on the bodies (nbody, 6), N and N m, world frame.
             num_substeps: physics steps; `self.num_substeps` if None.
         """
+        options: Any = {"fields": fields, "xfrc_applied": xfrc_applied, "num_substeps": num_substeps}
+        return self.step_with_overflow(data, ctrl, **options)[0]
+
+    def step_with_overflow(
+        self,
+        data: mjx.Data,
+        ctrl: jax.Array,
+        *,
+        fields: Mapping[str, jax.Array] | None = None,
+        xfrc_applied: jax.Array | None = None,
+        num_substeps: int | None = None,
+    ) -> tuple[mjx.Data, jax.Array]:
+        """As `step`; also returns whether contacts or constraints may have been dropped in any physics step () bool.
+
+        On Warp the engine's own flags; on MJX-JAX whether the capped contact list is full. The C engine has no cap.
+        """
         substeps = self.num_substeps if num_substeps is None else num_substeps
         data = data.replace(ctrl=ctrl.astype(jnp.float32))
         if xfrc_applied is not None:
             data = data.replace(xfrc_applied=xfrc_applied.astype(jnp.float32))
         if self.impl == "c":
-            return self._engine.step(data, dict(fields or {}), xfrc_applied is not None, substeps)
+            return self._engine.step(data, dict(fields or {}), xfrc_applied is not None, substeps), jnp.zeros((), bool)
 
         model = self._mjx_model.replace(**fields) if fields else self._mjx_model
-        return jax.lax.scan(lambda state, _: (self._mjx_step(model, state), None), data, None, substeps)[0]
+
+        def substep(carry: tuple[mjx.Data, jax.Array], _: None) -> tuple[tuple[mjx.Data, jax.Array], None]:
+            data = self._mjx_step(model, self._without_flags(carry[0]))
+            return (data, carry[1] | self._overflow(data)), None
+
+        return jax.lax.scan(substep, (data, jnp.zeros((), bool)), None, substeps)[0]
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
         """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
         merged = {name: jnp.where(choose, getattr(first, name), getattr(second, name)) for name in STATE_FIELDS}
         return second.replace(**merged)
 
-    def overflow(self, data: mjx.Data) -> jax.Array:
-        """Returns whether contacts or constraints may have been dropped in the last physics step () bool.
+    def _without_flags(self, data: mjx.Data) -> mjx.Data:
+        """Clears Warp's overflow flags, to which the engine only adds."""
+        if self.impl != "warp":
+            return data
+        return data.replace(_impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow)))
 
-        On Warp the engine's own flags; on MJX-JAX whether the capped contact list is full. The C engine has no cap.
-        """
+    def _overflow(self, data: mjx.Data) -> jax.Array:
+        """Returns whether contacts or constraints may have been dropped in the last physics step () bool."""
         if self.impl == "warp":
             return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
         if self.impl == "jax":
@@ -216,7 +240,7 @@ _ITERATIONS = 1 << 9 | 1 << 10
 
 
 def _quiet(model: mjx.Model) -> mjx.Model:
-    """Disables Warp's printed warnings; `Physics.overflow` reports overflows."""
+    """Disables Warp's printed warnings; `Physics.step_with_overflow` reports overflows."""
     return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import math
 import os
 import pathlib
 from collections.abc import Mapping
@@ -76,6 +77,16 @@ COMMAND_SCALE = np.array([command.scale for command in COMMANDS], np.float32)
 
 # (phase, offset, bound) of the named gaits.
 GAITS = {"trot": (0.5, 0.0, 0.0), "pronk": (0.0, 0.0, 0.0), "bound": (0.0, 0.5, 0.0), "pace": (0.0, 0.0, 0.5)}
+
+
+def check_period(timestep: float, num_substeps: int) -> None:
+    """Checks that `num_substeps` physics steps of `timestep` (s) are one policy step; raises an InputError."""
+    period = timestep * num_substeps
+    if not math.isclose(period, STEP):
+        raise InputError(
+            f"Scene.timestep: {timestep} s x {num_substeps} substeps is {period:g} s; "
+            f"the walk policy's period is {STEP} s"
+        )
 
 
 def command_index(name: str) -> int:

@@ -68,6 +68,7 @@ class FakeEnv:
     num_agents, observation_size, privileged_observation_size, action_size = 2, 1, 2, 3
     teams = ((0, 1),)
     dt = 0.02
+    overflow_x = 1.21  # m; a step that ends with the first robot beyond it overflows
 
     def __init__(self) -> None:
         self.mj_model = mujoco.MjModel.from_xml_string(XML)
@@ -100,7 +101,7 @@ class FakeEnv:
             "average_step_reward": total,
             "success": jnp.all(obs > 1.2).astype(jnp.float32),
             "diverged": jnp.zeros(()),
-            "overflow": (qpos[0] > 1.21).astype(jnp.float32),
+            "overflow": (qpos[0] > self.overflow_x).astype(jnp.float32),
         }
         end = state.step >= 9
         reward = jnp.full(2, total)

@@ -38,6 +38,7 @@ class Probe:
     reward of the first team (N,), and its negative that of a second one, or each agent's own (N, A). Episodes of even
     environments end after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates`
     says whether that is a termination (with `even_truncate` only in odd environments). The shorter kind is a success.
+    Every step of an odd environment overflows.
     """
 
     show: Callable[[jax.Array, jax.Array], jax.Array]
@@ -89,6 +90,7 @@ class Probe:
                 "success": zero,
                 "team0/win": zero,
                 "diverged": zero,
+                "overflow": zero,
             },
             key=key,
             step=step,
@@ -128,6 +130,7 @@ class Probe:
                 "success": short.astype(jnp.float32),
                 "team0/win": short.astype(jnp.float32),
                 "diverged": jnp.zeros(done.shape),
+                "overflow": (jnp.arange(self.num_envs) % 2).astype(jnp.float32),
             },
             key=key,
             step=step,
@@ -153,6 +156,11 @@ def show_step_and_parity(hidden: jax.Array, step: jax.Array) -> jax.Array:
 def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Reward 1 for every action."""
     return jnp.ones_like(hidden)
+
+
+def pay_own_side(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Pays about 1, and more the nearer agent 0 is to -0.5 and the farther agent 1 is from 0.5: a match of agents."""
+    return 1.0 + jnp.square(action[:, 0, 0] + 0.5) - jnp.square(action[:, 1, 0] - 0.5)
 
 
 def pay_near_hidden(hidden: jax.Array, action: jax.Array) -> jax.Array:

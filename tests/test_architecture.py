@@ -39,3 +39,9 @@ def test_fields_are_documented_by_the_docstring_under_them() -> None:
     files = [*architecture.PACKAGE.rglob("*.py"), *(architecture.ROOT / "examples").glob("*.py")]
     assert len(files) > 80
     assert [path.name for path in files if "    Attributes:" in path.read_text(encoding="utf-8")] == []
+
+
+def test_the_soak_is_asked_for_in_one_place() -> None:
+    """Only tests/conftest.py reads MQE_SOAK; a test that should be longer in the soak is a parameter marked `soak`."""
+    files = [path for path in Path(__file__).parent.glob("*.py") if path != Path(__file__)]
+    assert [path.name for path in files if "MQE_SOAK" in path.read_text(encoding="utf-8")] == ["conftest.py"]

@@ -6,12 +6,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax
 import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import cli
 from mqe_jax.cli import arguments, commands, setup
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.replay import load_recording
+from mqe_jax.errors import NonFiniteError
+from mqe_jax.train import checkpoint
+from mqe_jax.train.nn import mlp_init
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 
@@ -75,6 +80,8 @@ def test_every_training_setting_has_a_flag_with_its_meaning(capfd: pytest.Captur
 def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
     names = {path.name for path in run_folder.iterdir()}
     assert {"config.yaml", "metrics.csv", "curve.png", "policy.safetensors", "checkpoints"} <= names
+    columns = (run_folder / "metrics.csv").read_text().splitlines()[0].split(",")
+    assert {"overflow", "diverged", "episode_return"} <= set(columns)
 
 
 def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -123,7 +130,35 @@ def test_a_divergence_is_recorded_and_replayed(
     assert clip.stat().st_size > 500
 
 
-def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_divergence_in_training_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)  # in the second step
+    (tmp_path / "small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
+    command = [
+        "train",
+        "go1plane",
+        "--impl",
+        "c",
+        "--control",
+        "position",
+        "--run-dir",
+        "run",
+        "--config",
+        "small.yaml",
+    ]
+    command += ["--num-envs", "2", "--rollout-steps", "2", "--total-steps", "4", "--ppo.minibatches", "1"]
+    assert cli.main([*command, "--set", "num_agents=1", "--dump-diverged", "dump"]) == 0
+    assert "recorded 2 divergences" in capfd.readouterr().err
+    for file in ("diverged_0000.npz", "diverged_0001.npz"):
+        recording = load_recording(tmp_path / "dump" / file)
+        assert recording.task == "go1plane" and recording.states["step"].tolist() == [0, 1]
+
+
+def test_bench_prints_its_figures_and_appends_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(FakeEnv, "overflow_x", -100.0)
     table = tmp_path / "speed.csv"
     result: dict[str, Any] = {}
     for _ in range(2):
@@ -131,7 +166,7 @@ def test_bench_prints_its_figures_and_appends_them(tmp_path: Path, capfd: pytest
         assert cli.main(arguments) == 0
         result = json.loads(capfd.readouterr().out)
     figures = ["task", "impl", "num_envs", "env_steps_per_s", "bare_env_steps_per_s", "ratio", "compile_s"]
-    assert list(result)[:7] == figures and result["overflow"] >= 0
+    assert list(result)[:7] == figures and result["overflow"] == 2 * 3  # every step of both environments
     assert len(table.read_text().splitlines()) == 3
 
 
@@ -199,6 +234,20 @@ def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: py
     (broken / "policy.safetensors").write_bytes((run_folder / "policy.safetensors").read_bytes()[:200])
     assert cli.main(["eval", str(broken)]) == 2
     assert "policy.safetensors" in capfd.readouterr().err
+    arrays, metadata = checkpoint._read(run_folder / "policy.safetensors", "policy")
+    arrays[next(name for name in arrays if name.endswith("weight"))][0] = float("nan")
+    checkpoint.save_tree(broken / "policy.safetensors", arrays, metadata, kind="policy")
+    assert cli.main(["eval", str(broken)]) == 2
+    assert "holds NaN" in capfd.readouterr().err
+
+
+def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+    def stop(*arguments: Any, **named: Any) -> None:
+        raise NonFiniteError("run: update 3 made loss/value NaN or infinite")
+
+    monkeypatch.setattr(commands.runner, "train_seeds", stop)
+    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 1
+    assert capfd.readouterr().err.splitlines()[-1] == "mqe: run: update 3 made loss/value NaN or infinite"
 
 
 def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
@@ -210,13 +259,19 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any)
     assert "Traceback" not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("error", [ValueError("a defect in our own code"), KeyError("x"), ZeroDivisionError()])
-def test_defects_keep_their_traceback(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    def wrong(num_envs: int) -> None:
-        raise error
-
-    monkeypatch.setattr(commands, "make_env", lambda *arguments: wrong(1))
-    with pytest.raises(type(error)):
+@pytest.mark.parametrize(
+    ("defect", "error"),
+    [
+        (lambda: mlp_init(jax.random.PRNGKey(0), [2]), ValueError),
+        (lambda: {}["x"], KeyError),
+        (lambda: 1 // 0, Exception),
+    ],
+    ids=["our own", "KeyError", "ZeroDivisionError"],
+)
+def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also a ValueError that code of the package raises, unless it is an InputError."""
+    monkeypatch.setattr(commands, "make_env", lambda *arguments: defect())
+    with pytest.raises(error):
         cli.main(["bench", "fake"])
 
 

@@ -1,11 +1,116 @@
-"""Scenes with distinct geoms agree on MuJoCo's C engine and MJX; `python -m tests.engines` compares all tasks."""
+"""Scenes agree on MuJoCo's C engine and MJX-JAX: every kind of object on one scene, and in the soak all tasks.
+
+`python -m tests.engines` compares all engines.
+"""
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
 import pytest
 
 from mqe_jax.envs import TASKS
+from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
+from mqe_jax.physics import Physics
+from mqe_jax.robots import read_robots
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax.terrain import Gate, SpawnArea, Track
 from tests import engines
+
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a single step
+# Far apart, so that only the first robot touches them; the second one stands at x = 1.
+OBJECTS = (
+    Box("box"),
+    Ball("ball"),
+    Sheep("sheep"),
+    Cylinder("cylinder", position=(40.0, 0.0)),
+    Door("door", position=(50.0, 0.0)),
+    Seesaw("seesaw", hinge=(60.0, 0.0, 0.545)),
+    Platform("platform", center=(70.0, 0.0, 0.3)),
+)
+PLACES = {"box": (10.0, 0.0, 0.5), "ball": (20.0, 0.0, 0.1), "sheep": (30.0, 0.0)}
+# What the robot meets, by the start of the geom's name: start of its trunk (x, y, z), and where it moves at 0.5 m/s.
+AHEAD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+MEETINGS = {
+    "floor": ((4.0, 0.0, 0.5), DOWN),
+    "robot1/": ((0.2, 0.1, 0.33), AHEAD),
+    "wall/": ((2.3, 0.8, 0.33), AHEAD),
+    "object/box": ((9.0, 0.1, 0.33), AHEAD),
+    "object/ball": ((19.3, 0.1, 0.33), AHEAD),
+    "object/sheep": ((29.2, 0.1, 0.33), AHEAD),
+    "object/cylinder": ((38.2, 0.1, 0.33), AHEAD),
+    "object/door": ((49.4, 0.6, 0.33), AHEAD),
+    "object/seesaw": ((61.0, 0.1, 1.1), DOWN),
+    "object/platform": ((70.0, 0.1, 0.8), DOWN),
+}
+
+
+def met(scene: CompiledScene, name: str) -> mujoco.MjData:
+    """The state in which the first robot, upside down over the floor, overlaps a geom by about 2 mm."""
+    model, index, data = scene.model, scene.index, mujoco.MjData(scene.model)
+    data.mocap_pos[:] = scene.wall_positions(jnp.asarray(scene.anchor_mean))
+    data.qpos[index.joint_qpos] = data.ctrl[index.actuator] = GO1.default_joints
+    for item, place in PLACES.items():
+        data.qpos[scene.objects[item].qpos[: len(place)]] = place
+    data.qpos[index.base_qpos[1, :3]] = [1.0, 0.0, GO1.stand_height]
+    if name == "floor":
+        data.qpos[index.base_qpos[0, 3:]] = [0.0, 1.0, 0.0, 0.0]
+    start, direction = (np.array(part) for part in MEETINGS[name])
+    for way in np.arange(0.0, 1.0, 1e-3):
+        data.qpos[index.base_qpos[0, :3]] = start + way * direction
+        mujoco.mj_forward(model, data)
+        if min((*data.contact.dist[touching(model, data, name)], 1.0)) < -2e-3:
+            break
+    data.qvel[index.base_qvel[0, :3]] = 0.5 * direction
+    return data
+
+
+def touching(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> list[int]:
+    """The contacts between the first robot and the geoms whose names begin with `name`."""
+    pairs = [[model.geom(geom).name for geom in pair] for pair in data.contact.geom]
+    return [
+        number
+        for number, pair in enumerate(pairs)
+        if any(one.startswith("robot0/") and two.startswith(name) for one, two in (pair, pair[::-1]))
+    ]
+
+
+def test_a_robot_meets_everything_alike_on_two_engines() -> None:
+    """The same forces on the trunk at first, and the same movement of all after one environment step."""
+    track = Track((SpawnArea(2.0), Gate(length=2.0, width=0.6)), walled=False)
+    scene = compile_scene(Scene(track, num_robots=2, objects=OBJECTS, max_contacts=64))
+    starts = [met(scene, name) for name in MEETINGS]
+    for name, data in zip(MEETINGS, starts, strict=True):
+        assert touching(scene.model, data, name), f"nothing touches {name}"
+    qpos, qvel, mocap_pos, ctrl = (
+        jnp.asarray(np.stack([getattr(data, field) for data in starts]))
+        for field in ("qpos", "qvel", "mocap_pos", "ctrl")
+    )
+    force, states = {}, {}
+    for impl in ("c", "jax"):
+        physics = Physics(scene.model, impl=impl, num_substeps=1)
+        state = jax.vmap(physics.init)(qpos, qvel, mocap_pos, ctrl)
+        step = jax.jit(jax.vmap(lambda data, physics=physics: physics.step_with_overflow(data, data.ctrl)))
+        step = step.lower(state).compile(compiler_options=QUICK)
+        for substep in range(4):
+            state, overflow = step(state)
+            assert not np.asarray(overflow).any()
+            if substep == 0:
+                read = jax.vmap(lambda data: read_robots(scene.index, data.qpos, data.qvel, data.sensordata))
+                force[impl] = np.asarray(read(state).trunk_force)
+        states[impl] = state
+    for number, name in enumerate(MEETINGS):
+        for field, atol in (("qpos", 1e-3), ("qvel", 0.03)):
+            c, other = (np.asarray(getattr(states[impl], field)[number]) for impl in ("c", "jax"))
+            np.testing.assert_allclose(other, c, rtol=0.0, atol=atol, err_msg=f"{name}: {field}")
+    np.testing.assert_allclose(force["jax"], force["c"], rtol=0.01, atol=1.0)
+    meets = list(MEETINGS)
+    for name in ("floor", "robot1/", "wall/", "object/box", "object/sheep", "object/cylinder", "object/door"):
+        assert force["c"][meets.index(name), 0] > 100.0, f"{name}: not felt by the trunk"
+    assert np.abs(states["c"].qvel[meets.index("object/ball"), scene.objects["ball"].qvel[:2]]).max() > 0.05
 
 
 @pytest.mark.soak

@@ -82,7 +82,6 @@ def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
     ("impl", "num_envs", "steps"),
     [
         ("c", 8, 60),
-        ("jax", 2, 20),
         pytest.param("warp", 8, 60, marks=NEEDS_GPU),
         *(pytest.param(impl, 64, 2000, marks=pytest.mark.soak) for impl in ("c", "jax")),
         pytest.param("warp", 64, 2000, marks=[NEEDS_GPU, pytest.mark.soak]),
@@ -97,19 +96,22 @@ def test_random_actions_break_nothing(impl: str, num_envs: int, steps: int) -> N
         action = jax.random.uniform(key, (num_envs, 2, 12), minval=-1.0, maxval=1.0)
         state = vector.step(state, action)
         position = state.data.qpos[:, env.index.base_qpos[:, :3]]
-        overflow = jnp.any(jax.vmap(vector.env.physics.overflow)(state.data))
-        return state, (position, state.metrics["diverged"], jnp.all(jnp.isfinite(state.obs)), overflow)
+        counted = (state.metrics["diverged"], state.metrics["overflow"])
+        return state, (position, jnp.all(jnp.isfinite(state.obs)), *counted)
 
     run = jax.jit(lambda state, keys: jax.lax.scan(advance, state, keys))
     state = jax.jit(vector.reset)(jax.random.PRNGKey(0))
-    state, (position, diverged, finite, overflow) = run(state, jax.random.split(jax.random.PRNGKey(1), steps))
+    state, (position, finite, diverged, overflow) = run(state, jax.random.split(jax.random.PRNGKey(1), steps))
     assert bool(jnp.all(finite)) and float(jnp.sum(diverged)) == 0
-    assert not bool(jnp.any(overflow))
+    assert float(jnp.sum(overflow)) == 0
     x, y, z = np.moveaxis(np.asarray(position), -1, 0)
     assert np.all((x > 0.0) & (x < 6.0)) and np.all(np.abs(y) < 1.5) and np.all(z > 0.02)
 
 
-@pytest.mark.parametrize("impl", IMPLS)
+# On MJX-JAX tests/test_engines.py compares the forces with those of the C engine.
+@pytest.mark.parametrize(
+    "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=NEEDS_GPU)]
+)
 def test_trunk_force_is_read(impl: str) -> None:
     """Contact forces on two overlapping robots, and on a trunk that lies on the ground."""
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)

@@ -92,10 +92,11 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     assert float(metrics["episode_length"]) == 4.0
 
 
-def test_joint_values_of_a_match_are_per_team() -> None:
-    """In a zero-sum match the values of the two teams are opposite; averaged over both they would be 0."""
-    env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, teams=((1,), (0,)))
-    config = small(ppo={"ratio": "joint", "value": "joint", "gamma": 0.5}, network__critic_input="observations")
+@pytest.mark.parametrize("ratio", ["joint", "agent"])
+def test_joint_values_and_ratios_of_a_match_are_per_team(ratio: str) -> None:
+    """In a zero-sum match the values of the teams are opposite and both learn; averaged over both all would be 0."""
+    env = Probe(probes.show_step_and_parity, probes.pay_own_side, num_envs=32, features=5, teams=((1,), (0,)))
+    config = small(ppo={"ratio": ratio, "value": "joint", "gamma": 0.5}, network__critic_input="observations")
     state, metrics = learn(env, config, 40)
     network = make_learner(env, config).network
     obs = state.rollout.env_state.obs[None]
@@ -103,7 +104,9 @@ def test_joint_values_of_a_match_are_per_team() -> None:
     value = value_denormalize(state.value_normalizer, value)[0]
     assert value.shape == (32, 2)
     assert float(value[:, 0].min()) > 0.5 and float(value[:, 1].max()) < -0.5
-    assert np.isfinite(float(metrics["loss/policy"]))
+    assert float(metrics["episode_return"]) > 2.0  # of the first team, 4 steps of about 1
+    mean, _, _ = network.act(network.acting(state.params), (), obs[0], None)
+    assert float(jnp.mean(mean[:, 0])) < -0.3 and float(jnp.mean(mean[:, 1])) > 0.3
 
 
 def test_memory_carries_a_sign_through_an_episode() -> None:
@@ -171,6 +174,7 @@ def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) 
     assert float(metrics["team0/win"]) == pytest.approx(2 / 3)
     assert float(metrics["episode_return"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
     assert float(metrics["episode_length"]) == pytest.approx((8 * 2 + 4 * 4) / 12)
+    assert float(metrics["overflow"]) == 2 * 8  # a count, of all steps
 
 
 def test_settings_must_fit_the_environment() -> None:

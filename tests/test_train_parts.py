@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from mqe_jax.train import loss, nn
+from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.advantage import gae
+from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import (
     running_init,
     running_normalize,
@@ -181,3 +183,24 @@ def test_a_bounded_parameter_comes_back_from_beyond_its_bounds() -> None:
     np.testing.assert_allclose(nn.bounded(x, -1.5, 1.5), [-1.5, -1.0, 0.0, 1.0, 1.5])
     np.testing.assert_allclose(slope(1.0), [0, 1, 1, 1, 1])  # descent lowers x: back from above, never farther down
     np.testing.assert_allclose(slope(-1.0), [-1, -1, -1, -1, 0])
+
+
+def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
+    settings = ActorCritic(
+        recurrent=False, hidden_sizes=(4,), log_std_init=-2.0, log_std_max=-1.0, log_std_min=-3.0, critic_input="own"
+    )
+    dims = EnvDims(agents=1, observation=2, privileged=0, action=3, teams=((0,),), values=1)
+    network = settings.build(dims)
+    params = network.init(KEY)
+    obs, first, action = jnp.zeros((1, 1, 1, 2)), jnp.zeros((1, 1), bool), jnp.zeros((1, 1, 1, 3))
+
+    def entropy(log_std: jax.Array) -> jax.Array:
+        now = network.evaluate(
+            {**params, "log_std": log_std}, network.initial_memory(1), first, obs, obs[:, :, 0], action
+        )
+        return jnp.sum(now.entropy)
+
+    beyond = jnp.array([0.0, -2.0, -4.0])
+    assert float(entropy(beyond)) == pytest.approx(3 * 0.5 * math.log(2 * math.pi * math.e) - 1 - 2 - 3, rel=1e-5)
+    np.testing.assert_array_equal(jax.grad(entropy)(beyond), [1.0, 1.0, 0.0])
+    np.testing.assert_array_equal(jax.grad(lambda x: -entropy(x))(beyond), [0.0, -1.0, -1.0])

@@ -247,6 +247,8 @@ def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
     train(PROBE, settings(), tmp_path, recorder=training)
     assert len(training.all) == 5 and training.all[0].snapshot.shape == (4, 4)
     assert training.all[0].action.shape == (4, 4, 2, 1) and training.all[0].diverged.shape == (4, 4)
+    # The environment gets unbounded samples, which it clips to what it allows.
+    assert max(float(np.abs(trace.action).max()) for trace in training.all) > 1.0
     evaluate(
         PROBE, load_policy(tmp_path).act, 4, KEY, memory=load_policy(tmp_path).initial_memory(4), recorder=evaluation
     )
@@ -322,7 +324,14 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     """Short episodes (2 steps, successes) are not over-represented against long ones (30 steps)."""
-    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30)
+    env = Probe(
+        probes.show_hidden,
+        probes.pay_one,
+        num_envs=4,
+        max_episode_steps=2,
+        odd_episode_steps=30,
+        teams=((1,), (0,)),
+    )
 
     def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         return jnp.zeros((4, 2, 1)), memory + 1
@@ -332,10 +341,10 @@ def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     assert result.episodes == 10
     assert result.success_rate == pytest.approx(5 / 10)
     assert result.episode_length == pytest.approx((5 * 2 + 5 * 30) / 10)
-    assert result.episode_return == pytest.approx((5 * 2 + 5 * 30) / 10)  # 1 a step
+    assert result.episode_return == pytest.approx((5 * 2 + 5 * 30) / 10)  # 1 a step for the first team
     assert result.average_step_reward == pytest.approx(1.0)
     assert result.terms == {"pay": pytest.approx(1.0)}
-    assert result.to_dict()["diverged"] == 0
+    assert result.to_dict()["diverged"] == 0 and result.overflow == 5 * 30
     with pytest.raises(ValueError, match="episodes: 0"):
         evaluate(env, act, 0, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import pathlib
 import pickle
@@ -17,6 +18,7 @@ import pytest
 from mqe_jax import control, robots, walk_policy
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
+from mqe_jax.scene import Scene
 from mqe_jax.walk import convert, training
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
@@ -312,3 +314,9 @@ def test_actuator_network_computes_softsign_layers() -> None:
     expected = (x @ flat["4.weight"].T + flat["4.bias"])[:, 0]
     found = jax.jit(control.actuator_torque)(params, jnp.asarray(error), jnp.asarray(velocity))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_physics_step_that_does_not_fit_the_policy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mqe_jax.walk.env.Scene", functools.partial(Scene, timestep=0.004))
+    with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
+        WalkEnv(GO1, impl="c")

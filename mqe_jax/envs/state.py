@@ -37,7 +37,7 @@ class State:
     """Whether the episode was truncated at the time limit () bool."""
     metrics: dict[str, jax.Array]
     """`reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the physics
-    engine dropped contacts or constraints in this step) and the task's own, () each.
+    engine may have dropped contacts or constraints in any physics step of this step) and the task's own, () each.
     """
     step: jax.Array
     """Environment steps since the reset () int32."""

@@ -94,6 +94,7 @@ class WalkEnv:
         self.physics = Physics(
             self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=16, max_constraints_per_env=80
         )
+        walk_policy.check_period(scene.timestep, self.physics.num_substeps)
         self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)
 
