@@ -84,7 +84,7 @@ def _pack(package: Package, archive: Path) -> None:
     wanted = f"{package.name}@{package.version}"
     archive.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=archive.parent) as temporary:
-        command = [npm, "pack", "--silent", "--pack-destination", temporary, wanted]
+        command = [npm, "pack", "--loglevel=error", "--fetch-retries=0", "--pack-destination", temporary, wanted]
         try:
             done = subprocess.run(command, cwd=temporary, capture_output=True, text=True, timeout=300)
         except subprocess.TimeoutExpired:
