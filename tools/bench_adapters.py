@@ -108,17 +108,34 @@ def jaxmarl_rollout(env: Any, actions: np.ndarray) -> Block:
 
 
 def measure(ways: dict[str, Block], pairs: int, steps: int) -> list[dict[str, Any]]:
-    """Times every way in turn, after a first block that compiles it; returns rows of `way`, `pair`, `ms_per_step`."""
+    """Times every way in turn, after a first block that compiles it; returns rows of `way`, `pair` and two times.
+
+    `ms_per_step` is wall time, `cpu_ms_per_step` this process's time on all cores, which other programs disturb less.
+    """
     for block in ways.values():
         block()
     rows: list[dict[str, Any]] = []
     for pair in range(pairs):
         for name, block in ways.items():
-            began = time.perf_counter()
+            began, cpu_began = time.perf_counter(), time.process_time()
             block()
-            milliseconds = 1e3 * (time.perf_counter() - began) / steps
-            rows.append({"way": name, "pair": pair, "ms_per_step": round(milliseconds, 4)})
+            wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
+            row = {"ms_per_step": round(1e3 * wall / steps, 4), "cpu_ms_per_step": round(1e3 * cpu / steps, 4)}
+            rows.append({"way": name, "pair": pair, **row})
     return rows
+
+
+def summary(rows: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
+    """Returns each way's median time and its ratio to `direct` within pairs: median, lowest and highest."""
+    times: dict[str, list[float]] = {}
+    for row in rows:
+        times.setdefault(row["way"], []).append(row[kind])
+    found = {}
+    for name, values in times.items():
+        ratios = [value / base for value, base in zip(values, times["direct"], strict=True)]
+        spread = [round(min(ratios), 4), round(max(ratios), 4)]
+        found[name] = {"median": median(values), "ratio": round(median(ratios), 4), "ratio_range": spread}
+    return found
 
 
 def main() -> int:
@@ -155,8 +172,6 @@ def main() -> int:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-    times = {name: [row["ms_per_step"] for row in rows if row["way"] == name] for name in ways}
-    ratios = {name: [a / b for a, b in zip(found, times["direct"], strict=True)] for name, found in times.items()}
     result = {
         "task": arguments.task,
         "impl": env.impl,
@@ -166,9 +181,7 @@ def main() -> int:
         "pairs": arguments.pairs,
         "rollout": arguments.rollout,
         "load_average": round(os.getloadavg()[0], 2),
-        "ms_per_step": {name: median(found) for name, found in times.items()},
-        "ratio": {name: round(median(found), 4) for name, found in ratios.items()},
-        "ratio_range": {name: [round(min(found), 4), round(max(found), 4)] for name, found in ratios.items()},
+        **{kind: summary(rows, kind) for kind in ("ms_per_step", "cpu_ms_per_step")},
     }
     text = json.dumps(result)
     print(text)
