@@ -13,7 +13,7 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 pytho
 TEST_JOBS ?= 2
 SOURCES := $(wildcard mqe_jax tests examples tools)
 
-.PHONY: help install demo test soak docs check fmt clean system browser
+.PHONY: help install demo test soak docs check fmt clean system browser npm
 
 help: ## List the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -36,14 +36,18 @@ system: ## Install the GL libraries for rendering, where possible
 browser: ## Install Debian's Chromium for the test of `mqe view`, where possible
 	@bash tools/install_chromium.sh
 
+npm: ## Install Debian's npm for the libraries of the page docs/play, where possible
+	@bash tools/install_npm.sh
+
 demo: $(STAMP) system ## Train Narrow Gate on the CPU, evaluate before and after, write to runs/demo
 	JAX_PLATFORMS=cpu $(BIN)/mqe demo
 
 test: $(STAMP) ## Run the tests
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
 
-docs: $(STAMP) ## Build the documentation site into build/site
+docs: $(STAMP) npm ## Build the documentation site into build/site
 	NO_MKDOCS_2_WARNING=1 JAX_PLATFORMS=cpu $(BIN)/mkdocs build --strict --quiet
+	JAX_PLATFORMS=cpu $(BIN)/python tools/play.py build/site/play
 	@echo "docs: open build/site/index.html"
 
 soak: $(STAMP) ## Run the heavy tests too (about an hour)

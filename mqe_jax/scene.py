@@ -99,6 +99,12 @@ class CompiledScene:
 
 def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
     """Compiles a scene, with or without visual geoms."""
+    spec, layout = build_spec(scene, visual=visual)
+    return spec.compile(), layout
+
+
+def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
+    """Builds a scene's specification, with or without visual geoms."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = scene.timestep
@@ -135,7 +141,7 @@ def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
         spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
         spec.visual.quality.shadowsize = 4096
         spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
-    return spec.compile(), layout
+    return spec, layout
 
 
 def compile_scene(scene: Scene) -> CompiledScene:

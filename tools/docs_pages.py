@@ -48,6 +48,7 @@ REFERENCE = {
     "rendering": ("mqe_jax.viz.render", ()),
     "recording": ("mqe_jax.viz.recording", ()),
     "export": ("mqe_jax.export.policy", ()),
+    "export_scene": ("mqe_jax.export.scene", ()),
 }
 
 

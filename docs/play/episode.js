@@ -1,0 +1,134 @@
+// Episodes of a task in MuJoCo, driven by a policy exported by `mqe export` to ONNX.
+import { observe, outcome } from './gate.js';
+import { readRobots, turn } from './robots.js';
+
+/** A generator of numbers in [0, 1): 32-bit xorshift, started by an integer. */
+export function random(seed) {
+  let state = Math.imul(seed + 1, 0x9e3779b1) | 1;
+  return () => {
+    state ^= state << 13;
+    state ^= state >>> 17;
+    state ^= state << 5;
+    return (state >>> 0) / 2 ** 32;
+  };
+}
+
+/** An initial state sampled as `QuadrupedEnv.reset` does, from another generator. */
+export function sampleStart(settings, seed) {
+  const next = random(seed);
+  const around = (middle, width) => middle + width * (2 * next() - 1);
+  const { params, spawn } = settings;
+  const [low, high] = params.spawn_joint_scale;
+  const qpos = Float64Array.from(settings.qpos0);
+  const qvel = new Float64Array(settings.num_velocities);
+  const anchors = settings.anchors.mean.map((mean, i) => mean.map((x, j) => around(x, settings.anchors.spread[i][j])));
+  settings.robots.forEach((robot, number) => {
+    const [x, y, z, yaw] = spawn[number];
+    const place = [around(x, params.spawn_noise), around(y, params.spawn_noise), z];
+    [...place, ...turn(yaw)].forEach((value, i) => (qpos[robot.base_qpos[i]] = value));
+    robot.joint_qpos.forEach((address, i) => {
+      const angle = settings.default_joints[i] * (low + (high - low) * next());
+      qpos[address] = Math.max(settings.joint_lower[i], Math.min(settings.joint_upper[i], angle));
+    });
+    robot.base_qvel.forEach((address) => (qvel[address] = around(0, params.spawn_velocity)));
+  });
+  return { qpos, qvel, anchors };
+}
+
+/** MuJoCo's state of one environment. */
+export class Physics {
+  constructor(mujoco, xml, settings) {
+    this.mujoco = mujoco;
+    this.settings = settings;
+    this.model = mujoco.MjModel.from_xml_string(xml);
+    this.data = new mujoco.MjData(this.model);
+  }
+
+  /** Starts from a state; joint targets are neutral until the first step. */
+  reset({ qpos, qvel, anchors }) {
+    this.mujoco.mj_resetData(this.model, this.data);
+    this.data.qpos.set(qpos);
+    this.data.qvel.set(qvel);
+    const walls = this.settings.walls;
+    this.data.mocap_pos.set(
+      walls.flatMap(({ anchor, offset }) => offset.map((x, i) => x + (anchors[anchor][i] ?? 0))),
+    );
+  }
+
+  /** One environment step under joint targets (R x 12), rad; PD control runs inside MuJoCo. */
+  step(targets) {
+    this.settings.robots.forEach((robot, number) =>
+      robot.actuator.forEach((row, i) => (this.data.ctrl[row] = targets[12 * number + i])),
+    );
+    for (let i = 0; i < this.settings.substeps; i++) this.mujoco.mj_step(this.model, this.data);
+  }
+}
+
+/** A policy with its memory. */
+export class Policy {
+  constructor(ort, session, shapes) {
+    this.ort = ort;
+    this.session = session;
+    this.shapes = shapes;
+    this.reset();
+  }
+
+  /** Forgets: all memories become zero. */
+  reset() {
+    this.memory = {};
+    for (const [name, shape] of Object.entries(this.shapes.inputs)) {
+      if (`next_${name}` in this.shapes.outputs) this.memory[name] = this.tensor(name, []);
+    }
+  }
+
+  /** The outputs of one step by name, of the agents' inputs by name: arrays of numbers. */
+  async act(inputs) {
+    const feeds = { ...this.memory };
+    for (const [name, values] of Object.entries(inputs)) feeds[name] = this.tensor(name, values);
+    const outputs = await this.session.run(feeds);
+    for (const name of Object.keys(this.memory)) this.memory[name] = outputs[`next_${name}`];
+    return outputs;
+  }
+
+  tensor(name, values) {
+    const shape = [1, ...this.shapes.inputs[name].slice(1)];
+    const array = new Float32Array(shape.reduce((a, b) => a * b));
+    array.set(values);
+    return new this.ort.Tensor('float32', array, shape);
+  }
+}
+
+/** An episode: physics, policy and the task's rules. */
+export class Episode {
+  constructor(physics, policy) {
+    this.physics = physics;
+    this.policy = policy;
+    this.settings = physics.settings;
+  }
+
+  reset(seed) {
+    const start = sampleStart(this.settings, seed);
+    this.physics.reset(start);
+    this.policy.reset();
+    this.anchors = start.anchors;
+    this.steps = 0;
+    this.robots = readRobots(this.settings, this.physics.data);
+    this.result = null;
+  }
+
+  /** One environment step; `result` says how the episode ended, or null. */
+  async step() {
+    const all = (key) => this.robots.flatMap((robot) => robot[key]);
+    const outputs = await this.policy.act({
+      obs: observe(this.settings, this.robots, this.anchors).flat(),
+      gravity: all('gravity'),
+      joint_position: all('jointPosition'),
+      joint_velocity: all('jointVelocity'),
+    });
+    this.commands = outputs.commands.data;
+    this.physics.step(outputs.joint_target.data);
+    this.steps += 1;
+    this.robots = readRobots(this.settings, this.physics.data);
+    this.result = outcome(this.settings, this.robots, this.anchors, this.steps);
+  }
+}
