@@ -64,7 +64,7 @@ export class Physics {
   }
 }
 
-/** A policy with its memory. */
+/** A policy and its recurrent state. */
 export class Policy {
   constructor(ort, session, shapes) {
     this.ort = ort;
@@ -73,7 +73,7 @@ export class Policy {
     this.reset();
   }
 
-  /** Forgets: all memories become zero. */
+  /** Sets all recurrent states to zero. */
   reset() {
     this.memory = {};
     for (const [name, shape] of Object.entries(this.shapes.inputs)) {

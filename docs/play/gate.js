@@ -6,7 +6,7 @@ export function observe(settings, robots, anchors) {
   const blocks = (agent) => ({
     one_hot: agent === 0 ? [1, 0] : [0, 1],
     base: base[agent],
-    mate: base[1 - agent],
+    teammate: base[1 - agent],
     gate: anchors[0],
   });
   return robots.map((_, agent) => {
