@@ -460,16 +460,22 @@ def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
         assert np.abs(after[number] - qvel[1]).max() > 0.01
 
 
-def test_a_step_that_fills_the_contact_buffer_is_counted() -> None:
-    """Two contacts per environment on MJX-JAX: four feet on the ground, in the air, on the ground at first only."""
-    env = make(
-        "go1plane", impl="jax", control="position", num_envs=3, num_agents=1, contacts_per_robot=2, contacts="minimal"
-    )
+@pytest.mark.parametrize(
+    ("impl", "limit"),
+    [("jax", {"contacts_per_robot": 2}), pytest.param("warp", {"constraints_per_robot": 8}, marks=pytest.mark.gpu)],
+)
+def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
+    """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
+    env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
     stand = np.array([[1.0, 0.0, 0.30]])
     starts = placed(env, stand), placed(env, stand + np.array([0, 0, 1])), moving(env, placed(env, stand), [0, 0, 3])
     start = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
     step = jax.jit(jax.vmap(env.step)).lower(start, jnp.zeros((3, 1, 12))).compile(compiler_options=QUICK)
-    assert step(start, jnp.zeros((3, 1, 12))).metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
+    after = step(start, jnp.zeros((3, 1, 12)))
+    assert after.metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
+    lifted = after.data.qpos.at[:, env.index.base_qpos[0, 2]].add(1.0)
+    after = step(dataclasses.replace(after, data=after.data.replace(qpos=lifted)), jnp.zeros((3, 1, 12)))
+    assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
 
 
 def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
