@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.files import locked, write_atomically
+from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import fail, to_mapping
 from mqe_jax.train.checkpoint import (
     checkpoint_step,
@@ -96,10 +96,11 @@ def train_seeds(
     folders = [Path(run_dir) for run_dir in run_dirs]
     learner = make_learner(env, configs[0], None if recorder is None else recorder.snapshot)
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
-    newest = [prepare_folder(folder, resume, run_files) for folder in folders]
     with contextlib.ExitStack() as locks:
         for folder in folders:
+            check_folder(folder)
             locks.enter_context(locked(folder))
+        newest = [prepare_folder(folder, resume, run_files) for folder in folders]
         checkpoints = newest if len(folders) == 1 else _common_checkpoints(folders)
         return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update)
 
