@@ -14,6 +14,7 @@ _GOAL = jnp.array([12.0, 0.0])  # m
 _FLANK = (10.0, 1.5)
 _INNER_AIMS = jnp.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]])  # m, points in the goal further from the posts
 _TURN_IN = 9.4  # m, x of the ball from which it is pushed towards the goal
+_BOTH = 11.2  # m, x of the ball from which both robots attack: a first attack that failed leaves it at the goal line
 _LEAD = 0.3  # s, over which the ball's motion is predicted
 _KEEP_BACK = 2.0  # m, distance behind the ball of the supporting robot, which stays on the centre line
 
@@ -36,7 +37,7 @@ def plan_defender(obs: Observation) -> jax.Array:
     def play(own: jax.Array, teammate: jax.Array) -> jax.Array:
         attack, way = _attack(own, opponents, ball, velocity, aims)
         nearer = jnp.linalg.norm(own[:2] - start) < jnp.linalg.norm(teammate[:2] - start)
-        return _walk(own, jnp.where(nearer, attack, support), way)
+        return _walk(own, jnp.where(nearer | (ball[0] > _BOTH), attack, support), way)
 
     return jax.vmap(play)(obs["base"], obs["teammate"])
 
