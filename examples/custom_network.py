@@ -55,10 +55,10 @@ class MeanField(NetworkSettings):
             values, _ = value(params, (), is_first, obs, privileged)
             return Evaluation(log_prob(action, mean, spread), entropy(spread), values)
 
-        def acting(params):
+        def policy_params(params):
             return {name: params[name] for name in ("encoder", "actor", "log_std")}
 
-        return Network(init, acting, lambda num_envs: NetworkMemory((), ()), act, value, evaluate)
+        return Network(init, policy_params, lambda num_envs: NetworkMemory((), ()), act, value, evaluate)
 
 
 if __name__ == "__main__":

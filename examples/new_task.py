@@ -22,8 +22,7 @@ from mqe_jax.planners.steering import Observation, go_to, pose
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
-from mqe_jax.terrain import Block as TerrainBlock
-from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, Track, Wall, register_block
+from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall, register_block
 from mqe_jax.train.evaluate import evaluate
 
 # Step 1: a terrain block defines its walls.

@@ -2,7 +2,7 @@
 
 | mode | per robot | meaning |
 |---|---|---|
-| `command` | one number per command exposed to the action (3) | velocity (and gait) commands for the walk policy |
+| `command` | one number per command that the action sets (3) | velocity (and gait) commands for the walk policy |
 | `position` | 12 | joint target = default + scale x action, then PD at every physics step |
 | `torque` | 12 | joint torque = action x torque limit |
 
@@ -57,7 +57,7 @@ def check_mode(mode: str) -> str:
 
 
 def check_commands(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the commands exposed to the action, or raises an InputError that names the allowed ones."""
+    """Returns the commands that the action sets, or raises an InputError that names the allowed ones."""
     for name in names:
         if name not in COMMAND_RANGES:
             allowed = ", ".join(COMMAND_RANGES)
@@ -154,7 +154,7 @@ class Controller:
     actuator_params: ActuatorParams | None
     """Weights of the actuator network, or None for PD."""
     commands: tuple[str, ...]
-    """Commands exposed to the action, in order."""
+    """Commands that the action sets, in order."""
     default_commands: np.ndarray
     """Default commands of the walk policy (15,)."""
     lag: int = 0

@@ -24,7 +24,7 @@ def flock(
 ) -> jax.Array:
     """Returns the velocities (S, 2), m/s, of S sheep during the next environment step.
 
-    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4, with c the herd's centre (this
+    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4, with c the flock's centre (this
     term is omitted for one sheep), r = p - p_robot and q = |r squared elementwise|, zero beyond q = 9; then each
     component is clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
     before and half after this, so that the sheep moves at the step's mean speed.

@@ -102,9 +102,9 @@ class Ball(Object):
     """Radius, m."""
     mass: float = 0.318
     """Mass, kg."""
-    drag: float = 0.1
+    damping: float = 0.1
     """Linear damping, N s/m."""
-    spin_drag: float = 0.0003
+    angular_damping: float = 0.0003
     """Angular damping, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
@@ -113,8 +113,8 @@ class Ball(Object):
         A free joint is unsuitable, because it has a single damping coefficient for all six degrees of freedom.
         """
         body = self._body(spec, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
-        self._slides(body, "xyz", self.drag)
-        self._joint(body, "turn", _JOINT.mjJNT_BALL, self.spin_drag)
+        self._slides(body, "xyz", self.damping)
+        self._joint(body, "turn", _JOINT.mjJNT_BALL, self.angular_damping)
         self._solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
         if visual:  # dark patches make the rotation visible
             for axis in _AXES.values():

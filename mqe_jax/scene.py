@@ -34,7 +34,7 @@ class Scene:
     objects: tuple[Object, ...] = ()
     """Movable and fixed objects, added after the robots."""
     colors: tuple[int, ...] = ()
-    """Colors of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty."""
+    """Colours of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty."""
     friction: float = 1.0
     """Sliding friction of the robots' collision geoms and the ground."""
     torque_robots: int = 0

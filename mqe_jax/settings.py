@@ -118,7 +118,7 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
     """Returns a record with fields replaced, given as in `build`.
 
     A nested record with a `name` field (a choice among several records) is replaced as a whole where the changes
-    name another one; free mappings are merged.
+    name another one; mappings that are not records are merged.
 
     Raises:
         InputError: as `build`.
@@ -130,7 +130,7 @@ def to_mapping(settings: Any) -> dict[str, Any]:
     """Returns a record as nested mappings, lists and scalars that YAML and JSON can represent.
 
     Raises:
-        InputError: for a value in a free mapping that is none of these.
+        InputError: for a value in a mapping that is none of these.
     """
     return {field.name: _plain(field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings)}
 

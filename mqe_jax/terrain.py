@@ -80,8 +80,8 @@ class Layout:
     """Spawn poses (x, y, yaw) of the robots, m and rad."""
 
 
-BLOCKS: dict[str, type[Block]] = {}
-B = TypeVar("B", bound="Block")
+BLOCKS: dict[str, type[TerrainBlock]] = {}
+B = TypeVar("B", bound="TerrainBlock")
 
 
 def register_block(name: str) -> Callable[[type[B]], type[B]]:
@@ -95,7 +95,7 @@ def register_block(name: str) -> Callable[[type[B]], type[B]]:
     return register
 
 
-def block(name: str, **parameters: Any) -> Block:
+def block(name: str, **parameters: Any) -> TerrainBlock:
     """Creates a block by its registered name.
 
     Raises:
@@ -113,7 +113,7 @@ def block(name: str, **parameters: Any) -> Block:
 
 
 @dataclasses.dataclass(frozen=True)
-class Block:
+class TerrainBlock:
     """Base of all blocks."""
 
     name: ClassVar[str] = ""
@@ -124,7 +124,7 @@ class Block:
         """Returns the walls and poses of the block from x = `start`, m; `number` is its index in the track."""
         raise NotImplementedError(f"terrain block {type(self).__name__}: layout() is not defined")
 
-    def at(self, difficulty: float) -> Block:
+    def at(self, difficulty: float) -> TerrainBlock:
         """Returns the block with every (easy, hard) parameter interpolated at a difficulty in [0, 1]."""
         ranged = {field.name for field in dataclasses.fields(self) if "Ranged" in str(field.type)}
         fixed = {}
@@ -145,7 +145,7 @@ def _number(value: Ranged) -> float:
 
 @register_block("spawn")
 @dataclasses.dataclass(frozen=True)
-class SpawnArea(Block):
+class SpawnArea(TerrainBlock):
     """Spawn poses side by side across the track, with a wall behind them."""
 
     length: Ranged = 2.0
@@ -167,7 +167,7 @@ class SpawnArea(Block):
 
 @register_block("plane")
 @dataclasses.dataclass(frozen=True)
-class Plane(Block):
+class Plane(TerrainBlock):
     """Ground without walls."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
@@ -176,7 +176,7 @@ class Plane(Block):
 
 @register_block("end_wall")
 @dataclasses.dataclass(frozen=True)
-class EndWall(Block):
+class EndWall(TerrainBlock):
     """The wall at the end of the track."""
 
     length: Ranged = 0.0
@@ -187,7 +187,7 @@ class EndWall(Block):
 
 @register_block("gate")
 @dataclasses.dataclass(frozen=True)
-class Gate(Block):
+class Gate(TerrainBlock):
     """A wall across the middle of the block with a gap."""
 
     length: Ranged = 3.0
@@ -277,7 +277,7 @@ def _perlin(y: np.ndarray, x: np.ndarray, random: np.random.Generator) -> np.nda
 class Track:
     """A row of blocks between two side walls."""
 
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[TerrainBlock, ...] = ()
     """Blocks in order along x."""
     width: float = 3.0
     """Distance between the side walls, m."""

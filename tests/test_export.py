@@ -33,7 +33,7 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> Policy:
     dims = EnvDims(env.num_agents, env.observation_size, 0, env.action_size, env.teams, env.num_agents)
     net = config.network.build(dims)
     keys = jax.random.split(jax.random.PRNGKey(3), 3)
-    params = jax.tree.map(lambda x: x + 0.1, net.acting(jax.jit(net.init)(keys[0])))
+    params = jax.tree.map(lambda x: x + 0.1, net.policy_params(jax.jit(net.init)(keys[0])))
     mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
     return Policy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), dims, config, {})
 

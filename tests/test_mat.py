@@ -44,10 +44,10 @@ def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Arra
 )
 def test_parallel_log_probabilities_equal_sequential_ones(teams: tuple, settings: dict) -> None:
     network, params, obs = made(teams, **settings)
-    action, sequential, _ = network.act(network.acting(params), (), obs, KEY)
+    action, sequential, _ = network.act(network.policy_params(params), (), obs, KEY)
     np.testing.assert_allclose(log_probs(network, params, obs, action), sequential, atol=1e-5)
     assert float(jnp.std(action)) > 0.1
-    mean, density, _ = network.act(network.acting(params), (), obs, None)
+    mean, density, _ = network.act(network.policy_params(params), (), obs, None)
     np.testing.assert_allclose(log_probs(network, params, obs, mean), density, atol=1e-5)
 
 
@@ -75,7 +75,7 @@ def test_actions_and_observations_of_the_other_team_have_no_effect() -> None:
 def test_both_teams_have_the_same_weights() -> None:
     network, params, obs = made(((0, 1), (2, 3)))
     obs = obs.at[:, 2:].set(obs[:, :2])
-    action, _, _ = network.act(network.acting(params), (), obs, None)
+    action, _, _ = network.act(network.policy_params(params), (), obs, None)
     np.testing.assert_allclose(action[:, :2], action[:, 2:], atol=1e-6)
     values, _ = network.value(params, (), jnp.zeros((4,), bool), obs, obs[..., 0, :1])
     assert values.shape == (4, 4)
@@ -95,7 +95,7 @@ def test_the_deviation_starts_as_openrl_has_it_or_free() -> None:
         ({"deviation": "free", "log_std_init": -1.0}, np.exp(-1)),
     ):
         network, params, obs = made(ONE_TEAM, **settings)
-        mean, density, _ = network.act(network.acting(params), (), obs, None)
+        mean, density, _ = network.act(network.policy_params(params), (), obs, None)
         np.testing.assert_allclose(density, -np.log(deviation * np.sqrt(2 * np.pi)), rtol=1e-5)
         assert mean.shape == (4, 3, 2)
 
@@ -117,9 +117,9 @@ def test_a_free_deviation_beyond_its_bounds_gets_the_gradient_that_leads_back() 
 def test_actions_start_small_and_acting_needs_no_value_head() -> None:
     network = Mat().build(dims(ONE_TEAM))
     params = jax.jit(network.init)(KEY)
-    mean, _, _ = jax.jit(network.act)(network.acting(params), (), jax.random.normal(KEY, (4, 3, 5)), None)
+    mean, _, _ = jax.jit(network.act)(network.policy_params(params), (), jax.random.normal(KEY, (4, 3, 5)), None)
     assert float(jnp.abs(mean).max()) < 0.1
-    assert "value_head" not in network.acting(params)
+    assert "value_head" not in network.policy_params(params)
 
 
 def test_settings_that_do_not_fit_are_named() -> None:

@@ -229,23 +229,25 @@ def test_windows_are_the_histories_of_the_rollout() -> None:
     random = np.random.default_rng(0)
     steps, envs = 40, 3
     obs = random.normal(size=(steps, envs, 70)).astype(np.float32)
-    age = np.arange(steps)[:, None] + np.zeros((1, envs), int)
-    age[10:, 1] = np.arange(steps - 10)  # environment 1 is reset at step 10
+    episode_steps = np.arange(steps)[:, None] + np.zeros((1, envs), int)
+    episode_steps[10:, 1] = np.arange(steps - 10)  # environment 1 is reset at step 10
     history, kept = np.zeros((envs, 30, 70), np.float32), []
     for t in range(steps):
-        history = np.concatenate([np.where(age[t][:, None, None] == 0, 0, history[:, 1:]), obs[t][:, None]], axis=1)
+        history = np.concatenate(
+            [np.where(episode_steps[t][:, None, None] == 0, 0, history[:, 1:]), obs[t][:, None]], axis=1
+        )
         kept.append(history)
     buffer = jnp.concatenate([jnp.zeros((29, envs, 70)), jnp.asarray(obs)])
     t, n = np.meshgrid(np.arange(steps), np.arange(envs), indexing="ij")
-    found = windows(buffer, jnp.asarray(age), jnp.asarray(t.ravel()), jnp.asarray(n.ravel()))
+    found = windows(buffer, jnp.asarray(episode_steps), jnp.asarray(t.ravel()), jnp.asarray(n.ravel()))
     np.testing.assert_array_equal(found, np.stack(kept).reshape(steps * envs, -1))
 
 
 def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pathlib.Path) -> None:
     """Weights, learning rate, iteration and key are exact, Adam's second moments to 8 bits; at most 16 MB a file."""
     config = training.WalkConfig()
-    init_learner = jax.jit(training.init_learner, static_argnums=(1, 2))
-    learner = init_learner(jax.random.PRNGKey(0), config, 110)
+    init_train_state = jax.jit(training.init_train_state, static_argnums=(1, 2))
+    learner = init_train_state(jax.random.PRNGKey(0), config, 110)
     square = jax.tree.map(lambda x: jnp.square(x) + 1e-7, learner.params)
     learner = dataclasses.replace(
         learner,
@@ -255,7 +257,7 @@ def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pa
     )
     path = training.save(tmp_path, learner, GO1, config)
     assert path.stat().st_size < 16e6
-    fresh = init_learner(jax.random.PRNGKey(1), config, 110)
+    fresh = init_train_state(jax.random.PRNGKey(1), config, 110)
     found = training.restore(tmp_path, fresh, GO1)
     jax.tree.map(np.testing.assert_array_equal, found.params, learner.params)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1 / 128), found.optimizer.square, square)

@@ -222,7 +222,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train all combinations of tasks, algorithms, settings and seeds, and report; resumes interrupted runs."""
+    """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
 
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""

@@ -50,7 +50,7 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
 
 
 def report(arguments: Report) -> dict[str, Any]:
-    """Writes the report of a study folder from its raw data."""
+    """Writes the report of a sweep from its raw data."""
     files = reports.report(arguments.folder)
     echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
     return {"report": [str(file) for file in files]}

@@ -49,8 +49,8 @@ class FootballParams(TaskParams):
     """Radius of the ball, m."""
     ball_mass: Positive = 0.318
     """Mass of the ball, kg."""
-    ball_drag: NonNegative = 0.1
-    """Linear drag coefficient of the ball, N s/m."""
+    ball_damping: NonNegative = 0.1
+    """Linear damping of the ball, N s/m."""
     ball_noise: NonNegative = 0.0
     """Half-width of the uniform noise on the ball's position at reset, m."""
 
@@ -67,7 +67,7 @@ class Football(QuadrupedEnv):
     ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)
     """X, y of the ball at reset, m."""
     colors: ClassVar[tuple[int, ...]] = ()
-    """Colors of the robots, as in `Scene`."""
+    """Colours of the robots, as in `Scene`."""
 
     def scene(self) -> Scene:
         params = self.params
@@ -78,7 +78,7 @@ class Football(QuadrupedEnv):
             width=params.field_width,
             wall_height=params.wall_height,
         )
-        ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, drag=params.ball_drag)
+        ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, damping=params.ball_damping)
         robots = len(self.kick_off)
         return Scene(track, num_robots=robots, objects=(ball,), colors=self.colors)
 

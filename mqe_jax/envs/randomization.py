@@ -79,9 +79,9 @@ class Randomizer:
         random, robots = self.random, self.index.num_robots
         keys = jax.random.split(key, 5)
 
-        def uniform(key: jax.Array, span: Range | None, shape: tuple[int, ...], usual: float) -> jax.Array:
+        def uniform(key: jax.Array, span: Range | None, shape: tuple[int, ...], default: float) -> jax.Array:
             if span is None:
-                return jnp.full(shape, usual)
+                return jnp.full(shape, default)
             return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
 
         return RandomizedParams(

@@ -48,7 +48,7 @@ class SheepEasyParams(TaskParams):
     """Lengths of the spawn area and of the free ground in front of and behind the gate, m."""
     spawn_x: float = 1.25
     """Spawn x of the robots, m."""
-    spawn_apart: NonNegative = 1.95
+    spawn_spacing: NonNegative = 1.95
     """Distance between the robots, m."""
     gate_width: Positive = 0.8
     """Width of the gate's gap, m."""
@@ -85,7 +85,7 @@ class SheepHardParams(SheepEasyParams):
     track_width: Positive = 6.0
     lengths: tuple[Positive, Positive, Positive] = (2.0, 6.0, 6.0)
     spawn_x: float = 1.5
-    spawn_apart: NonNegative = 3.0
+    spawn_spacing: NonNegative = 3.0
     gate_width: Positive = 1.5
     gate_random: tuple[NonNegative, NonNegative] = (0.0, 1.0)
     flock: tuple[PositiveInt, PositiveInt] = (3, 3)
@@ -129,7 +129,7 @@ class Go1SheepEasy(QuadrupedEnv):
     def scene(self) -> Scene:
         params = self.params
         before, middle, behind = params.lengths
-        spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_apart)
+        spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_spacing)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))

@@ -58,8 +58,8 @@ class TugParams(TaskParams):
     """Half-width of the range of the robots' initial x about the arena's centre, m."""
     spawn_y: NonNegative = 2.5
     """Distance of the robots from the centre line, m; the first robot is on the side of negative y."""
-    win_by: NonNegative = 0.1
-    """Distance of the cylinder on the opponent's half at the end of the episode that wins, m."""
+    win_distance: NonNegative = 0.1
+    """Minimum distance of the cylinder on the opponent's half at the end of the episode for a win, m."""
     rewards: TugRewards = TugRewards()
     """Weights of the reward terms."""
 
@@ -177,4 +177,4 @@ class Go1Tug(Duel):
 
     def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """A robot leads while the cylinder is on the opponent's half."""
-        return self.cylinder_y(state.data) * jnp.array([1.0, -1.0]) > self.params.win_by
+        return self.cylinder_y(state.data) * jnp.array([1.0, -1.0]) > self.params.win_distance

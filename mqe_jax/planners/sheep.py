@@ -1,4 +1,4 @@
-"""Scripted policies of Sheep Dog: drive one sheep from behind, or gather a herd towards the gate."""
+"""Scripted policies of Sheep Dog: drive one sheep from behind, or gather a flock towards the gate."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def plan_sheep_hard(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3).
 
     Each robot walks behind a weighted mean of the sheep that prefers those far from the gate, on its own side and
-    nearby, and so drives stragglers up to the herd, whose attraction to its centre keeps it together.
+    nearby, and so drives stragglers up to the flock, whose attraction to its centre keeps it together.
     """
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]

@@ -1,4 +1,4 @@
-"""Raw data of a study: per run, a CSV file with its curve and a JSON file with its evaluations.
+"""Raw data of a sweep: per run, a CSV file with its curve and a JSON file with its evaluations.
 
 FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    at most 100 rows, 10 columns, 6 digits
 FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, evaluations during training, absolute metric
@@ -32,7 +32,7 @@ Curve = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Cell:
-    """One task, algorithm and setting of a study; runs of different seeds belong to the same cell."""
+    """One task, algorithm and variant (`setting`) of a sweep; runs of different seeds belong to the same cell."""
 
     task: str
     algorithm: str
@@ -140,7 +140,7 @@ def read_records(folder: Path) -> list[Record]:
     """
     paths = sorted((folder / "raw").glob("*/*/seed*.json"))
     if not paths:
-        raise InputError(f"{folder}: holds no raw/TASK/ALGORITHM/seed*.json; it must be a study folder")
+        raise InputError(f"{folder}: holds no raw/TASK/ALGORITHM/seed*.json; it must be a sweep folder")
     records = []
     for path in paths:
         try:

@@ -1,4 +1,4 @@
-"""The report of a study: figures, tables and aggregates with the paper's values, generated from raw data alone.
+"""The report of a sweep: figures, tables and aggregates with the paper's values, generated from raw data alone.
 
 The output is deterministic: bootstrap intervals use a fixed seed, and figures contain no timestamp.
 """

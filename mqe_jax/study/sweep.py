@@ -1,4 +1,4 @@
-"""Sweeps: tasks x algorithms x settings x seeds in one folder, resumed after any interruption.
+"""Sweeps: tasks x algorithms x variants x seeds in one folder, resumed after any interruption.
 
 FOLDER/sweep.yaml    settings of the sweep
 FOLDER/runs/...      run folders, with checkpoints
@@ -53,7 +53,7 @@ class Sweep:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings that override the file's in every run."""
     variants: Mapping[str, Any] = field(default_factory=lambda: {HIERARCHICAL: {}})
-    """Named further settings, each a setting of the study, such as scratch: {env: {control: position}}."""
+    """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `setting`."""
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "seeds"):
@@ -97,7 +97,7 @@ def load_sweep(path: Path) -> Sweep:
 def plan(sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig]) -> list[Job]:
     """Returns the remaining jobs in the order of training.
 
-    `config_of(task, algorithm)` gives the settings before those of the sweep. Runs with raw data are complete.
+    `config_of(task, algorithm)` gives the settings that those of the sweep override. Runs with raw data are complete.
     The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 

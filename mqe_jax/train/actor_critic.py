@@ -127,7 +127,7 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
             "critic": critic_init(critic_key) if critic_shared else jax.vmap(critic_init)(critic_key),
         }
 
-    def acting(params: Params) -> Params:
+    def policy_params(params: Params) -> Params:
         return {name: params[name] for name in ("actor", "log_std")}
 
     def initial_memory(num_envs: int) -> NetworkMemory:
@@ -190,4 +190,4 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
         return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)
 
     chunk_length = settings.chunk_length if settings.recurrent else 1
-    return Network(init, acting, initial_memory, act, value, evaluate, chunk_length)
+    return Network(init, policy_params, initial_memory, act, value, evaluate, chunk_length)

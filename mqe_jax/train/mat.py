@@ -35,7 +35,7 @@ class Mat(GaussianSettings):
     width: PositiveInt = 64
     """Width of every layer."""
     gain: Positive = 0.01
-    """Orthogonal gain of attention, of residual branches' last layers, and of the output layers."""
+    """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of output layers."""
     deviation: Literal["sigmoid", "free"] = "sigmoid"
     """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an unconstrained
     log, the only choice that uses log_std_*.
@@ -241,7 +241,7 @@ def _build(settings: Mat, dims: EnvDims) -> Network:
 
     return Network(
         init=lambda key: init_params(key, dims, settings),
-        acting=lambda params: {name: params[name] for name in ("encoder", "decoder", "deviation")},
+        policy_params=lambda params: {name: params[name] for name in ("encoder", "decoder", "deviation")},
         initial_memory=lambda num_envs: NetworkMemory((), ()),
         act=act,
         value=value,

@@ -54,9 +54,9 @@ class Network(NamedTuple):
     """The functions that make up a network.
 
     `init(key) -> params`
-    `acting(params) -> params`: the parameters used by `act`, stored in a saved policy
+    `policy_params(params) -> params`: the parameters used by `act`, stored in a saved policy
     `initial_memory(num_envs) -> memory`: recurrent state of zeros with leading axis N
-    `act(acting_params, actor_memory, obs (N, A, O), key or None) -> (action (N, A, D), log_prob (N, A, D),
+    `act(policy_params, actor_memory, obs (N, A, O), key or None) -> (action (N, A, D), log_prob (N, A, D),
     actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents may act
     autoregressively within one call.
     `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P)) -> (value (L, N, V),
@@ -66,7 +66,7 @@ class Network(NamedTuple):
     """
 
     init: Callable[[jax.Array], Params]
-    acting: Callable[[Params], Params]
+    policy_params: Callable[[Params], Params]
     initial_memory: Callable[[int], NetworkMemory]
     act: Callable[[Params, Memory, jax.Array, jax.Array | None], tuple[jax.Array, jax.Array, Memory]]
     value: Callable[[Params, Memory, jax.Array, jax.Array, jax.Array], tuple[jax.Array, Memory]]

@@ -25,10 +25,10 @@ POLICY_FILE = "policy.safetensors"
 
 @dataclass(frozen=True)
 class Policy:
-    """A team's policy: the acting parameters of a network, and its observation statistics."""
+    """A team's policy: the policy parameters of a network, and its observation statistics."""
 
     params: Params
-    """Parameters as `Network.acting` returns them."""
+    """Parameters as `Network.policy_params` returns them."""
     normalizer: RunningStatistics
     dims: EnvDims
     config: TrainConfig
@@ -79,8 +79,8 @@ def _compiled_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> 
 
 def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata: Any) -> Policy:
     """Returns the policy of a learner state."""
-    acting = config.network.build(dims).acting(state.params)
-    return Policy(acting, state.obs_normalizer.obs, dims, config, metadata)
+    policy_params = config.network.build(dims).policy_params(state.params)
+    return Policy(policy_params, state.obs_normalizer.obs, dims, config, metadata)
 
 
 def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE) -> Path:
@@ -116,7 +116,7 @@ def load_policy(run: str | Path) -> Policy:
     network = config.network.build(dims)
 
     def template() -> dict[str, Any]:
-        params = network.acting(network.init(jax.random.PRNGKey(0)))
+        params = network.policy_params(network.init(jax.random.PRNGKey(0)))
         return {"params": params, "normalizer": running_init(dims.observation)}
 
     tree = load_tree(path, jax.eval_shape(template), kind="policy").tree

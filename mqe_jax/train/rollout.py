@@ -69,7 +69,7 @@ def rollout(
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
         obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, normalize)
-        action, log_prob, actor_memory = network.act(network.acting(params), memory.actor, obs, key)
+        action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None])
         scaled = action_scale * action

@@ -22,7 +22,7 @@ DIRECTIONS = (
 KEY_STEP = 0.25
 """Increment of a key press, as a fraction of the maximum command."""
 FREE, NONE = "free", "none"
-_COLOURS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
+_COLORS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
 _POINTS = 200
 
 
@@ -186,7 +186,7 @@ class Panel:
                 self._command_plot = self._uplot(DRIVEN)
 
     def _uplot(self, names: Sequence[str]) -> Any:
-        lines = [{"label": name, "stroke": _COLOURS[i % len(_COLOURS)], "width": 1.5} for i, name in enumerate(names)]
+        lines = [{"label": name, "stroke": _COLORS[i % len(_COLORS)], "width": 1.5} for i, name in enumerate(names)]
         empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.zeros(2) for i in range(len(names) + 1))
         return self._gui.add_uplot(
             empty,

@@ -87,7 +87,7 @@ def _followed(data: mujoco.MjData, robots: Sequence[int], objects: Sequence[int]
 
 
 def _smoothed(fitted: Sequence[Camera], width: int) -> list[Camera]:
-    """Returns cameras averaged over a triangle of `2 width + 1` frames."""
+    """Returns cameras smoothed by a triangular window of `2 width + 1` frames."""
     values = np.array([[*camera.lookat, camera.distance] for camera in fitted])
     padded = np.concatenate([np.repeat(values[:1], width, 0), values, np.repeat(values[-1:], width, 0)])
     weights = np.minimum(np.arange(1, 2 * width + 2), np.arange(2 * width + 1, 0, -1)) / (width + 1) ** 2

@@ -69,7 +69,7 @@ class WalkState:
     """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
     step: jax.Array
     """Steps counted towards the time limit () int32; starts at a random offset in training."""
-    age: jax.Array
+    episode_steps: jax.Array
     """Steps since the reset () int32."""
     difficulty: jax.Array
     """Curriculum level () in [0, 1], which scales slopes, forces and pushes."""
@@ -151,7 +151,7 @@ class WalkEnv:
             memory=memory,
             mean_error=jnp.zeros(3),
             step=jnp.asarray(step, jnp.int32),
-            age=jnp.zeros((), jnp.int32),
+            episode_steps=jnp.zeros((), jnp.int32),
             difficulty=difficulty,
             key=next_key,
         )
@@ -164,7 +164,7 @@ class WalkEnv:
         action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
         target = walk_policy.joint_targets(self.robot, action)
         previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
-        before_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
+        earlier_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
 
         # Slope and force reach the spec's values within about half a second.
         slope = state.slope + jnp.clip(state.spec.slope - state.slope, -0.02, 0.02)
@@ -173,7 +173,7 @@ class WalkEnv:
             pushed = jax.random.bernoulli(time_key, DT / task.push_period)
             size = state.spec.push * jax.random.uniform(size_key, ())
         else:
-            pushed = (state.age + 1) % round(task.push_period / DT) == 0
+            pushed = (state.episode_steps + 1) % round(task.push_period / DT) == 0
             size = state.spec.push
         angle = jax.random.uniform(direction_key, (), maxval=2 * jnp.pi)
         push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
@@ -203,7 +203,7 @@ class WalkEnv:
             gait=gait,
             target=target,
             previous_target=previous_target,
-            before_target=before_target,
+            earlier_target=earlier_target,
             foot_force=self.foot_force(data),
             strength=state.body.strength,
         )
@@ -214,7 +214,7 @@ class WalkEnv:
         low = robot_state.position_w[0, 2] < self.robot.walk.min_trunk_height
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         fallen = (robot_state.trunk_force[0] > 1.0) | (up[2] < 0.5) | low | ~finite
-        step, age = state.step + 1, state.age + 1
+        step, episode_steps = state.step + 1, state.episode_steps + 1
         metrics = {f"reward/{name}": value for name, value in weighted.items()} | {
             "error_vx": jnp.square(error[0]),
             "error_vy": jnp.square(error[1]),
@@ -239,7 +239,7 @@ class WalkEnv:
             memory=memory,
             mean_error=mean_error,
             step=step,
-            age=age,
+            episode_steps=episode_steps,
             key=key,
         )
         return self._observed(state, noise_key)
@@ -331,7 +331,7 @@ class WalkEnv:
         return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
 
     def autoreset(self, state: WalkState) -> WalkState:
-        """Resets a finished environment; reward, end flags and metrics of the last step are kept."""
+        """Resets a finished environment; reward, termination flags and metrics of the last step are kept."""
         done = state.terminated | state.truncated
         key, reset_key = jax.random.split(state.key)
         fresh = self.reset(reset_key, None, state.difficulty)

@@ -49,7 +49,10 @@ class WalkRewards:
 
 @dataclasses.dataclass(frozen=True)
 class RewardInputs:
-    """Inputs of the reward terms; shapes and units as in `WalkState`."""
+    """Inputs of the reward terms; shapes and units as in `WalkState`.
+
+    Joint targets: `target`, `previous_target` one step before it, `earlier_target` two steps before it.
+    """
 
     robot: Robot
     robot_state: RobotState
@@ -59,7 +62,7 @@ class RewardInputs:
     gait: jax.Array
     target: jax.Array
     previous_target: jax.Array
-    before_target: jax.Array
+    earlier_target: jax.Array
     foot_force: jax.Array
     strength: jax.Array
 
@@ -125,7 +128,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
         "foot_slip": jnp.sum(on_ground * jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1)),
         "smoothness": jnp.sum(jnp.square(inputs.target - inputs.previous_target)),
-        "second_smoothness": jnp.sum(jnp.square(inputs.target - 2 * inputs.previous_target + inputs.before_target)),
+        "second_smoothness": jnp.sum(jnp.square(inputs.target - 2 * inputs.previous_target + inputs.earlier_target)),
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),

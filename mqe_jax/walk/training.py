@@ -44,7 +44,7 @@ class WalkConfig:
 
     num_envs: int = 8192
     """Number of parallel environments."""
-    rollout_length: int = 24
+    rollout_steps: int = 24
     """Steps per environment and update."""
     iterations: int = 1200
     """Total number of updates."""
@@ -62,11 +62,11 @@ class WalkConfig:
     """Discount factor."""
     gae_lambda: float = 0.95
     """Trace decay of generalised advantage estimation."""
-    entropy: float = 0.01
+    entropy_coef: float = 0.01
     """Coefficient of the entropy bonus."""
-    value: float = 1.0
+    value_coef: float = 1.0
     """Coefficient of the value loss."""
-    adaptation: float = 1.0
+    adaptation_coef: float = 1.0
     """Coefficient of the adaptation network's regression loss."""
     max_grad_norm: float = 1.0
     """Global gradient-norm clip."""
@@ -84,8 +84,8 @@ class WalkConfig:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class WalkLearner:
-    """Learner state."""
+class WalkTrainState:
+    """Training state without the environments."""
 
     params: dict[str, Any]
     """Parameters: {"policy": walk policy weights, "log_std": (12,), "critic": layers}."""
@@ -99,25 +99,25 @@ class WalkLearner:
     """Random key."""
 
 
-def windows(buffer: jax.Array, age: jax.Array, time_index: jax.Array, env_index: jax.Array) -> jax.Array:
+def windows(buffer: jax.Array, episode_steps: jax.Array, time_index: jax.Array, env_index: jax.Array) -> jax.Array:
     """Gathers flattened 30-step histories (B, 2100); observations before the episode's start are zero.
 
     Args:
         buffer: observations (29 + T, N, 70): row t + 29 is that of step t.
-        age: steps since the reset at each step (T, N).
+        episode_steps: steps since the reset at each step (T, N).
         time_index: (B,).
         env_index: (B,).
     """
     rows = time_index[:, None] + jnp.arange(HISTORY)
     history = buffer[rows, env_index[:, None]]
     back = HISTORY - 1 - jnp.arange(HISTORY)
-    alive = back <= age[time_index, env_index][:, None]
+    alive = back <= episode_steps[time_index, env_index][:, None]
     return (history * alive[..., None]).reshape(len(time_index), -1)
 
 
-def init_learner(
+def init_train_state(
     key: jax.Array, config: WalkConfig, privileged_size: int, policy: walk_policy.Params | None = None
-) -> WalkLearner:
+) -> WalkTrainState:
     """Samples the initial weights; those of the policy are `policy` if given, for fine-tuning."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     params = {
@@ -126,13 +126,13 @@ def init_learner(
         "critic": nn.mlp_init(critic_key, (privileged_size, 512, 256, 128, 1), final_scale=1.0),
     }
     optimizer = adam(1e-8, max_grad_norm=config.max_grad_norm).init(params)
-    return WalkLearner(params, optimizer, jnp.float32(config.learning_rate), jnp.int32(0), key)
+    return WalkTrainState(params, optimizer, jnp.float32(config.learning_rate), jnp.int32(0), key)
 
 
 def make_iteration(
     env: WalkEnvironment, config: WalkConfig
-) -> Callable[..., tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]]:
-    """Returns `iterate(learner, state, history, scale) -> (learner, state, history, metrics)`: one rollout, one update.
+) -> Callable[..., tuple[WalkTrainState, Any, jax.Array, dict[str, jax.Array]]]:
+    """Returns `iterate(train_state, state, history, scale) -> (train_state, state, history, metrics)`: rollout, update.
 
     `state` is the batched environment state, `history` each environment's last observations (N, 30, 70), newest last,
     `scale` () in [0, 1] the factor on learning rate and entropy bonus; below 1 the KL rule only lowers the rate.
@@ -144,8 +144,10 @@ def make_iteration(
     def critic(params: Any, privileged: jax.Array) -> jax.Array:
         return nn.mlp(params["critic"], privileged, jax.nn.elu)[..., 0]
 
-    def rollout(learner: WalkLearner, state: Any, history: jax.Array, key: jax.Array) -> tuple[Any, jax.Array, Any]:
-        params = learner.params
+    def rollout(
+        train_state: WalkTrainState, state: Any, history: jax.Array, key: jax.Array
+    ) -> tuple[Any, jax.Array, Any]:
+        params = train_state.params
 
         def body(carry: tuple[Any, jax.Array], step_key: jax.Array) -> tuple[tuple[Any, jax.Array], Any]:
             state, history = carry
@@ -158,7 +160,7 @@ def make_iteration(
             record = {
                 "obs": state.obs,
                 "privileged": state.privileged_obs,
-                "age": state.age,
+                "episode_steps": state.episode_steps,
                 "action": action,
                 "mean": mean,
                 "log_prob": jnp.sum(log_prob(action, mean, params["log_std"]), -1),
@@ -167,28 +169,28 @@ def make_iteration(
                 "terminated": next_state.terminated,
                 "truncated": next_state.truncated,
                 "latent_target": state.latent_target,
-                "length": next_state.age,
+                "length": next_state.episode_steps,
                 "metrics": next_state.metrics,
             }
             next_state = autoreset(next_state)
-            fresh = (next_state.age == 0)[:, None, None]
+            fresh = (next_state.episode_steps == 0)[:, None, None]
             history = jnp.concatenate([jnp.where(fresh, 0.0, history[:, 1:]), next_state.obs[:, None]], axis=1)
             return (next_state, history), record
 
-        (state, history), records = jax.lax.scan(body, (state, history), jax.random.split(key, config.rollout_length))
+        (state, history), records = jax.lax.scan(body, (state, history), jax.random.split(key, config.rollout_steps))
         return state, history, records
 
     def iterate(
-        learner: WalkLearner, state: Any, history: jax.Array, scale: jax.Array
-    ) -> tuple[WalkLearner, Any, jax.Array, dict[str, jax.Array]]:
-        key, rollout_key, shuffle_key = jax.random.split(learner.key, 3)
-        difficulty = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
+        train_state: WalkTrainState, state: Any, history: jax.Array, scale: jax.Array
+    ) -> tuple[WalkTrainState, Any, jax.Array, dict[str, jax.Array]]:
+        key, rollout_key, shuffle_key = jax.random.split(train_state.key, 3)
+        difficulty = jnp.clip(train_state.iteration / max(config.curriculum, 1), 0.0, 1.0)
         state = dataclasses.replace(state, difficulty=jnp.full(config.num_envs, difficulty))
         before = jnp.moveaxis(history[:, :-1], 1, 0)
-        state, history, records = rollout(learner, state, history, rollout_key)
+        state, history, records = rollout(train_state, state, history, rollout_key)
         buffer = jnp.concatenate([before, records["obs"]])
-        value = critic(learner.params, records["privileged"])
-        next_value = critic(learner.params, records["next_privileged"])
+        value = critic(train_state.params, records["privileged"])
+        next_value = critic(train_state.params, records["next_privileged"])
         done = records["terminated"] | records["truncated"]
         advantage, target = gae(
             records["reward"],
@@ -200,12 +202,12 @@ def make_iteration(
             gae_lambda=config.gae_lambda,
         )
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-        old_log_std = learner.params["log_std"]
+        old_log_std = train_state.params["log_std"]
         # Policy gradients are zeroed during the first `critic_warmup` iterations of fine-tuning.
-        acting = (learner.iteration >= config.critic_warmup).astype(jnp.float32)
+        policy_trained = (train_state.iteration >= config.critic_warmup).astype(jnp.float32)
 
         def loss(params: Any, t: jax.Array, n: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-            flat = windows(buffer, records["age"], t, n)
+            flat = windows(buffer, records["episode_steps"], t, n)
             latent = walk_policy.infer_latent(params["policy"], flat)
             mean = walk_policy.infer_action(params["policy"], flat, jax.lax.stop_gradient(latent))
             new = jnp.sum(log_prob(records["action"][t, n], mean, params["log_std"]), -1)
@@ -216,19 +218,19 @@ def make_iteration(
             value_error = jnp.mean(jnp.maximum(jnp.square(predicted - wanted), jnp.square(near - wanted)))
             adaptation = jnp.mean(jnp.square(latent - records["latent_target"][t, n]))
             bonus = jnp.mean(entropy(params["log_std"]))
-            total = acting * (policy - scale * config.entropy * bonus)
-            total += config.value * value_error + config.adaptation * adaptation
+            total = policy_trained * (policy - scale * config.entropy_coef * bonus)
+            total += config.value_coef * value_error + config.adaptation_coef * adaptation
             kl = jnp.mean(kl_divergence(records["mean"][t, n], old_log_std, mean, params["log_std"]))
             return total, {"kl": kl, "value_loss": value_error, "adaptation_loss": adaptation}
 
-        samples = config.rollout_length * config.num_envs
+        samples = config.rollout_steps * config.num_envs
         size = samples // config.minibatches
 
         def minibatch(carry: tuple[Any, Any, jax.Array], index: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
             params, state, rate = carry
             grads, info = jax.grad(loss, has_aux=True)(params, index // config.num_envs, index % config.num_envs)
             rate = jnp.where(info["kl"] > 2 * config.target_kl, jnp.maximum(rate / 1.5, 1e-5), rate)
-            raised = (info["kl"] < config.target_kl / 2) & (acting > 0) & (scale >= 1.0)
+            raised = (info["kl"] < config.target_kl / 2) & (policy_trained > 0) & (scale >= 1.0)
             rate = jnp.where(raised, jnp.minimum(rate * 1.5, 1e-2), rate)
             params, state, info["grad_norm"] = optimizer.update(grads, state, params, rate * scale)
             return (params, state, rate), info
@@ -237,7 +239,7 @@ def make_iteration(
             jax.random.split(shuffle_key, config.epochs)
         )
         (params, optimizer_state, rate), info = jax.lax.scan(
-            minibatch, (learner.params, learner.optimizer, learner.learning_rate), order.reshape(-1, size)
+            minibatch, (train_state.params, train_state.optimizer, train_state.learning_rate), order.reshape(-1, size)
         )
         ended = jnp.sum(done)
         metrics = {name: jnp.mean(values) for name, values in {**info, **records["metrics"]}.items()}
@@ -249,31 +251,31 @@ def make_iteration(
             "difficulty": difficulty,
             "episode_length": jnp.sum(records["length"] * done) / jnp.maximum(ended, 1),
         }
-        learner = WalkLearner(params, optimizer_state, rate, learner.iteration + 1, key)
-        return learner, state, history, metrics
+        train_state = WalkTrainState(params, optimizer_state, rate, train_state.iteration + 1, key)
+        return train_state, state, history, metrics
 
     return iterate
 
 
-def _to_checkpoint(learner: WalkLearner) -> dict[str, Any]:
-    """Returns the part of a learner that a checkpoint stores: 12 MB instead of 25.
+def _to_checkpoint(train_state: WalkTrainState) -> dict[str, Any]:
+    """Returns the part of a training state that a checkpoint stores: 12 MB instead of 25.
 
     Adam's second moments are stored as bfloat16 (bits in uint16), its first moments are omitted: they restart from zero
     and recover within about ten minibatches.
     """
     half = lambda x: jax.lax.bitcast_convert_type(x.astype(jnp.bfloat16), jnp.uint16)  # noqa: E731
     return {
-        "params": learner.params,
-        "adam_square": jax.tree.map(half, learner.optimizer.square),
-        "adam_updates": learner.optimizer.updates,
-        "learning_rate": learner.learning_rate,
-        "iteration": learner.iteration,
-        "key": learner.key,
+        "params": train_state.params,
+        "adam_square": jax.tree.map(half, train_state.optimizer.square),
+        "adam_updates": train_state.optimizer.updates,
+        "learning_rate": train_state.learning_rate,
+        "iteration": train_state.iteration,
+        "key": train_state.key,
     }
 
 
-def _from_checkpoint(saved: dict[str, Any]) -> WalkLearner:
-    """Restores a learner from a checkpoint's contents."""
+def _from_checkpoint(saved: dict[str, Any]) -> WalkTrainState:
+    """Restores a training state from a checkpoint's contents."""
     full = lambda x: jax.lax.bitcast_convert_type(x, jnp.bfloat16).astype(jnp.float32)  # noqa: E731
     params = saved["params"]
     optimizer = AdamState(
@@ -281,27 +283,27 @@ def _from_checkpoint(saved: dict[str, Any]) -> WalkLearner:
         square=jax.tree.map(full, saved["adam_square"]),
         updates=saved["adam_updates"],
     )
-    return WalkLearner(params, optimizer, saved["learning_rate"], saved["iteration"], saved["key"])
+    return WalkTrainState(params, optimizer, saved["learning_rate"], saved["iteration"], saved["key"])
 
 
-def save(run_dir: Path, learner: WalkLearner, robot: Robot, config: WalkConfig) -> Path:
+def save(run_dir: Path, train_state: WalkTrainState, robot: Robot, config: WalkConfig) -> Path:
     """Writes a checkpoint and walk.safetensors into a run folder; returns the checkpoint's path."""
-    iteration = int(learner.iteration)
+    iteration = int(train_state.iteration)
     about = {"robot": robot.name, "config": dataclasses.asdict(config), "iteration": iteration}
-    walk_policy.save_params(learner.params["policy"], run_dir / "walk.safetensors", about)
-    return checkpoint.save_checkpoint(run_dir, _to_checkpoint(learner), iteration, about, keep=2)
+    walk_policy.save_params(train_state.params["policy"], run_dir / "walk.safetensors", about)
+    return checkpoint.save_checkpoint(run_dir, _to_checkpoint(train_state), iteration, about, keep=2)
 
 
-def restore(run_dir: Path, learner: WalkLearner, robot: Robot) -> WalkLearner:
-    """Returns the learner of a run's newest checkpoint; `learner` itself if there is none.
+def restore(run_dir: Path, train_state: WalkTrainState, robot: Robot) -> WalkTrainState:
+    """Returns the training state of a run's newest checkpoint; `train_state` itself if there is none.
 
     Raises:
         InputError: if the checkpoint is damaged or of another robot.
     """
     newest = checkpoint.latest(run_dir)
     if newest is None:
-        return learner
-    saved = checkpoint.load_checkpoint(newest, jax.eval_shape(_to_checkpoint, learner))
+        return train_state
+    saved = checkpoint.load_checkpoint(newest, jax.eval_shape(_to_checkpoint, train_state))
     if saved.metadata["robot"] != robot.name:
         trained = saved.metadata["robot"]
         raise InputError(f"{newest}: trained on {trained}; resume it with --robot {trained}, not {robot.name}")
@@ -337,12 +339,12 @@ def train_walk(
     start = time.monotonic()
     run_dir.mkdir(parents=True, exist_ok=True)
     key = jax.random.PRNGKey(config.seed)
-    learner_key, state_key, stagger_key = jax.random.split(key, 3)
-    learner = init_learner(learner_key, config, env.privileged_size, policy)
+    train_key, state_key, stagger_key = jax.random.split(key, 3)
+    train_state = init_train_state(train_key, config, env.privileged_size, policy)
     if resume:
-        learner = restore(run_dir, learner, env.robot)
-        state_key = jax.random.fold_in(state_key, learner.iteration)
-    difficulty = jnp.clip(learner.iteration / max(config.curriculum, 1), 0.0, 1.0)
+        train_state = restore(run_dir, train_state, env.robot)
+        state_key = jax.random.fold_in(state_key, train_state.iteration)
+    difficulty = jnp.clip(train_state.iteration / max(config.curriculum, 1), 0.0, 1.0)
     keys = jax.random.split(state_key, config.num_envs)
     # Staggered time limits: the environments do not all reset at once.
     steps = jax.random.randint(stagger_key, (config.num_envs,), 0, 900)
@@ -350,7 +352,7 @@ def train_walk(
     state = reset(keys, steps)
     history = jnp.zeros((config.num_envs, HISTORY, OBSERVATION_SIZE)).at[:, -1].set(state.obs)
     iterate = jax.jit(make_iteration(env, config), donate_argnums=(2,))
-    first = int(learner.iteration)
+    first = int(train_state.iteration)
     table = run_dir / "metrics.csv"
     fresh = first == 0 or not table.exists()
     with table.open("w" if fresh else "a", newline="") as file:
@@ -360,7 +362,7 @@ def train_walk(
             if max_seconds is not None:
                 done = max(done, min((time.monotonic() - start) / max_seconds, 1.0))
             scale = min(1.0, (1.0 - done) / config.anneal) if config.anneal > 0 else 1.0
-            learner, state, history, metrics = iterate(learner, state, history, jnp.float32(scale))
+            train_state, state, history, metrics = iterate(train_state, state, history, jnp.float32(scale))
             jax.block_until_ready(metrics)  # so that `max_seconds` measures finished work
             last = iteration == config.iterations or (
                 max_seconds is not None and time.monotonic() - start > max_seconds
@@ -377,7 +379,7 @@ def train_walk(
                 if report is not None:
                     report(iteration, row)
             if iteration % save_every == 0 or last:
-                save(run_dir, learner, env.robot, config)
+                save(run_dir, train_state, env.robot, config)
             if last:
                 break
-    return learner.params["policy"]
+    return train_state.params["policy"]
