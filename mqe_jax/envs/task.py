@@ -31,7 +31,7 @@ class Task:
     name: ClassVar[str] = ""
     """Id of the task."""
     title: ClassVar[str] = ""
-    """Name of the task in the paper."""
+    """Title of the task: the paper's name, or the own name of another task."""
     Params: ClassVar[type[TaskParams]] = TaskParams
     """Class of the task's parameters."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
