@@ -202,10 +202,12 @@ class Physics:
         model = self._mjx_model.replace(**fields) if fields else self._mjx_model
 
         def substep(carry: tuple[mjx.Data, jax.Array], _: None) -> tuple[tuple[mjx.Data, jax.Array], None]:
-            data = self._mjx_step(model, self._without_flags(carry[0]))
-            return (data, carry[1] | self._overflow(data)), None
+            data = self._mjx_step(model, carry[0])
+            return (data, carry[1] | self._full(data)), None
 
-        return jax.lax.scan(substep, (data, jnp.zeros((), bool)), None, substeps)[0]
+        start = (self._without_flags(data), jnp.zeros((), bool))
+        data, full = jax.lax.scan(substep, start, None, substeps)[0]
+        return data, full | self._flagged(data)
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
         """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
@@ -218,14 +220,16 @@ class Physics:
             return data
         return data.replace(_impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow)))
 
-    def _overflow(self, data: mjx.Data) -> jax.Array:
-        """Returns whether contacts or constraints may have been dropped in the last physics step () bool."""
-        if self.impl == "warp":
-            return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
-        if self.impl == "jax":
-            contact = data._impl.contact
-            if len(contact.dist) == _contact_cap(self.model):
-                return jnp.all(contact.dist < contact.includemargin)
+    def _flagged(self, data: mjx.Data) -> jax.Array:
+        """Returns whether Warp dropped contacts or constraints since its flags were cleared () bool."""
+        if self.impl != "warp":
+            return jnp.zeros((), bool)
+        return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+
+    def _full(self, data: mjx.Data) -> jax.Array:
+        """Returns whether MJX-JAX's contact list was full in the last physics step () bool."""
+        if self.impl == "jax" and len(data._impl.contact.dist) == _contact_cap(self.model):
+            return jnp.all(data._impl.contact.dist < data._impl.contact.includemargin)
         return jnp.zeros((), bool)
 
 

@@ -105,7 +105,7 @@ def test_joint_values_and_ratios_of_a_match_are_per_team(ratio: str) -> None:
     assert value.shape == (32, 2)
     assert float(value[:, 0].min()) > 0.5 and float(value[:, 1].max()) < -0.5
     assert float(metrics["episode_return"]) > 2.0  # of the first team, 4 steps of about 1
-    mean, _, _ = network.act(network.acting(state.params), (), obs[0], None)
+    mean, _, _ = network.act(network.policy_params(state.params), (), obs[0], None)
     assert float(jnp.mean(mean[:, 0])) < -0.3 and float(jnp.mean(mean[:, 1])) > 0.3
 
 
