@@ -1,6 +1,6 @@
 """MJX-JAX's physics step with contact margins that hold for every pair of geoms.
 
-MJX-JAX finds no contact with a box before the surfaces meet, whatever the margin. Here collisions are computed on
+MJX-JAX detects no contact with a box before the surfaces meet, whatever the margin. Here collisions are computed on
 spheres and capsules inflated by their margins; distances and positions are then those of the original surfaces.
 """
 

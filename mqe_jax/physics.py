@@ -190,7 +190,7 @@ class Physics:
     ) -> tuple[mjx.Data, jax.Array]:
         """As `step`; also returns whether contacts or constraints may have been dropped in any physics step () bool.
 
-        On Warp the engine's own flags; on MJX-JAX whether the capped contact list is full. The C engine has no cap.
+        Warp: from the engine's flags; MJX-JAX: true if the capped contact list is full; C: never, it has no cap.
         """
         substeps = self.num_substeps if num_substeps is None else num_substeps
         data = data.replace(ctrl=ctrl.astype(jnp.float32))
@@ -215,7 +215,7 @@ class Physics:
         return second.replace(**merged)
 
     def _without_flags(self, data: mjx.Data) -> mjx.Data:
-        """Clears Warp's overflow flags, to which the engine only adds."""
+        """Clears Warp's overflow flags, which the engine sets but never clears."""
         if self.impl != "warp":
             return data
         return data.replace(_impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow)))

@@ -276,11 +276,11 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     train = f"train it with 'mqe walk train --robot {robot.name}'"
     if not file.is_file() and path is None:
         raise InputError(
-            f"walk policy: none for {robot.name} is shipped (assets/{file.name}); {train} and give the weights as "
+            f"walk policy: no weights are shipped for {robot.name} (assets/{file.name}); {train} and give them as "
             "walk_policy=FILE, or use control 'position' or 'torque'"
         )
     if not file.is_file():
-        raise InputError(f"walk policy: no file {file}; {train} or make it with 'mqe walk convert'")
+        raise InputError(f"walk policy: no file {file}; {train} or convert official weights with 'mqe walk convert'")
     try:
         flat = load_file(file)
     except SafetensorError as error:

@@ -120,7 +120,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         """Advances by one environment step; an agent's info has the metrics of the step.
 
         Raises:
-            InputError: if an agent has no action, or an action belongs to no agent.
+            InputError: if an agent has no action, or an action is given for an unknown agent.
         """
         if not self.agents:
             return {}, {}, {}, {}, {}

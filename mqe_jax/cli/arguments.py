@@ -181,7 +181,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure environment steps per second, including walk policy and resets, and of the physics alone."""
+    """Measure throughput in environment steps per second: with walk policy and resets, and for physics alone."""
 
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""
@@ -264,7 +264,7 @@ class WalkTrain:
     max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time limit, s; training stops there after saving a checkpoint."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Weights to fine-tune, also of another robot. Default: from scratch."""
+    """Weights to fine-tune; may be those of another robot. Default: from scratch."""
     initial_std: float = 1.0
     """Initial standard deviation of the actions."""
     curriculum: int = 400
@@ -331,7 +331,7 @@ class Walk:
 
 
 def _parser(wanted: Sequence[str]) -> Any:
-    """Returns the union of all subcommands; the flags of training settings only where `train` is wanted."""
+    """Returns the union of all subcommands; training flags are included only for the `train` subcommand."""
     train: Any = Train
     if "train" in wanted[:1]:
         flags = importlib.import_module("mqe_jax.cli.flags").train_flags()

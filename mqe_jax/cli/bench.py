@@ -1,4 +1,4 @@
-"""Throughput: environment steps per second with walk policy and resets, and of the physics alone."""
+"""Throughput in environment steps per second: with walk policy and resets, and for physics alone."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def report(arguments: Report) -> dict[str, Any]:
 
 
 def _estimate(folder: Path, jobs: list[sweeps.Job]) -> dict[str, Any]:
-    """Returns the remaining jobs of a sweep, a row for each, and sums."""
+    """Returns the remaining jobs of a sweep, one row per job, plus totals."""
     seconds = sweeps.estimate(folder, jobs)
     rows = [
         {

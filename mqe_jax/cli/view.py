@@ -32,5 +32,5 @@ def view(arguments: View) -> None:
     viewer = Viewer(Session(env, vector_env, act, memory, arguments.seed), arguments.host, arguments.port)
     if arguments.host not in _LOCAL:
         echo(f"mqe: warning: every machine that reaches {arguments.host} can open this page and control the robots")
-    echo(f"mqe: open {viewer.url} in a browser; Ctrl-C ends")
+    echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
     viewer.run()

@@ -29,7 +29,7 @@ class DefenderRewards:
     goal: float = 10.0
     """In steps in which the ball is in the goal."""
     nearness: float = 3.0
-    """Per exp(-distance of the ball to the goal's midpoint / 3 m)."""
+    """Times exp(-distance of the ball to the goal's midpoint / 3 m)."""
 
 
 @record

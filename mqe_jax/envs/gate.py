@@ -32,7 +32,7 @@ class GateRewards:
     approach: float = 1.0
     """Per m of decrease of a robot's distance to its target."""
     crowding: float = -0.025
-    """Per robot and 1 / d^2 while the distance d between the robots is below 0.5 m."""
+    """Times the sum over robots of 1 / d^2 while the distance d between the robots is below 0.5 m."""
     collision: float = -2.0
     """In steps with any trunk contact."""
 

@@ -27,7 +27,7 @@ _FIELDS = ("step", "anchors", "control", "randomized", "task", "assistance", "fr
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Consecutive states of one environment within an episode, and the actions per state."""
+    """Consecutive states of one environment within an episode, and the action taken in each."""
 
     task: str
     """Id of the task."""

@@ -131,7 +131,7 @@ class Go1Seesaw(QuadrupedEnv):
         platform = Platform(
             "platform", center=params.platform, size=params.platform_size, column=params.platform_column
         )
-        # Plank and platform collide as ground.
+        # Plank and platform use the ground's collision bits.
         return Scene(track, num_robots=2, objects=(plank, platform))
 
     def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -31,7 +31,7 @@ class Task:
     name: ClassVar[str] = ""
     """Id of the task."""
     title: ClassVar[str] = ""
-    """Title of the task: the paper's name, or the own name of another task."""
+    """Display title: the paper's name if the task is in the paper."""
     Params: ClassVar[type[TaskParams]] = TaskParams
     """Class of the task's parameters."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}

@@ -1,4 +1,4 @@
-"""A task's scene for programs outside Python: MJCF, and the numbers needed to reset, step and judge an episode."""
+"""A task's scene for other programs: MJCF, and the numerical settings needed to reset, step and evaluate an episode."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from mqe_jax.settings import to_mapping
 
 
 def scene_xml(env: Any) -> str:
-    """Returns the MJCF of the task's rendering model, whose physics is the task's.
+    """Returns the MJCF of the task's rendering model, which has the physics of the task's model.
 
-    MuJoCo writes 6 digits: compiled again, inertias and their frames differ by less than 1e-6.
+    MuJoCo writes six significant digits, so inertias and inertial frames differ by less than 1e-6 after recompilation.
     """
     spec, _ = build_spec(env.compiled.scene, visual=True)
     spec.compile()
@@ -65,5 +65,5 @@ def scene_settings(env: Any) -> dict[str, Any]:
 
 
 def _plain(values: np.ndarray) -> list[float]:
-    """Returns float32 values as the shortest decimal numbers that stand for them."""
+    """Returns float32 values as the shortest decimals that round-trip to the same float32."""
     return [float(str(value)) for value in values]

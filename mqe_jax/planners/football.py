@@ -22,8 +22,8 @@ _KEEP_BACK = 2.0  # m, distance behind the ball of the supporting robot, which s
 def plan_defender(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3): one dribbles past the defender on the flank, then turns in to the goal.
 
-    The defender is not observed; it is assumed at the target of its control law. The robot nearer to the point behind
-    the ball, as seen from the goal, attacks; the other supports.
+    The defender is not observed; it is assumed to be at the target position of its control law. The robot nearer to the
+    point behind the ball, as seen from the goal, attacks; the other supports. Both attack a ball at the goal line.
     """
     ball, velocity = obs["ball"][0, :2], obs["ball_velocity"][0, :2]
     opponents = (0.6 * ball + 0.4 * _GOAL)[None]

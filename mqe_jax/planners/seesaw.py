@@ -10,7 +10,7 @@ from mqe_jax.planners.steering import Observation, go_to, pose
 _TOP = 8.1  # m, x of the climber's goal on the platform
 _NEAR_END = 3.87  # m, x at which the partner has all four feet on the plank
 _BEHIND = 0.9  # m, distance of the partner behind the climber
-# The climber enters the plank, which is 1 m wide, centred; with one row of feet beside the plank it would tip over.
+# The climber steps onto the centre of the 1 m wide plank; with the feet of one side off the plank it would tip over.
 _FOOT = 2.6  # m, x of the climber's goal while it is off-centre
 _ENTRY = 2.9  # m, x up to which the climber stops if it is more than _CENTRED off-centre
 _CENTRED = 0.15  # m

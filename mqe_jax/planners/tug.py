@@ -10,7 +10,7 @@ from mqe_jax.planners.steering import GAIN, Observation, go_to, pose
 _AXIS_X = 1.6  # m, of the line on which the cylinder slides
 _ALIGNED = 0.25  # m, distance from that line within which a robot pushes
 _BEFORE = 1.65  # m, distance from the cylinder's axis at which a robot aligns
-_EXCESS = 0.4  # m/s, speed of a pushing robot's goal above the cylinder's
+_EXCESS = 0.4  # m/s, goal speed of a pushing robot relative to the cylinder
 
 
 def plan_tug(obs: Observation) -> jax.Array:

@@ -227,7 +227,7 @@ class Robot:
     joint_upper: np.ndarray
     """Upper joint limits (12,), rad."""
     joint_speed_limit: np.ndarray
-    """Speed limits of the motors (12,), rad/s; informative, not enforced by the physics."""
+    """Speed limits of the motors (12,), rad/s; informational, not enforced by the physics."""
     torque_limit: np.ndarray
     """Torque limits of the controller (12,), N m."""
     kp: float

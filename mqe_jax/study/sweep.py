@@ -33,7 +33,7 @@ from mqe_jax.train.types import VectorEnv
 SWEEP_FILE = "sweep.yaml"
 
 Environments = Callable[[TrainConfig, int], tuple[VectorEnv, VectorEnv | None]]
-"""Makes training and evaluation environments of a number of seeds trained together."""
+"""Factory of the training and evaluation environments for a given number of seeds trained together."""
 
 
 @record

@@ -100,10 +100,12 @@ def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
     expected, structure = _flatten(template)
     for name in expected:
         if name not in arrays:
-            raise InputError(f"{path}: lacks {name}; it belongs to other settings or another version")
+            raise InputError(
+                f"{path}: {name} is missing; the file was written with different settings or another version"
+            )
     for name in arrays:
         if name not in expected:
-            raise InputError(f"{path}: holds {name}, which these settings do not have")
+            raise InputError(f"{path}: unexpected entry {name}, not defined by the current settings")
     for name, leaf in expected.items():
         found = arrays[name]
         if tuple(found.shape) != tuple(leaf.shape):

@@ -33,9 +33,9 @@ class PPO:
     """The PPO update."""
 
     epochs: PositiveInt = 10
-    """Passes over each rollout."""
+    """Epochs over each rollout."""
     minibatches: PositiveInt = 1
-    """Minibatches per pass."""
+    """Minibatches per epoch."""
     ratio: Literal["agent", "dimension", "joint"] = "agent"
     """Probability ratio that is clipped: per agent, per action dimension (OpenRL), or joint per team (JRPO)."""
     value: Literal["agent", "joint"] = "agent"

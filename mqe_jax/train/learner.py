@@ -189,7 +189,7 @@ def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
     if assistance and not hasattr(state, "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
     if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
-        fail("stagger_episodes", True, f"false: {env.name} lacks max_episode_steps or its state a field step")
+        fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
 
 
 def _check_divisible(config: TrainConfig, network: Network) -> None:

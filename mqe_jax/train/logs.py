@@ -131,7 +131,7 @@ class TensorBoardLog:
 
 
 class WandbLog:
-    """A Weights & Biases run, written to `run_dir/wandb` without a network unless WANDB_MODE=online is set.
+    """A Weights & Biases run, logged offline to `run_dir/wandb` unless WANDB_MODE=online is set.
 
     `wandb sync` uploads it later. A resumed training run keeps its run id.
     """

@@ -1,7 +1,7 @@
 """The network protocol and the registry of networks.
 
 A network is one registered settings record whose `build` returns the functions that the learner, the rollout and a
-saved policy use. A further architecture is one more entry:
+saved policy use. To add an architecture, register another settings record:
 
     @register_network("mine")
     class MyNetwork(NetworkSettings):

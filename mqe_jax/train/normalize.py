@@ -86,8 +86,8 @@ def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -
 def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
     """Returns mean and standard deviation, both 0 before the first update.
 
-    The deviation is at least a thousandth of the root mean square, so that the normalisation is the same at any scale
-    of rewards and float32 rounding of nearly constant targets is not magnified.
+    The standard deviation is at least a thousandth of the root mean square, so that the normalisation is the same at
+    any scale of rewards and float32 rounding of nearly constant targets is not magnified.
     """
     weight = jnp.where(statistics.weight > 0.0, statistics.weight, 1.0)
     mean, square = statistics.mean / weight, statistics.square / weight

@@ -23,7 +23,7 @@ def robot_bases(model: mujoco.MjModel) -> list[int]:
 
 
 def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
-    """Returns the ids of objects and NPCs that move in the episode: free, sliding or mocap bodies but the robots."""
+    """Returns the ids of objects and NPCs that move in the episode: free, sliding or mocap bodies, excluding robots."""
     moved = np.ptp(episode.mocap_pos, axis=0).max(-1) > 0.05 if model.nmocap else np.zeros(0, bool)
     bodies = [body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]]
     robots = {int(model.body_rootid[body]) for body in robot_bases(model)}

@@ -51,11 +51,11 @@ def render_episode(
     at: float | None = None,
     backend: str | None = "auto",
 ) -> str:
-    """Renders an episode to a file by suffix; returns the renderer (`egl`, `osmesa`, `matplotlib`).
+    """Renders an episode to a file (format by suffix) and returns the renderer used (`egl`, `osmesa`, `matplotlib`).
 
     Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow` for
     a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the middle).
-    Without GL, one line on standard error names the packages for 3-D images.
+    Without GL, the packages required for 3-D rendering are printed to standard error.
     """
     check_output(path)
     suffix = path.suffix.lower()

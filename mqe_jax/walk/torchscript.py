@@ -60,7 +60,7 @@ class _Unpickler(pickle.Unpickler):
             return dict
         if module == "torch.jit._pickle":
             return lambda value, *_: value
-        raise ValueError(f"holds {module}.{name}, which a network of linear layers does not need")
+        raise ValueError(f"unexpected class {module}.{name} in a network of linear layers")
 
     def persistent_load(self, pid: Any) -> np.ndarray:
         kind, dtype, key = pid[:3]
