@@ -123,7 +123,7 @@ class Match(QuadrupedEnv):
 
 
 class Duel(Match):
-    """Base of the matches of one robot against one: each observes both robots in its own frame."""
+    """Base of the one-on-one matches: each observes both robots in its own frame."""
 
     @property
     def observation_layout(self) -> ObservationLayout:

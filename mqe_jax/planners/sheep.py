@@ -26,8 +26,8 @@ def plan_sheep_easy(obs: Observation) -> jax.Array:
 def plan_sheep_hard(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3).
 
-    Each robot walks behind a weighted mean of the sheep that prefers those far from the gate, on its own side and
-    nearby, and so drives stragglers up to the flock, whose attraction to its centre keeps it together.
+    Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, on
+    the robot's side and close to it. Stragglers are thus driven back to the flock, whose cohesion keeps it together.
     """
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]

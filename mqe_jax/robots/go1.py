@@ -1,4 +1,4 @@
-"""The Unitree Go1 as data.
+"""Model parameters of the Unitree Go1.
 
 Source: the public Unitree Go1 description (masses, inertias, limits); collision shapes are spheres and capsules,
 which all three engines support.

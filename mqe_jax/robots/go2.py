@@ -1,4 +1,4 @@
-"""The Unitree Go2 as data.
+"""Model parameters of the Unitree Go2.
 
 Source: MuJoCo Menagerie's inertial parameters and limits of the Go2 and Unitree's description (motor speeds);
 collision shapes are spheres and capsules, which all three engines support.

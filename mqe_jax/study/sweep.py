@@ -160,7 +160,7 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     """Creates the folder and writes sweep.yaml into it; tasks, algorithms, variants and seeds may be added later.
 
     Raises:
-        InputError: if the folder holds a sweep of other settings.
+        InputError: if the folder contains a sweep with different settings.
     """
     check_folder(folder)
     path = folder / SWEEP_FILE
@@ -180,7 +180,7 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
     """Trains the jobs sequentially; each resumes from its checkpoints and writes raw data at its end.
 
     Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
-    first. Returns the jobs skipped because other processes hold their cells.
+    first. Returns the jobs skipped because other processes hold the locks of their cells.
 
     Raises:
         InputError: if a run cannot be resumed.

@@ -80,8 +80,8 @@ def evaluate(
 ) -> EvalResult:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
-    Environment i counts its first `episodes // N` episodes (one more where i < `episodes % N`) and none after, so
-    selection is independent of episode length.
+    Environment i contributes its first `episodes // N` episodes (one more if i < `episodes % N`); later ones are
+    ignored, so the sample is not biased by episode length.
 
     Args:
         env: the environments.

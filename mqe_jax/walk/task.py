@@ -51,7 +51,7 @@ class EpisodeSpec:
     commands: jax.Array
     """Commands of the walk policy (15,)."""
     slope: jax.Array
-    """Inclination of the ground along x and y (2,), rad; a positive first entry climbs towards +x."""
+    """Inclination of the ground along x and y (2,), rad; positive in x where the ground rises towards +x."""
     force: jax.Array
     """Sustained force on the trunk (2,), N, along its heading and to its left, horizontal."""
     push: jax.Array
