@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from browser import open_page
 
 from mqe_jax import make
 from mqe_jax.export.scene import scene_settings, scene_xml
@@ -205,16 +206,7 @@ def address(page: Path) -> Iterator[str]:
 
 def test_two_robots_pass_the_gate_in_a_browser(address: str) -> None:
     """The team plays an episode in headless Chromium, and the page says that both robots are through."""
-    from test_view import chromium
-
-    program = chromium()
-    if program is None:
-        pytest.skip("no Chromium here (tools/install_chromium.sh installs Debian's)")
-    playwright = pytest.importorskip("playwright.sync_api")
-    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=program, args=flags)
-        tab = browser.new_page(viewport={"width": 1000, "height": 640})
+    with open_page(1000, 640) as tab:
         errors: list[str] = []
         tab.on("pageerror", lambda error: errors.append(str(error)))
         tab.goto(f"{address}?speed=4&seed=0")
@@ -231,4 +223,3 @@ def test_two_robots_pass_the_gate_in_a_browser(address: str) -> None:
         assert "3.14" in tab.locator("#version").inner_text()
         assert "differ by at most" in tab.locator("#agreement").inner_text()
         assert errors == []
-        browser.close()

@@ -1,7 +1,6 @@
 """The viewer: its simulation, its scene, its panel, and the page in a real browser."""
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -16,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browser import open_page
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import cli, make
@@ -213,12 +213,6 @@ def test_nothing_listens_beyond_this_machine(viewer: SimpleNamespace) -> None:
     assert listening(viewer.port) == {"0100007F"}
 
 
-def chromium() -> str | None:
-    """The program of a Chromium, or None."""
-    names = ("chromium", "chromium-browser", "google-chrome")
-    return os.environ.get("MQE_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-
-
 class Page:
     """The viewer's page, as rendered."""
 
@@ -246,18 +240,10 @@ class Page:
 
 @pytest.fixture(scope="module")
 def page(viewer: SimpleNamespace) -> Iterator[Page]:
-    program = chromium()
-    if program is None:
-        pytest.skip("no Chromium here (tools/install_chromium.sh installs Debian's)")
-    playwright = pytest.importorskip("playwright.sync_api")
-    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=program, args=flags)
-        tab = browser.new_page(viewport={"width": 640, "height": 480})
+    with open_page(640, 480) as tab:
         tab.goto(f"http://127.0.0.1:{viewer.port}")
         tab.wait_for_selector("table", timeout=1000 * STARTUP)
         yield Page(tab)
-        browser.close()
 
 
 def test_a_robot_is_driven_from_the_page(page: Page) -> None:
