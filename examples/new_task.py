@@ -129,7 +129,9 @@ class Go1Catch(QuadrupedEnv):
         track = Track(blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1)
         return Scene(track, num_robots=1, objects=(Mouse("mouse"),))
 
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Samples the mouse's initial position."""
         place = jnp.array([3.8, 0.0]) + jax.random.uniform(key, (2,), minval=-0.5, maxval=0.5)
         return qpos.at[self.objects["mouse"].qpos].set(place), qvel

@@ -26,7 +26,8 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
     folder = arguments.folder or Path("runs") / arguments.file.stem
 
     def config_of(task: str, algorithm: str) -> TrainConfig:
-        return train_config(task, settings.config, algorithm=algorithm)
+        name = settings.config and settings.config.replace("{task}", task)
+        return train_config(task, name, algorithm=algorithm)
 
     jobs = sweeps.plan(settings, folder, config_of)
     result = _estimate(folder, jobs)

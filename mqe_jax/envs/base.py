@@ -175,7 +175,7 @@ class QuadrupedEnv(Task):
         assistance = jnp.asarray(assistance, jnp.float32)
         anchors = self._sample_anchors(anchor_key)
         qpos, qvel = self._sample_robots(spawn_key, body_key)
-        qpos, qvel = self.reset_objects(object_key, qpos, qvel)
+        qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
         ctrl = jnp.zeros(self.compiled.model.nu).at[self.index.actuator].set(self.controller.neutral)
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
         robot_state = self.read(data)

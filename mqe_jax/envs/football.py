@@ -86,7 +86,9 @@ class Football(QuadrupedEnv):
         """The kick-off poses."""
         return self.kick_off
 
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Samples the ball's initial position about its spot."""
         params = self.params
         noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)

@@ -15,7 +15,7 @@ from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
-from mqe_jax.settings import record
+from mqe_jax.settings import Fraction, record
 from mqe_jax.walk_policy import command_index
 
 if TYPE_CHECKING:
@@ -30,6 +30,10 @@ class DefenderRewards:
     """In steps in which the ball is in the goal."""
     nearness: float = 3.0
     """Times exp(-distance of the ball to the goal's midpoint / 3 m)."""
+    progress: float = 0.0
+    """Per m of decrease of the ball's distance to the goal's midpoint. Not in the paper: shaping."""
+    approach: float = 0.0
+    """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper: shaping."""
 
 
 @record
@@ -38,6 +42,10 @@ class DefenderParams(FootballParams):
 
     defender_idle: bool = False
     """Whether the defender stands still."""
+    head_start: Fraction = 0.0
+    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to the goal, the two robots as far
+    forward, so that agents first learn to score from near. Inactive at assistance 0.
+    """
     rewards: DefenderRewards = DefenderRewards()
     """Weights of the reward terms."""
 
@@ -49,6 +57,10 @@ class DefenderState:
 
     scored: jax.Array
     """Whether the ball has been in the goal in this episode () bool."""
+    goal: jax.Array
+    """Distance of the ball to the goal's midpoint after the last step (), m."""
+    robot: jax.Array
+    """Distance of the ball to the nearest of the two robots after the last step (), m."""
 
 
 class Go1FootballDefender(Football):
@@ -80,7 +92,25 @@ class Go1FootballDefender(Football):
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
-        return DefenderState(jnp.zeros((), bool))
+        return DefenderState(jnp.zeros((), bool), *self.distances(robot_state, data))
+
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Samples the ball's initial position, and moves ball and robots forward by the head start."""
+        if not self.params.head_start:
+            return super().reset_objects(key, qpos, qvel, assistance)
+        key, start_key = jax.random.split(key)
+        qpos, qvel = super().reset_objects(key, qpos, qvel, assistance)
+        ball = self.objects["ball"].qpos[:2]
+        start = self.params.head_start * assistance * jax.random.uniform(start_key)
+        way = start * (jnp.asarray(GOALS[0]) - qpos[ball])
+        return qpos.at[ball].add(way).at[self.index.base_qpos[:2, 0]].add(way[0]), qvel
+
+    def distances(self, robot_state: RobotState, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+        """Returns the ball's distances to the goal's midpoint and to the nearest of the two robots (), m."""
+        apart = jnp.linalg.norm(robot_state.position_w[:2, :2] - self.ball(data)[:2], axis=-1)
+        return self.goal_distance(data)[0], jnp.min(apart)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -95,8 +125,14 @@ class Go1FootballDefender(Football):
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         goal = self.in_goal(state.data)[0]
-        terms = {"goal": goal, "nearness": jnp.exp(-self.goal_distance(state.data)[0] / 3.0)}
-        return terms, DefenderState(state.task.scored | goal)
+        distance, robot = self.distances(robot_state, state.data)
+        terms = {
+            "goal": goal,
+            "nearness": jnp.exp(-distance / 3.0),
+            "progress": state.task.goal - distance,
+            "approach": state.task.robot - robot,
+        }
+        return terms, DefenderState(state.task.scored | goal, distance, robot)
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a goal at any time in this episode."""

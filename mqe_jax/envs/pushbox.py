@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
@@ -18,11 +19,15 @@ from mqe_jax.envs.state import State
 from mqe_jax.objects import Box
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.settings import NonNegative, Positive, PositiveInt, fail, record
 from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
 
 if TYPE_CHECKING:
     from mujoco import mjx
+
+
+_SPAWN_LENGTH, _GATE_LENGTH, _GATE_DEPTH = 2.0, 5.0, 0.1  # m, along x
+_BEHIND = 0.3  # of a robot's centre behind the box's rear face, m
 
 
 @record
@@ -33,6 +38,10 @@ class PushBoxRewards:
     """Per m of the box's displacement along x."""
     success: float = 1.0
     """In steps in which the box is past the gate."""
+    approach: float = 0.0
+    """Per m of decrease of the robots' summed distances to their places behind the box. Not in the paper: shaping."""
+    aim: float = 0.0
+    """Per m of decrease of the lateral distance between box and gate. Not in the paper: shaping."""
 
 
 @record
@@ -58,6 +67,10 @@ class PushBoxParams(TaskParams):
     """X of the box's centre at reset, m."""
     box_noise: NonNegative = 0.5
     """Half-width of the uniform noise on the box's position, m."""
+    head_start: NonNegative = 0.0
+    """Curriculum: box and robots start up to head_start x `State.assistance` further along x, m, so that agents first
+    learn the end of the push. Inactive at assistance 0.
+    """
     contacts_per_robot: PositiveInt = 16
     rewards: PushBoxRewards = PushBoxRewards()
     """Weights of the reward terms."""
@@ -65,6 +78,10 @@ class PushBoxParams(TaskParams):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_gap("gate_width", self.gate_width, self.track_width)
+        gate = _SPAWN_LENGTH + (_GATE_LENGTH - _GATE_DEPTH) / 2 - self.gate_random[0]
+        room = max(gate - (self.box_x + self.box_noise + self.box_size[0] / 2), 0.0)
+        if self.head_start > room:
+            fail("head_start", self.head_start, f"at most {room:.2f}, the distance between box and gate")
 
 
 @jax.tree_util.register_dataclass
@@ -76,6 +93,10 @@ class PushBoxState:
     """X of the box after the last step (), m."""
     start: jax.Array
     """X of the box at the reset (), m."""
+    behind: jax.Array
+    """Summed distances of the robots to their places behind the box after the last step (), m."""
+    lateral_offset: jax.Array
+    """Lateral distance between box and gate after the last step (), m."""
 
 
 class Go1PushBox(QuadrupedEnv):
@@ -95,21 +116,37 @@ class Go1PushBox(QuadrupedEnv):
 
     def scene(self) -> Scene:
         params = self.params
-        gate = Gate(5.0, width=params.gate_width, random=params.gate_random)
-        track = Track(blocks=(SpawnArea(2.0), gate, EndWall()), width=params.track_width)
+        gate = Gate(_GATE_LENGTH, width=params.gate_width, depth=_GATE_DEPTH, random=params.gate_random)
+        track = Track(blocks=(SpawnArea(_SPAWN_LENGTH), gate, EndWall()), width=params.track_width)
         box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
         return Scene(track, num_robots=2, objects=(box,))
 
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Samples the box's initial position."""
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Samples the box's initial position, and moves box and robots forward by the head start."""
         params = self.params
+        key, start_key = jax.random.split(key) if params.head_start else (key, key)
         noise = jax.random.uniform(key, (2,), minval=-params.box_noise, maxval=params.box_noise)
         pose = jnp.array([params.box_x, 0.0, params.box_size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
-        return qpos.at[self.objects["box"].qpos].set(pose), qvel
+        qpos = qpos.at[self.objects["box"].qpos].set(pose)
+        if params.head_start:
+            start = params.head_start * assistance * jax.random.uniform(start_key)
+            forward = np.append(self.index.base_qpos[:, 0], self.objects["box"].qpos[0])
+            qpos = qpos.at[forward].add(start)
+        return qpos, qvel
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PushBoxState:
         x = self.object_pose(data, "box")[0]
-        return PushBoxState(x, x)
+        return PushBoxState(x, x, *self.distances(robot_state, data, anchors))
+
+    def distances(self, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""
+        box = self.object_pose(data, "box")[:2]
+        length, width, _ = self.params.box_size
+        places = box + jnp.array([[-0.5 * length - _BEHIND, -0.25 * width], [-0.5 * length - _BEHIND, 0.25 * width]])
+        behind = jnp.sum(jnp.linalg.norm(robot_state.position_w[:2, :2] - places, axis=-1))
+        return behind, jnp.abs(box[1] - anchors[0, 1])
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -126,8 +163,14 @@ class Go1PushBox(QuadrupedEnv):
 
     def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
         x = self.object_pose(state.data, "box")[0]
-        terms = {"progress": x - state.task.x, "success": self.through(state).astype(jnp.float32)}
-        return terms, PushBoxState(x, state.task.start)
+        behind, lateral_offset = self.distances(robot_state, state.data, state.anchors)
+        terms = {
+            "progress": x - state.task.x,
+            "success": self.through(state).astype(jnp.float32),
+            "approach": state.task.behind - behind,
+            "aim": state.task.lateral_offset - lateral_offset,
+        }
+        return terms, PushBoxState(x, state.task.start, behind, lateral_offset)
 
     def through(self, state: State) -> jax.Array:
         """Returns whether the box is past the gate () bool."""

@@ -134,7 +134,9 @@ class Go1Seesaw(QuadrupedEnv):
         # Plank and platform use the ground's collision bits.
         return Scene(track, num_robots=2, objects=(plank, platform))
 
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Places the plank at its initial angle, with the near end on the ground."""
         return qpos.at[self.objects["seesaw"].qpos].set(self.params.plank_start), qvel
 

@@ -135,7 +135,9 @@ class Go1SheepEasy(QuadrupedEnv):
         flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
         return Scene(track, num_robots=2, objects=flock)
 
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Samples the sheep's initial positions."""
         params = self.params
         rows, columns = params.flock

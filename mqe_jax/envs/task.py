@@ -73,8 +73,10 @@ class Task:
         noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
         return jnp.asarray(pose).at[:, :2].add(noise)
 
-    def reset_objects(self, key: jax.Array, qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,)."""
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,), at a curriculum level ()."""
         return qpos, qvel
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> Any:

@@ -49,7 +49,8 @@ class Sweep:
     seeds_together: PositiveInt | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
-    """Settings file or shipped name; none uses the paper's settings of each algorithm."""
+    """Settings file or shipped name, in which {task} stands for the task's id; none uses the paper's settings of each
+    algorithm."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings that override the file's in every run."""
     variants: Mapping[str, Any] = field(default_factory=lambda: {HIERARCHICAL: {}})
