@@ -1,0 +1,115 @@
+"""Shaping terms and head starts of Push Box and Football (2 vs 1): off by default, and what they do in training."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.envs import State, make
+from mqe_jax.errors import InputError
+
+BOX, BALL = "go1pushbox", "go1football-defender"
+GOAL = np.array([12.0, 0.0])
+
+
+def resets(task: str, assistance: float, **params: Any) -> tuple[Any, State]:
+    """64 initial states of a task with position control on the C engine."""
+    env: Any = make(task, impl="c", control="position", **params)
+    reset = jax.jit(jax.vmap(env.reset, (0, None)))
+    return env, reset(jax.random.split(jax.random.PRNGKey(3), 64), assistance)
+
+
+def object_xy(env: Any, states: State, name: str) -> np.ndarray:
+    return np.asarray(states.data.qpos)[:, env.objects[name].qpos[:2]]
+
+
+def robots_x(env: Any, states: State) -> np.ndarray:
+    return np.asarray(states.data.qpos)[:, env.index.base_qpos[: env.num_agents, 0]]
+
+
+@pytest.mark.parametrize("task", [BOX, BALL])
+def test_assistance_moves_nothing_without_a_head_start(task: str) -> None:
+    plain, assisted = (np.asarray(resets(task, a)[1].data.qpos) for a in (0.0, 1.0))
+    np.testing.assert_array_equal(plain, assisted)
+
+
+def test_box_and_robots_start_further_by_the_same_distance() -> None:
+    env, states = resets(BOX, 0.5, head_start=0.9)
+    plain = resets(BOX, 0.0, head_start=0.9)[1]
+    moved = object_xy(env, states, "box") - object_xy(env, plain, "box")
+    np.testing.assert_allclose(robots_x(env, states) - robots_x(env, plain), np.tile(moved[:, :1], 2), atol=1e-6)
+    assert not moved[:, 1].any()
+    assert moved[:, 0].min() >= 0 and 0.4 < moved[:, 0].max() <= 0.45
+
+
+def test_a_box_does_not_start_inside_the_gate() -> None:
+    with pytest.raises(InputError, match=r"head_start: 1.0 .* at most 0.95"):
+        make(BOX, impl="c", head_start=1.0)
+
+
+def test_ball_and_robots_start_nearer_to_the_goal() -> None:
+    env, states = resets(BALL, 1.0, head_start=0.9)
+    plain = resets(BALL, 0.0, head_start=0.9)[1]
+    before, after = object_xy(env, plain, "ball"), object_xy(env, states, "ball")
+    share = (after - before)[:, 0] / (GOAL - before)[:, 0]
+    np.testing.assert_allclose(after, before + share[:, None] * (GOAL - before), atol=1e-5)
+    assert share.min() >= 0 and 0.8 < share.max() <= 0.9
+    np.testing.assert_allclose(
+        robots_x(env, states) - robots_x(env, plain), np.tile((after - before)[:, :1], 2), atol=1e-5
+    )
+    defender = env.index.base_qpos[2]
+    np.testing.assert_array_equal(states.data.qpos[:, defender], plain.data.qpos[:, defender])
+
+
+def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
+    """Reward terms of a step in which some coordinates take new values."""
+    data = state.data.replace(qpos=state.data.qpos.at[jnp.asarray(columns)].set(jnp.asarray(values)))
+    state = dataclasses.replace(state, data=data)
+    return {name: float(x) for name, x in env.rewards(state, env.read(data), jnp.array(False))[0].items()}
+
+
+def test_shaping_terms_of_push_box() -> None:
+    env, states = resets(BOX, 0.0)
+    state = jax.tree.map(lambda x: x[0], states)
+    box, gate = env.objects["box"].qpos, float(state.anchors[0, 1])
+    here = float(state.data.qpos[box[1]])
+    nearer = terms_after(env, state, box[1:2], [here + 0.25 * (gate - here)])
+    assert nearer["aim"] == pytest.approx(0.25 * abs(gate - here), abs=1e-5)
+    position = np.asarray(state.data.qpos)[box[:2]]
+    first = env.index.base_qpos[0, :2]
+    place = position + np.array([-0.8, -0.25])
+    start = np.asarray(state.data.qpos)[first]
+    assert terms_after(env, state, first, place)["approach"] == pytest.approx(np.linalg.norm(start - place), abs=1e-5)
+    assert env.params.rewards.approach == env.params.rewards.aim == 0
+
+
+def test_shaping_terms_of_football() -> None:
+    env, states = resets(BALL, 0.0)
+    state = jax.tree.map(lambda x: x[0], states)
+    ball = env.objects["ball"].qpos[:2]
+    here = np.asarray(state.data.qpos)[ball]
+    moved = here + 0.1 * (GOAL - here)
+    terms = terms_after(env, state, ball, moved)
+    assert terms["progress"] == pytest.approx(0.1 * np.linalg.norm(GOAL - here), abs=1e-4)
+    robots = np.asarray(state.data.qpos)[env.index.base_qpos[:2, :2]]
+    near = lambda point: np.linalg.norm(robots - point, axis=1).min()  # noqa: E731
+    assert terms["approach"] == pytest.approx(near(here) - near(moved), abs=1e-4)
+    assert env.params.rewards.progress == env.params.rewards.approach == 0
+
+
+@pytest.mark.parametrize("task", [BOX, BALL])
+def test_weights_of_shaping_terms_count_in_training_only_where_given(task: str) -> None:
+    env: Any = make(task, impl="c", control="position", **{"rewards.approach": 2.0})
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
+    for _ in range(5):
+        state = step(state, jnp.zeros((env.num_agents, 12)))
+    approach = float(state.metrics["reward/approach"])
+    rest = sum(float(x) for name, x in state.metrics.items() if name.startswith("reward/")) - approach
+    assert approach != 0
+    assert float(state.reward[0]) == pytest.approx(rest + approach, abs=1e-6)
