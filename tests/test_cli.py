@@ -207,7 +207,7 @@ BAD = {
     "setting": (["train", "fake", "--ppo.gamma", "2"], ["ppo.gamma", "2", "between 0 and 1"]),
     "setting's type": (["train", "fake", "--ppo.clip", "much"], ["ppo.clip: 'much'", "a number greater than 0"]),
     "network's setting": (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network.hidden_sizes: [8, 0]"]),
-    "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .gif, .png"]),
+    "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),
     "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
     "recording": (["replay", "none.npz"], ["none.npz"]),

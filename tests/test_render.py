@@ -98,7 +98,7 @@ def test_slow_motion_lasts_longer(env: FakeEnv, episode: recording.Episode, tmp_
     assert seconds[0.5] > 1.4 * seconds[1.0]
 
 
-@pytest.mark.parametrize("suffix", [".png", ".gif", ".mp4"])
+@pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4"])
 def test_clips_land_whole_without_gl(
     env: FakeEnv, episode: recording.Episode, tmp_path: Path, capsys: Any, suffix: str
 ) -> None:
@@ -108,7 +108,7 @@ def test_clips_land_whole_without_gl(
     assert render.render_episode(env, episode, file, size=(160, 90), backend=None) == "matplotlib"
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
     start = file.read_bytes()[:12]
-    assert {".png": b"PNG", ".gif": b"GIF89", ".mp4": b"ftyp"}[suffix] in start
+    assert {".png": b"PNG", ".gif": b"GIF89", ".webp": b"WEBP", ".mp4": b"ftyp"}[suffix] in start
     errors = capsys.readouterr().err
     assert errors.count("\n") == 1 and "libegl1" in errors
 
@@ -137,7 +137,7 @@ def test_a_broken_drawing_leaves_nothing_behind(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("clip.avi", r"clip\.avi.*\.mp4, \.gif, \.png"),
+        ("clip.avi", r"clip\.avi.*\.mp4, \.webp, \.gif, \.png"),
         (".", "suffix"),
         ("/proc/nowhere/clip.png", "cannot be written"),
     ],

@@ -130,8 +130,8 @@ def task_page(task: Any) -> str:
     env, name = _make(task), task.name
     body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
     media = [f"![{task.title}]({_image(name)})"] if _image(name) else []
-    if (DOCS / "clips" / f"{name}.gif").is_file():
-        media.append(f"The scripted policy (`mqe render {name}`):\n\n![clip](../clips/{name}.gif)")
+    if (DOCS / "clips" / f"{name}.webp").is_file():
+        media.append(f"The scripted policy (`mqe render {name}`):\n\n![clip](../clips/{name}.webp)")
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
         "- action per agent: command 3 (velocities for the walk policy), position 12, torque 12",

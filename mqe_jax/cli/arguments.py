@@ -123,12 +123,12 @@ class Eval:
 
 @dataclass(frozen=True)
 class Render:
-    """Render an episode of a task or of a trained run to a .mp4, .gif or .png file."""
+    """Render an episode of a task or of a trained run to a .mp4, .webp, .gif or .png file."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
     """Id of a task, or run folder."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
-    """File to write: .mp4, .gif or .png."""
+    """File to write: .mp4, .webp, .gif or .png."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
     (straight on at half speed). Default for a task: scripted if available, else forward."""
@@ -141,9 +141,10 @@ class Render:
     seconds: float = 20.0
     """Maximum length of the clip, s."""
     width: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .gif, 1280 for .png."""
+    """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .webp
+    and .gif, 1280 for .png."""
     fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Frames per second. Default: 25 for .mp4, 12.5 for .gif."""
+    """Frames per second. Default: 25 for .mp4, 12.5 for .webp and .gif."""
     view: Literal["follow", "near", "scene", "side"] | None = None
     """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
     side (tracks the first robot). Default: follow for a clip, scene for an image."""
@@ -170,7 +171,7 @@ class Replay:
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Recording written by `--dump-diverged` (.npz)."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """Clip or image to write: .mp4, .gif or .png."""
+    """Clip or image to write: .mp4, .webp, .gif or .png."""
     impl: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Engine: jax, warp or c. Default: the recorded one."""
     json: Json = False

@@ -32,6 +32,7 @@ scene; side: tracks the first robot from its side."""
 _MARGIN = np.array([0.45, 0.45, 0.3])  # around a followed body, m
 _REACH = 3.0  # distance from the ball within which robots are followed, m
 _TALL = 0.4  # height of walls above the trunks beyond which the camera is steeper, m
+_ROUNDS = 5  # of following further robots
 _SMOOTHING = 0.8  # duration over which a following camera is averaged, s
 
 
@@ -59,22 +60,41 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     tops = [box_corners(model, data, geom)[:, 2].max() for geom in scenery_geoms(model)]
     tall = max(tops, default=0.0) > min(data.xpos[body][2] for body in robots) + _TALL
     start = Camera((0.0, 0.0, 0.0), 1.0, elevation=-50.0 if tall else -30.0)
-    fitted, everywhere = [], []
+    corners: list[dict[int, np.ndarray]] = []
+    followed = np.zeros((len(episode), model.nbody), bool)
     for index in range(len(episode)):
         pose(model, data, episode, index)
-        if view == "side":
-            x, y, _ = data.xpos[robots[0]]
-            fitted.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))
-            continue
-        places = data.xpos[_followed(data, robots, objects)]
-        corners = np.concatenate([places + _MARGIN * (a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
-        everywhere.append(corners)
-        if view == "follow":
-            fitted.append(_fitted(model, corners, start, aspect, (2.0, 9.0)))
+        corners.append({body: _box(data, body) for body in (*robots, *objects)})
+        followed[index, [robots[0]] if view == "side" else _followed(data, robots, objects)] = True
+
+    def fit(chosen: Sequence[np.ndarray], distances: tuple[float, float]) -> Camera:
+        return _fitted(model, np.concatenate(chosen), start, aspect, distances)
+
     if view == "near":
-        return [_fitted(model, np.concatenate(everywhere), start, aspect, (2.0, 14.0))] * len(episode)
-    width = 0.3 if view == "side" else _SMOOTHING
-    return _smoothed(fitted, max(1, round(width / episode.dt)))
+        inside = [
+            boxes[body] for boxes, row in zip(corners, followed, strict=True) for body in np.flatnonzero(row).tolist()
+        ]
+        return [fit(inside, (2.0, 14.0))] * len(episode)
+    if view == "side":
+        centers = [boxes[robots[0]].mean(axis=0) for boxes in corners]
+        fitted = [Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0) for x, y, _ in centers]
+        return _smoothed(fitted, max(1, round(0.3 / episode.dt)))
+    width = max(1, round(_SMOOTHING / episode.dt))
+    views: list[Camera] = []
+    for _ in range(_ROUNDS):
+        rows = zip(corners, followed, strict=True)
+        fitted = [fit([boxes[body] for body in np.flatnonzero(row).tolist()], (2.0, 12.0)) for boxes, row in rows]
+        views = _smoothed(fitted, width)
+        rows = zip(corners, views, strict=True)
+        cut = np.array([[_cut(model, boxes[robot], camera, aspect) for robot in robots] for boxes, camera in rows])
+        cut &= ~followed[:, robots]
+        if not cut.any():
+            break
+        for index, which in np.argwhere(
+            cut
+        ).tolist():  # a robot that the image would cut is followed too, from earlier on
+            followed[max(0, index - 2 * width) : index + 2 * width + 1, robots[which]] = True
+    return views
 
 
 def _followed(data: mujoco.MjData, robots: Sequence[int], objects: Sequence[int]) -> list[int]:
@@ -84,6 +104,28 @@ def _followed(data: mujoco.MjData, robots: Sequence[int], objects: Sequence[int]
     apart = {robot: float(np.linalg.norm(data.xpos[robot] - data.xpos[objects[0]])) for robot in robots}
     closest = sorted(robots, key=lambda robot: apart[robot])
     return [*(robot for i, robot in enumerate(closest) if i == 0 or apart[robot] < _REACH), *objects]
+
+
+def _box(data: mujoco.MjData, body: int) -> np.ndarray:
+    """Returns the corners of a box about a body (8, 3), m."""
+    return np.array([data.xpos[body] + _MARGIN * (a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+
+
+def _cut(model: mujoco.MjModel, corners: np.ndarray, camera: Camera, aspect: float) -> bool:
+    """Returns whether the image contains some, but not all of the corners (P, 3)."""
+    forward, right, up = _axes(camera)
+    offset = corners - np.array(camera.lookat)
+    depth = (camera.distance + offset @ forward) * np.tan(np.radians(model.vis.global_.fovy) / 2)
+    inside = (np.abs(offset @ right) <= depth * aspect) & (np.abs(offset @ up) <= depth)
+    return bool(inside.any() and not inside.all())
+
+
+def _axes(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the camera's directions forward, right and up (3,)."""
+    azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
+    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    return forward, right, np.cross(right, forward)
 
 
 def _smoothed(fitted: Sequence[Camera], width: int) -> list[Camera]:
@@ -102,10 +144,7 @@ def _fitted(
     model: mujoco.MjModel, corners: np.ndarray, camera: Camera, aspect: float, distances: tuple[float, float]
 ) -> Camera:
     """Returns a camera of the same direction whose image contains and centres the points `corners` (P, 3)."""
-    azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
-    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    up = np.cross(right, forward)
+    forward, right, up = _axes(camera)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     lookat, distance = (corners.min(axis=0) + corners.max(axis=0)) / 2, 1.0
     for _ in range(60):  # centre the projection, then adjust the distance

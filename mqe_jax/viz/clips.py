@@ -1,4 +1,4 @@
-"""Clips and images, written atomically: .mp4, .gif and .png."""
+"""Clips and images, written atomically: .mp4, .webp, .gif and .png."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 
-SUFFIXES = (".mp4", ".gif", ".png")
+SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
 
 def check_output(path: Path) -> Path:
@@ -38,13 +38,13 @@ def check_output(path: Path) -> Path:
         except ImportError:
             raise InputError(
                 f"output {str(path)!r}: .mp4 needs imageio-ffmpeg "
-                "(pip install 'mqe-jax[render]'); without it use .gif or .png"
+                "(pip install 'mqe-jax[render]'); without it use .webp, .gif or .png"
             ) from None
     return path
 
 
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    """Writes frames (H, W, 3) uint8 as .mp4, .gif or .png (the last frame), atomically."""
+    """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
     path = check_output(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
@@ -54,6 +54,8 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
             _write_mp4(temporary, frames, fps)
         elif suffix == ".gif":
             _write_gif(temporary, list(frames), fps)
+        elif suffix == ".webp":
+            _write_webp(temporary, list(frames), fps)
         else:
             from PIL import Image
 
@@ -97,3 +99,13 @@ def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
     images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
     images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)
+
+
+def _write_webp(path: Path, frames: list[np.ndarray], fps: float) -> None:
+    """Writes an animated WebP, which browsers support and which has about 40% of a GIF's size."""
+    from PIL import Image
+
+    images = [Image.fromarray(frame) for frame in frames]
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, quality=60, method=6
+    )

@@ -53,14 +53,15 @@ def render_episode(
 ) -> str:
     """Renders an episode to a file (format by suffix) and returns the renderer used (`egl`, `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow` for
-    a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the middle).
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif and .webp 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow`
+    for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the
+    middle).
     Without GL, the packages required for 3-D rendering are printed to standard error.
     """
     check_output(path)
     suffix = path.suffix.lower()
-    size = size or {".mp4": (960, 540), ".gif": (480, 270), ".png": (1280, 720)}[suffix]
-    fps = fps or {".mp4": 25.0, ".gif": 12.5, ".png": 1.0}[suffix]
+    size = size or {".mp4": (960, 540), ".webp": (480, 270), ".gif": (480, 270), ".png": (1280, 720)}[suffix]
+    fps = fps or {".mp4": 25.0, ".webp": 12.5, ".gif": 12.5, ".png": 1.0}[suffix]
     if backend == "auto":
         backend = gl_backend()
     if backend is None:
