@@ -3,6 +3,7 @@
 MJX-JAX detects no contact with a box before the surfaces meet, whatever the margin. Here collisions are computed on
 spheres and capsules inflated by their margins; distances and positions are then those of the original surfaces.
 Between a plane and a box MJX-JAX keeps only corners within 1 mm of the deepest one; here all four lower corners count.
+It also misses or misplaces contacts between a capsule and an edge of a box, which are corrected for moving boxes.
 """
 
 from __future__ import annotations
@@ -79,16 +80,26 @@ class MarginStep:
 
 
 def _contacts(model: mjx.Model, data: mjx.Data) -> mjx.Contact:
-    """As `mjx.collision`, with `_plane_box`: contacts by dimension, of each the deepest `max_contact_points`."""
+    """Contacts by dimension, of each the deepest `max_contact_points`.
+
+    As `mjx.collision`, with `_plane_box`, and with `_capsule_box` for boxes that move: for all walls it would cost 7%
+    of a physics step in Narrow Gate.
+    """
     by_dimension: dict[int, list[Any]] = {}
+    geoms = collision_driver._geom_groups(model)
+    moves = model.body_weldid[model.geom_bodyid] != 0
     for key, pairs in collision_driver._contact_groups(model, data).items():
         if key.types == (mjx.GeomType.PLANE, mjx.GeomType.BOX):
             dist, pos, frame = _plane_box(model, data, pairs.geom)
         else:
             function: Any = collision_driver._COLLISION_FUNC[key.types]  # pyright: ignore[reportArgumentType]
             dist, pos, frame = function(model, data, key, pairs.geom)
-            if key.types == (mjx.GeomType.CAPSULE, mjx.GeomType.BOX):
-                dist, pos, frame = _corrected(dist, pos, frame, *_capsule_box(model, data, pairs.geom))
+            rows = np.flatnonzero(moves[np.array(geoms[key])[:, 1]])
+            if key.types == (mjx.GeomType.CAPSULE, mjx.GeomType.BOX) and len(rows):
+                both = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
+                nearest = _capsule_box(model, data, pairs.geom[rows])
+                corrected = _corrected(dist[both], pos[both], frame[both], *nearest)
+                dist, pos, frame = (x.at[both].set(y) for x, y in zip((dist, pos, frame), corrected, strict=True))
         count = len(dist) // len(pairs.geom)
         pairs = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), pairs)
         by_dimension.setdefault(key.condim, []).append(pairs.replace(dist=dist, pos=pos, frame=frame))

@@ -79,8 +79,8 @@ CONTACTS = """
   <option timestep="0.005"><flag eulerdamp="disable"/></option>
   <worldbody>
     <geom name="floor" type="plane" size="9 9 1"/>
-    <geom name="wall" type="box" size="0.04 1 0.3" pos="0 0 0.3"/>
     <body><freejoint/><geom name="box" type="box" size="0.5 0.5 0.5" mass="6"/></body>
+    <body><freejoint/><geom name="wall" type="box" size="0.04 1 0.3" mass="6"/></body>
     <body><freejoint/><geom name="trunk" type="capsule" size="0.065 0.185" mass="5" margin="0.003"/></body>
   </worldbody>
 </mujoco>
@@ -88,7 +88,7 @@ CONTACTS = """
 
 
 def poses(model: mujoco.MjModel) -> np.ndarray:
-    """A tilted box on the floor; a capsule that points at the end of the wall, 1 mm inside or outside: qpos (N, 14)."""
+    """A tilted box on the floor; a capsule that points at the end of the wall, 1 mm inside or outside: qpos (N, 21)."""
     data, found = mujoco.MjData(model), []
 
     def turned(axis: tuple[float, float, float], angle: float) -> np.ndarray:
@@ -110,11 +110,12 @@ def poses(model: mujoco.MjModel) -> np.ndarray:
             for yaw, dist in ((0.0, -1e-3), (0.02, 1e-3), (0.3, -1e-3)):
                 data.qpos[:] = 0.0
                 data.qpos[:3], data.qpos[3:7] = [6.0, 0.0, 2.0], turned((0.6, 0.8, 0.0), tilt)
-                data.qpos[7:10] = [-1.0, 1.0 + beyond - 0.185 * np.sin(yaw), 0.3]
+                data.qpos[7:11] = [0.0, 0.0, 0.5, 1.0]
+                data.qpos[14:17] = [-1.0, 1.0 + beyond - 0.185 * np.sin(yaw), 0.5]
                 across, flat = turned((0.0, 1.0, 0.0), np.pi / 2), turned((0.0, 0.0, 1.0), yaw)
-                mujoco.mju_mulQuat(data.qpos[10:14], flat, across)
+                mujoco.mju_mulQuat(data.qpos[17:21], flat, across)
                 near("box", "floor", slice(0, 3), np.array([0.0, 0.0, -2.0]), -3e-3)
-                near("trunk", "wall", slice(7, 10), np.array([0.75, 0.0, 0.0]), dist)
+                near("trunk", "wall", slice(14, 17), np.array([0.75, 0.0, 0.0]), dist)
                 found.append(data.qpos.copy())
     return np.array(found)
 
