@@ -124,3 +124,12 @@ def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
     # Where a robot leans on an edge of a box, the engines put the contact points otherwise.
     assert figures["play/robots_1"] < 0.03 and figures["play/robots_20"] < 0.05, figures
     assert figures.get("play/objects_20", 0.0) < 0.05, figures
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("task", ["go1pushbox", "go1football-defender", "go1wrestling"])
+def test_mjx_agrees_with_the_c_engine_where_the_solver_converges(task: str) -> None:
+    """With the default limit of 4 iterations some steps end before convergence, differently on each engine."""
+    figures = engines.disagreement(task, "jax", engines.record(task, num_envs=8, solver_iterations=20))
+    assert figures["standing/robots_1"] < 1e-4 and figures["play/robots_1"] < 1e-3, figures
+    assert figures["standing/robots_20"] < 1e-4 and figures["play/robots_20"] < 1e-3, figures

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 
 from mqe_jax import make, physics
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
+from mqe_jax.mjx_step import MarginStep
 from mqe_jax.physics import Physics
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
@@ -70,6 +72,80 @@ def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> N
         data = step(data)
     mujoco.mj_step(plane.model, reference, 49)
     assert np.abs(np.asarray(data.qpos[0]) - reference.qpos).max() < 5e-3
+
+
+CONTACTS = """
+<mujoco>
+  <option timestep="0.005"><flag eulerdamp="disable"/></option>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 1"/>
+    <body><freejoint/><geom name="box" type="box" size="0.5 0.5 0.5" mass="6"/></body>
+    <body><freejoint/><geom name="wall" type="box" size="0.04 1 0.3" mass="6"/></body>
+    <body><freejoint/><geom name="trunk" type="capsule" size="0.065 0.185" mass="5" margin="0.003"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def poses(model: mujoco.MjModel) -> np.ndarray:
+    """A tilted box on the floor; a capsule that points at the end of the wall, 1 mm inside or outside: qpos (N, 21)."""
+    data, found = mujoco.MjData(model), []
+
+    def turned(axis: tuple[float, float, float], angle: float) -> np.ndarray:
+        quaternion = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(quaternion, np.array(axis), angle)
+        return quaternion
+
+    def near(first: str, second: str, position: slice, way_to: np.ndarray, dist: float) -> None:
+        start, (low, high) = data.qpos[position].copy(), (0.0, 1.0)
+        for _ in range(40):
+            way = 0.5 * (low + high)
+            data.qpos[position] = start + way * way_to
+            mujoco.mj_kinematics(model, data)
+            reached = mujoco.mj_geomDistance(model, data, model.geom(first).id, model.geom(second).id, 5.0, None)
+            low, high = (way, high) if reached > dist else (low, way)
+
+    for tilt in (0.0, 2e-3, 4e-3, 0.3):
+        for beyond in (-0.2, -0.02, 0.0, 0.002, 0.005, 0.009, 0.03):  # m; the capsule's tip beyond the wall's end
+            for yaw, dist in ((0.0, -1e-3), (0.02, 1e-3), (0.3, -1e-3)):
+                data.qpos[:] = 0.0
+                data.qpos[:3], data.qpos[3:7] = [6.0, 0.0, 2.0], turned((0.6, 0.8, 0.0), tilt)
+                data.qpos[7:11] = [0.0, 0.0, 0.5, 1.0]
+                data.qpos[14:17] = [-1.0, 1.0 + beyond - 0.185 * np.sin(yaw), 0.5]
+                across, flat = turned((0.0, 1.0, 0.0), np.pi / 2), turned((0.0, 0.0, 1.0), yaw)
+                mujoco.mju_mulQuat(data.qpos[17:21], flat, across)
+                near("box", "floor", slice(0, 3), np.array([0.0, 0.0, -2.0]), -3e-3)
+                near("trunk", "wall", slice(14, 17), np.array([0.75, 0.0, 0.0]), dist)
+                found.append(data.qpos.copy())
+    return np.array(found)
+
+
+def test_contacts_with_boxes_are_those_of_the_c_engine() -> None:
+    """All corners of a tilted box; a capsule near a box's edge, which MJX alone does not detect."""
+    model = mujoco.MjModel.from_xml_string(CONTACTS)
+    qpos, step = poses(model).astype(np.float32), MarginStep(model)
+    fresh = mjx.make_data(model, impl="jax")
+    after = jax.jit(jax.vmap(lambda q: step(step.model, fresh.replace(qpos=q))))(jnp.asarray(qpos))
+    contact = jax.tree.map(np.asarray, after._impl.contact)
+    reference, floor, wall = mujoco.MjData(model), model.geom("floor").id, model.geom("wall").id
+    for number, q in enumerate(qpos):
+        reference.qpos[:] = q
+        mujoco.mj_fwdPosition(model, reference)
+        active = contact.dist[number] < contact.includemargin[number]
+        for geom in (floor, wall):
+            mine = active & (contact.geom[number] == geom).any(axis=1)
+            theirs = (reference.contact.geom == geom).any(axis=1)
+            dist, c_dist = contact.dist[number][mine], reference.contact.dist[theirs]
+            assert len(dist) and len(c_dist), f"{q}: not in contact with {model.geom(geom).name}"
+            if geom == floor:
+                np.testing.assert_allclose(np.sort(dist), np.sort(c_dist), atol=2e-6)
+            first, c_first = np.argmin(dist), np.argmin(c_dist)
+            assert dist[first] == pytest.approx(c_dist[c_first], abs=2e-5)
+            if geom == wall:
+                position = reference.contact.pos[theirs][c_first]
+                np.testing.assert_allclose(contact.pos[number][mine][first], position, atol=1e-3)
+                normal = reference.contact.frame[theirs][c_first][:3]
+                np.testing.assert_allclose(contact.frame[number][mine][first, 0], normal, atol=0.02)
 
 
 def inside(env: QuadrupedEnv, state: Any) -> tuple[np.ndarray, ...]:
