@@ -14,6 +14,7 @@ from PIL import Image, ImageSequence
 from mqe_jax.cli.players import planner
 from mqe_jax.errors import InputError
 from mqe_jax.viz import cameras, clips, geometry, gl, recording, render
+from tests.states import made, placed
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,31 @@ def test_following_cameras_hold_all_robots_in_every_frame(env: FakeEnv, episode:
         assert max(reach) < 1.0
     assert followed[0].distance < 0.8 * whole.distance  # nearer, so that legs are seen
     assert followed[-1].lookat[0] > followed[0].lookat[0] + 0.05  # the robots walk along +x
+
+
+def test_no_robot_of_a_match_is_cut_by_the_image() -> None:
+    """Four robots spread over the field walk towards the ball; the view contains a robot wholly or not at all."""
+    env = made("go1football-2vs2")
+    frames = 60
+    states = [
+        placed(env, [[4 + 0.03 * t, -2 + 0.03 * t, 0.3], [4, 2, 0.3], [10 - 0.04 * t, 2, 0.3], [10, -2.5, 0.3]])
+        for t in range(frames)
+    ]
+    qpos = np.stack([np.asarray(state.data.qpos) for state in states])
+    still = (np.repeat(np.asarray(x)[None], frames, 0) for x in (states[0].data.mocap_pos, states[0].data.mocap_quat))
+    episode = recording.Episode(qpos, *still, dt=0.1)
+    model, data = env.mj_model, mujoco.MjData(env.mj_model)
+    whole = 0
+    for index, camera in enumerate(cameras.cameras(model, episode, "follow")):
+        geometry.pose(model, data, episode, index)
+        for body in geometry.robot_bases(model):
+            corners = data.xpos[body] + np.array(
+                [[x, y, z] for x in (-0.3, 0.3) for y in (-0.3, 0.3) for z in (-0.2, 0.2)]
+            )
+            reach = [in_image(model, camera, corner, 16 / 9) for corner in corners]
+            assert max(reach) <= 1.0 or min(reach) >= 1.0
+            whole += max(reach) <= 1.0
+    assert whole >= 2 * frames
 
 
 def test_the_side_view_follows_the_first_robot(env: FakeEnv, episode: recording.Episode) -> None:

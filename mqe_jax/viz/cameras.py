@@ -32,7 +32,7 @@ scene; side: tracks the first robot from its side."""
 _MARGIN = np.array([0.45, 0.45, 0.3])  # around a followed body, m
 _REACH = 3.0  # distance from the ball within which robots are followed, m
 _TALL = 0.4  # height of walls above the trunks beyond which the camera is steeper, m
-_ROUNDS = 5  # of following further robots
+_ROUNDS = 8  # of following further robots
 _SMOOTHING = 0.8  # duration over which a following camera is averaged, s
 
 
@@ -87,13 +87,12 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
         views = _smoothed(fitted, width)
         rows = zip(corners, views, strict=True)
         cut = np.array([[_cut(model, boxes[robot], camera, aspect) for robot in robots] for boxes, camera in rows])
-        cut &= ~followed[:, robots]
-        if not cut.any():
-            break
-        for index, which in np.argwhere(
-            cut
-        ).tolist():  # a robot that the image would cut is followed too, from earlier on
+        before = followed.copy()
+        # A robot that the image would cut is followed too, from earlier on.
+        for index, which in np.argwhere(cut).tolist():
             followed[max(0, index - 2 * width) : index + 2 * width + 1, robots[which]] = True
+        if np.array_equal(before, followed):
+            break
     return views
 
 
