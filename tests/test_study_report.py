@@ -13,8 +13,9 @@ import pytest
 
 from mqe_jax.errors import InputError
 from mqe_jax.study import paper
+from mqe_jax.study.estimates import band
 from mqe_jax.study.records import MAX_COLUMNS, MAX_ROWS, Cell, Record, read_records, thin, write_record
-from mqe_jax.study.report import band, report
+from mqe_jax.study.report import report
 
 
 def made_up(cell: Cell, seed: int, *, ended: bool = True, scale: float = 1.0) -> Record:

@@ -58,9 +58,9 @@ class Cell:
 class Record:
     """One run: its cell and seed, its thinned curve by column, and its evaluation results.
 
-    `evaluation` holds `evaluations`, a list of {env_steps, sampled, deterministic}, and `absolute`, one such entry with
-    its number of episodes, or None; `sampled` and `deterministic` map names such as average_step_reward and success_rate
-    to numbers or None.
+    `evaluation` holds `evaluations`, a list of {env_steps, sampled, deterministic}, and `absolute`, one such entry
+    with its number of episodes, or None; `sampled` and `deterministic` map names such as average_step_reward and
+    success_rate to numbers or None.
     """
 
     cell: Cell
