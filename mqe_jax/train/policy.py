@@ -90,7 +90,9 @@ def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE, *,
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
     path = Path(run_dir) / name
-    params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, policy.params) if half else policy.params
+    params = policy.params
+    if half:
+        params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
     if wrong := nonfinite({"params": params, "normalizer": policy.normalizer}):
         raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     metadata = {**policy.metadata, "dims": policy.dims._asdict(), "config": to_mapping(policy.config)}
