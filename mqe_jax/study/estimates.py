@@ -146,17 +146,22 @@ ABOVE, ABOUT_ABOVE, ABOUT_BELOW, BELOW = "above", "above, within the interval", 
 """Verdicts of `comparison`: where the estimate and its 95% interval lie relative to the paper's value."""
 
 
+MIN_SEEDS = 3
+"""Seeds that a verdict requires: the interval of a single seed is a point."""
+
+
 def comparison(finals: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
     """Returns the columns `compared` and `ours` to be added to those of `final_table`.
 
     `compared` is the column compared with the paper's value: `training` in the paper's settings, as in its figure, and
-    `absolute` in others, whose training rewards may include shaping. `ours` is a verdict, empty without both values.
+    `absolute` in others, whose training rewards may include shaping. `ours` is a verdict, empty without both values or
+    with fewer than `MIN_SEEDS` seeds.
     """
     compared = ["training" if setting in paper.SETTINGS else "absolute" for setting in finals["setting"]]
     ours = []
     for i, name in enumerate(compared):
         middle, low, high, value = (finals[column][i] for column in (name, f"{name}_low", f"{name}_high", "paper"))
-        if not math.isfinite(middle) or not math.isfinite(value):
+        if finals["seeds"][i] < MIN_SEEDS or not math.isfinite(middle) or not math.isfinite(value):
             ours.append("")
         elif middle > value:
             ours.append(ABOVE if low > value else ABOUT_ABOVE)
