@@ -13,8 +13,9 @@ import pytest
 
 from mqe_jax.errors import InputError
 from mqe_jax.study import paper
+from mqe_jax.study.estimates import band, comparison, evaluated, group
 from mqe_jax.study.records import MAX_COLUMNS, MAX_ROWS, Cell, Record, read_records, thin, write_record
-from mqe_jax.study.report import band, report
+from mqe_jax.study.report import report
 
 
 def made_up(cell: Cell, seed: int, *, ended: bool = True, scale: float = 1.0) -> Record:
@@ -58,13 +59,16 @@ def test_raw_data_are_small_and_keep_the_largest_terms(study: Path) -> None:
     rows = list(csv.reader(path.open()))
     assert len(rows) == MAX_ROWS + 1 and len(rows[0]) <= MAX_COLUMNS
     assert {"reward/approach", "reward/success"} <= set(rows[0]) and "updates" not in rows[0]
-    assert max(len(item.replace("-", "").replace(".", "").lstrip("0")) for row in rows[1:] for item in row[2:]) <= 10
+    assert (
+        max(len(item.lstrip("-").replace(".", "").split("e")[0].lstrip("0")) for row in rows[1:] for item in row[2:])
+        <= 5
+    )
 
 
 def test_thinning_keeps_ends_and_means() -> None:
     curve = thin({"env_steps": np.arange(1.0, 201.0), _REWARD: np.arange(200.0), "success": np.full(200, math.nan)})
-    assert curve["env_steps"][0] == 2 and curve["env_steps"][-1] == 200
-    assert curve[_REWARD][0] == 0.5 and np.isnan(curve["success"]).all()
+    assert curve["env_steps"][0] == 4 and curve["env_steps"][-1] == 200
+    assert curve[_REWARD][0] == 1.5 and np.isnan(curve["success"]).all()
     short = thin({"env_steps": np.array([5.0, 9.0]), _REWARD: np.array([1.0, 2.0])})
     np.testing.assert_array_equal(short[_REWARD], [1.0, 2.0])
 
@@ -82,7 +86,7 @@ def test_final_values_stand_beside_the_papers(study: Path) -> None:
     assert len(rows) == 6
     gate = next(row for row in rows if row["task"] == "go1gate" and row["algorithm"] == "mappo")
     records = [record for record in read_records(study) if record.cell == Cell("go1gate", "mappo")]
-    ends = sorted(record.curve[_REWARD][-2:].mean() for record in records)
+    ends = sorted(record.curve[_REWARD][-1] for record in records)
     assert float(gate["training"]) == pytest.approx(np.mean(ends), rel=1e-4)
     assert float(gate["training_low"]) <= float(gate["training"]) <= float(gate["training_high"])
     assert float(gate["paper"]) == 2.75 and gate["seeds"] == "3"
@@ -147,3 +151,50 @@ def test_the_committed_report_is_remade_from_its_raw_data(tmp_path: Path) -> Non
     for file in files:
         if file.suffix != ".png":
             assert file.read_bytes() == (sweep / "report" / file.name).read_bytes(), file.name
+
+
+def test_other_settings_are_compared_by_their_evaluations(tmp_path: Path) -> None:
+    """Training rewards may include shaping: tuned cells are drawn and compared by evaluations of the plain task."""
+    write_record(tmp_path, made_up(Cell("go1gate", "mappo"), 0))
+    for seed, score in enumerate((3.2, 3.4, 3.6)):
+        record = made_up(Cell("go1gate", "mat", "tuned"), seed, scale=100.0)
+        point = {"episodes": 32, "sampled": {_REWARD: score, "success_rate": 0.5}, "deterministic": {_REWARD: 0.1}}
+        points = [{"env_steps": 20_000_000, **point}, {"env_steps": 40_000_000, **point}]
+        evaluation = {"evaluations": points, "absolute": points[0]}
+        write_record(tmp_path, Record(record.cell, seed, record.curve, evaluation))
+    files = {path.name for path in report(tmp_path)}
+    assert {"curves.png", "evaluations.png", "comparison.csv"} <= files
+    rows = list(csv.DictReader((tmp_path / "report" / "comparison.csv").open()))
+    assert [(row["setting"], row["compared"]) for row in rows] == [("hierarchical", "training"), ("tuned", "absolute")]
+    assert rows[1]["paper"] == "3.1" and rows[1]["ours"] == "above"
+    assert rows[0]["ours"] == ""  # a single seed
+    (cell,) = evaluated({cell: runs for cell, runs in group(read_records(tmp_path)).items() if cell.setting == "tuned"})
+    assert cell.algorithm == "mat"
+
+
+@pytest.mark.parametrize(
+    ("low", "middle", "high", "verdict"),
+    [
+        (3.2, 3.3, 3.4, "above"),
+        (3.0, 3.3, 3.4, "above, within the interval"),
+        (1.0, 2.0, 3.4, "below, within the interval"),
+        (1.0, 2.0, 3.0, "below"),
+        (math.nan, math.nan, math.nan, ""),
+    ],
+)
+def test_verdicts(low: float, middle: float, high: float, verdict: str) -> None:
+    columns = {"setting": ["hierarchical"], "seeds": [3], "paper": [3.1], "training": [middle]}
+    finals = {**columns, "training_low": [low], "training_high": [high]}
+    assert comparison(finals) == {"compared": ["training"], "ours": [verdict]}
+
+
+def test_a_reward_term_that_a_seed_never_gets_is_zero(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        record = made_up(Cell("go1gate", "mappo"), seed)
+        curve = {**record.curve, "reward/success": record.curve["reward/success"] * seed}
+        write_record(tmp_path, Record(record.cell, seed, curve, record.evaluation))
+    records = read_records(tmp_path)
+    assert "reward/success" not in records[0].curve
+    _, middle, _, _ = band(records, "reward/success")
+    np.testing.assert_allclose(middle, records[1].curve["reward/success"] / 2)
+    assert "gate_terms.csv" in {path.name for path in report(tmp_path)}

@@ -23,6 +23,9 @@ STEPS = 40_000_000
 HIERARCHICAL, SCRATCH = "hierarchical", "scratch"
 """The paper's two settings: commands for the walk policy, or joint targets."""
 
+SETTINGS: Mapping[str, str] = {HIERARCHICAL: "hierarchical (walk policy)", SCRATCH: "from scratch (joint targets)"}
+"""Titles of the paper's settings, in the order of its figure."""
+
 VALUES: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     HIERARCHICAL: {
         "go1gate": {"mappo": 2.75, "jrpo": 3.1, "mat": 2.1},
@@ -51,6 +54,17 @@ GATE_STEPS = 20_000_000
 
 
 def value(setting: str, task: str, algorithm: str) -> float | None:
-    """Returns the paper's value of a cell, the best algorithm's where only that is known, or None."""
-    cell = VALUES.get(setting, {}).get(task, {})
+    """Returns the paper's value to compare a cell with, or None.
+
+    That is the value of the same cell; from scratch, the best algorithm's; for a setting that the paper does not have,
+    `best` of the task.
+    """
+    if setting not in SETTINGS:
+        return best(task)
+    cell = VALUES[setting].get(task, {})
     return cell.get(algorithm, cell.get("best"))
+
+
+def best(task: str) -> float | None:
+    """Returns the paper's best value of a task over all algorithms, with the walk policy, or None."""
+    return max(VALUES[HIERARCHICAL].get(task, {}).values(), default=None)

@@ -1,7 +1,11 @@
 """Raw data of a sweep: per run, a CSV file with its curve and a JSON file with its evaluations.
 
-FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    at most 100 rows, 10 columns, 6 digits
-FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, evaluations during training, absolute metric
+FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    the training curve: at most 50 rows, 10 columns, 5 digits
+FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, main numbers of the evaluations during training as columns,
+                                                 absolute metric
+
+Files of the earlier format (100 rows, 6 digits, evaluations as a list with all numbers) are read as well. The complete
+data are in the run folders.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,9 +27,14 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.paper import HIERARCHICAL
 
-MAX_ROWS, MAX_COLUMNS, DIGITS = 100, 10, 6
+MAX_ROWS, MAX_COLUMNS, RAW_DIGITS, DIGITS = 50, 10, 5, 6
+"""Limits of the raw data, and significant digits in the report's tables."""
 COLUMNS = ("env_steps", "seconds", "average_step_reward", "success", "episode_length")
-"""Columns that every curve keeps; reward terms fill the rest, largest mean magnitude first."""
+"""Columns that every curve keeps; nonzero reward terms fill the rest, largest mean magnitude first."""
+MODES = ("sampled", "deterministic")
+"""Actions of an evaluation: sampled from the policy, or its mean."""
+EVALUATED = ("average_step_reward", "success_rate", "episode_return")
+"""Numbers that are kept of each evaluation during training, for both modes."""
 
 Curve = dict[str, NDArray[np.float64]]
 
@@ -49,8 +58,9 @@ class Cell:
 class Record:
     """One run: its cell and seed, its thinned curve by column, and its evaluation results.
 
-    `evaluation` holds `evaluations`, a list of {env_steps, episodes, sampled, deterministic}, and `absolute`, one such
-    entry or None; `sampled` and `deterministic` map names such as average_step_reward and success_rate to numbers.
+    `evaluation` holds `evaluations`, a list of {env_steps, sampled, deterministic}, and `absolute`, one such entry
+    with its number of episodes, or None; `sampled` and `deterministic` map names such as average_step_reward and
+    success_rate to numbers or None.
     """
 
     cell: Cell
@@ -66,10 +76,8 @@ def thin(curve: Curve) -> Curve:
     """
     steps = len(curve["env_steps"])
     ends = np.unique(np.linspace(0, steps, min(steps, MAX_ROWS) + 1).round().astype(int))
-    terms = sorted(
-        (name for name in curve if name.startswith("reward/")),
-        key=lambda name: (-float(np.nanmean(np.abs(curve[name]))) if np.isfinite(curve[name]).any() else 0.0, name),
-    )
+    size = {name: _magnitude(curve[name]) for name in curve if name.startswith("reward/")}
+    terms = sorted((name for name in size if size[name] > 0.0), key=lambda name: (-size[name], name))
     names = [*(name for name in COLUMNS if name in curve), *terms][:MAX_COLUMNS]
     thinned: Curve = {}
     for name in names:
@@ -77,6 +85,10 @@ def thin(curve: Curve) -> Curve:
         at_end = name in ("env_steps", "seconds")
         thinned[name] = np.array([part[-1] if at_end else _mean(part) for part in parts])
     return thinned
+
+
+def _magnitude(values: NDArray[np.float64]) -> float:
+    return _mean(np.abs(values)) if np.isfinite(values).any() else 0.0
 
 
 def _mean(values: NDArray[np.float64]) -> float:
@@ -104,20 +116,20 @@ def read_curve(path: Path) -> Curve:
     return curve
 
 
-def number(value: float) -> str:
-    """Returns a number with `DIGITS` significant digits; integers, such as steps, in full."""
+def number(value: float, digits: int = DIGITS) -> str:
+    """Returns a number with `digits` significant digits; integers, such as steps, in full."""
     value = float(value)
     whole = math.isfinite(value) and value.is_integer() and abs(value) < 1e15
-    return str(int(value)) if whole else f"{value:.{DIGITS}g}"
+    return str(int(value)) if whole else f"{value:.{digits}g}"
 
 
-def table(columns: Mapping[str, Any]) -> str:
+def table(columns: Mapping[str, Any], digits: int = DIGITS) -> str:
     """Returns columns of equal length as CSV text; numbers as `number` writes them."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     for row in zip(*columns.values(), strict=True):
-        writer.writerow([item if isinstance(item, str) else number(item) for item in row])
+        writer.writerow([item if isinstance(item, str) else number(item, digits) for item in row])
     return text.getvalue()
 
 
@@ -127,8 +139,9 @@ def write_record(folder: Path, record: Record) -> None:
     path = folder / "raw" / cell.path / f"seed{record.seed}"
     path.parent.mkdir(parents=True, exist_ok=True)
     identity = {"task": cell.task, "algorithm": cell.algorithm, "setting": cell.setting, "seed": record.seed}
-    write_atomically(path.with_suffix(".csv"), table(thin(record.curve)).encode())
-    text = json.dumps(_rounded({**identity, **record.evaluation}), separators=(",", ":")) + "\n"
+    write_atomically(path.with_suffix(".csv"), table(thin(record.curve), RAW_DIGITS).encode())
+    evaluation = {"evaluations": _columns(record.evaluation["evaluations"]), "absolute": record.evaluation["absolute"]}
+    text = json.dumps(_rounded({**identity, **evaluation}), separators=(",", ":")) + "\n"
     write_atomically(path.with_suffix(".json"), text.encode())
 
 
@@ -146,7 +159,7 @@ def read_records(folder: Path) -> list[Record]:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
             cell = Cell(values["task"], values["algorithm"], values["setting"])
-            evaluation = {"evaluations": values.get("evaluations", []), "absolute": values.get("absolute")}
+            evaluation = {"evaluations": _points(values.get("evaluations", [])), "absolute": values.get("absolute")}
             records.append(Record(cell, int(values["seed"]), read_curve(path.with_suffix(".csv")), evaluation))
         except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
@@ -155,10 +168,40 @@ def read_records(folder: Path) -> list[Record]:
     return sorted(records, key=lambda record: (record.cell.path.as_posix(), record.seed))
 
 
+def _columns(points: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Returns the numbers of evaluations that are kept as columns: env_steps and MODE/NAME."""
+    columns = {"env_steps": [point["env_steps"] for point in points]}
+    for mode, name in itertools.product(MODES, EVALUATED):
+        values = [point.get(mode, {}).get(name) for point in points]
+        if any(value is not None for value in values):
+            columns[f"{mode}/{name}"] = values
+    return columns
+
+
+def _points(evaluations: Any) -> list[dict[str, Any]]:
+    """Returns evaluations as a list, from columns or from the earlier format."""
+    if isinstance(evaluations, list):
+        return evaluations
+    points: list[dict[str, Any]] = [
+        {"env_steps": steps, **{mode: {} for mode in MODES}} for steps in evaluations["env_steps"]
+    ]
+    for column, values in evaluations.items():
+        mode, slash, name = column.partition("/")
+        if slash:
+            for point, value in zip(points, values, strict=True):
+                point[mode][name] = value
+    return points
+
+
+def _short(value: float) -> float | int:
+    value = float(f"{value:.{RAW_DIGITS}g}")
+    return int(value) if value.is_integer() else value
+
+
 def _rounded(value: Any) -> Any:
-    """Returns JSON values with floats of at most `DIGITS` significant digits; non-finite ones become null."""
+    """Returns JSON values with floats of at most `RAW_DIGITS` significant digits; non-finite ones become null."""
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+        return _short(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {key: _rounded(item) for key, item in value.items()}
     return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value

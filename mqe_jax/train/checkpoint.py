@@ -88,8 +88,10 @@ def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
     return _read(Path(path), kind)[1]
 
 
-def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
+def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False) -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
+
+    With `half`, float16 leaves are allowed where the template has float32, and are converted to it.
 
     Raises:
         InputError: in one line naming the file, for a missing, damaged or truncated file, another format or format
@@ -110,7 +112,9 @@ def load_tree(path: str | Path, template: Any, *, kind: str) -> Checkpoint:
         found = arrays[name]
         if tuple(found.shape) != tuple(leaf.shape):
             raise InputError(f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed")
-        if found.dtype != leaf.dtype:
+        if half and found.dtype == np.float16 and leaf.dtype == np.float32:
+            arrays[name] = found.astype(np.float32)
+        elif found.dtype != leaf.dtype:
             raise InputError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
     leaves = [jnp.asarray(arrays[name]) for name in expected]
     return Checkpoint(jax.tree_util.tree_unflatten(structure, leaves), metadata)

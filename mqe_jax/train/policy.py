@@ -83,22 +83,25 @@ def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata:
     return Policy(policy_params, state.obs_normalizer.obs, dims, config, metadata)
 
 
-def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE) -> Path:
-    """Writes a policy into a run folder atomically.
+def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
+    """Writes a policy into a run folder atomically; with `half`, its parameters as float16.
 
     Raises:
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
     path = Path(run_dir) / name
-    if wrong := nonfinite({"params": policy.params, "normalizer": policy.normalizer}):
+    params = policy.params
+    if half:
+        params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
+    if wrong := nonfinite({"params": params, "normalizer": policy.normalizer}):
         raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     metadata = {**policy.metadata, "dims": policy.dims._asdict(), "config": to_mapping(policy.config)}
-    save_tree(path, {"params": policy.params, "normalizer": policy.normalizer}, metadata, kind="policy")
+    save_tree(path, {"params": params, "normalizer": policy.normalizer}, metadata, kind="policy")
     return path
 
 
 def load_policy(run: str | Path) -> Policy:
-    """Reads the policy of a run folder, or a policy file.
+    """Reads the policy of a run folder, or a policy file; parameters stored as float16 become float32.
 
     Raises:
         InputError: in one line naming the file, if it is missing, damaged, of another format or non-finite.
@@ -119,7 +122,7 @@ def load_policy(run: str | Path) -> Policy:
         params = network.policy_params(network.init(jax.random.PRNGKey(0)))
         return {"params": params, "normalizer": running_init(dims.observation)}
 
-    tree = load_tree(path, jax.eval_shape(template), kind="policy").tree
+    tree = load_tree(path, jax.eval_shape(template), kind="policy", half=True).tree
     if wrong := nonfinite(tree):
         raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; it was written by a diverged run")
     return Policy(tree["params"], tree["normalizer"], dims, config, metadata)
