@@ -104,7 +104,8 @@ def test_shaping_terms_of_football() -> None:
 
 @pytest.mark.parametrize("task", [BOX, BALL])
 def test_weights_of_shaping_terms_count_in_training_only_where_given(task: str) -> None:
-    env: Any = make(task, impl="c", control="position", **{"rewards.approach": 2.0})
+    weights: dict[str, Any] = {"rewards.approach": 2.0}
+    env: Any = make(task, impl="c", control="position", **weights)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     step = jax.jit(env.step)
     for _ in range(5):
