@@ -83,14 +83,14 @@ def test_following_cameras_hold_all_robots_in_every_frame(env: FakeEnv, episode:
 def test_no_robot_of_a_match_is_cut_by_the_image() -> None:
     """Four robots spread over the field walk towards the ball; the view contains a robot wholly or not at all."""
     env = made("go1football-2vs2")
-    frames = 60
+    frames = 30
     states = [
-        placed(env, [[4 + 0.03 * t, -2 + 0.03 * t, 0.3], [4, 2, 0.3], [10 - 0.04 * t, 2, 0.3], [10, -2.5, 0.3]])
+        placed(env, [[4 + 0.06 * t, -2 + 0.06 * t, 0.3], [4, 2, 0.3], [10 - 0.08 * t, 2, 0.3], [10, -2.5, 0.3]])
         for t in range(frames)
     ]
     qpos = np.stack([np.asarray(state.data.qpos) for state in states])
     still = (np.repeat(np.asarray(x)[None], frames, 0) for x in (states[0].data.mocap_pos, states[0].data.mocap_quat))
-    episode = recording.Episode(qpos, *still, dt=0.1)
+    episode = recording.Episode(qpos, *still, dt=0.2)
     model, data = env.mj_model, mujoco.MjData(env.mj_model)
     whole = 0
     for index, camera in enumerate(cameras.cameras(model, episode, "follow")):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -17,10 +18,16 @@ BOX, BALL = "go1pushbox", "go1football-defender"
 GOAL = np.array([12.0, 0.0])
 
 
+@functools.cache
+def compiled(task: str, **params: Any) -> tuple[Any, Any]:
+    """A task with position control on the C engine, and its compiled reset of many environments."""
+    env: Any = make(task, impl="c", control="position", **params)
+    return env, jax.jit(jax.vmap(env.reset, (0, None)))
+
+
 def resets(task: str, assistance: float, **params: Any) -> tuple[Any, State]:
     """64 initial states of a task with position control on the C engine."""
-    env: Any = make(task, impl="c", control="position", **params)
-    reset = jax.jit(jax.vmap(env.reset, (0, None)))
+    env, reset = compiled(task, **params)
     return env, reset(jax.random.split(jax.random.PRNGKey(3), 64), assistance)
 
 

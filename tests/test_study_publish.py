@@ -84,7 +84,9 @@ def tree(folder: Path) -> dict[str, tuple[bytes, int]]:
     return {path.relative_to(folder).as_posix(): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
 
-@pytest.mark.parametrize("below", ["runs/{cell}/{seed}/best", "best/{cell}/{seed}"])
+@pytest.mark.parametrize(
+    "below", ["runs/{cell}/{seed}/best", pytest.param("best/{cell}/{seed}", marks=pytest.mark.soak)]
+)
 def test_the_best_seeds_policy_is_published_once(tmp_path: Path, below: str) -> None:
     sweep, target = make_sweep(tmp_path / "sweep", {0: 1.0, 1: 3.0, 2: 2.0}, below), tmp_path / "published"
     assert publish_sweep.publish([sweep], target) == []
