@@ -71,6 +71,7 @@ class PushBoxParams(TaskParams):
     """Curriculum: box and robots start up to head_start x `State.assistance` further along x, m, so that agents first
     learn the end of the push. Inactive at assistance 0.
     """
+    solver_iterations: PositiveInt = 8  # with 4 the pushed box does not converge on Warp
     contacts_per_robot: PositiveInt = 16
     rewards: PushBoxRewards = PushBoxRewards()
     """Weights of the reward terms."""
