@@ -467,9 +467,12 @@ def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
 def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
     """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
     env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
-    stand = np.array([[1.0, 0.0, 0.30]])
-    starts = placed(env, stand), placed(env, stand + np.array([0, 0, 1])), moving(env, placed(env, stand), [0, 0, 3])
-    start = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    def start_at(key: Array, height: Array, speed: Array) -> Any:
+        position = jnp.array([[1.0, 0.0, 0.0]]).at[0, 2].set(height)
+        return moving(env, placed(env, position, state=env.reset(key)), [0.0, 0.0, speed])
+
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    start = jax.vmap(start_at)(keys, jnp.array([0.3, 1.3, 0.3]), jnp.array([0.0, 0.0, 3.0]))
     step = jax.jit(jax.vmap(env.step)).lower(start, jnp.zeros((3, 1, 12))).compile(compiler_options=QUICK)
     after = step(start, jnp.zeros((3, 1, 12)))
     assert after.metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
