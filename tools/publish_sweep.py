@@ -29,8 +29,8 @@ from mqe_jax.study.records import Cell, Record, read_records, write_record
 from mqe_jax.train.policy import POLICY_FILE, Policy, load_policy, save_policy
 from mqe_jax.train.runner import CONFIG_FILE, load_run_config
 
-POLICIES = ("*+tuned",)
-"""Patterns of the cells whose policies are published by default; all policies would exceed the size of the raw data."""
+POLICIES = ("*/mappo", "*/jrpo", "*/mat", "*+tuned")
+"""Patterns of the cells whose policies are published by default: without those from scratch and of ablations."""
 
 
 def publish(sweeps: Sequence[Path], target: Path, policies: Sequence[str] = POLICIES) -> list[str]:
