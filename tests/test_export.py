@@ -22,7 +22,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from mqe_jax.export.check import largest_error, reference  # noqa: E402
 from mqe_jax.export.policy import shapes, to_onnx  # noqa: E402
 
-GATE = Path(__file__).parents[1] / "results" / "gate" / "seed0"
+GATE = Path(__file__).parents[1] / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned"
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
 
 

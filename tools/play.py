@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "play"
-RUN = ROOT / "results" / "gate" / "seed0"
+RUN = ROOT / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned"
 
 
 class Package(NamedTuple):

@@ -107,5 +107,5 @@ def _write_webp(path: Path, frames: list[np.ndarray], fps: float) -> None:
 
     images = [Image.fromarray(frame) for frame in frames]
     images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, quality=60, method=6
+        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, quality=40, method=6, minimize_size=True
     )
