@@ -11,8 +11,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 
 import pytest
 
-# The tests compile far longer than they simulate. Unoptimised code halves their time, and so does XLA's fusion emitter
-# without MLIR (a version of XLA that lacks this option ignores it). The soak runs optimised code.
+# The tests compile far longer than they simulate. Unoptimised code halves their time, and XLA's fusion emitters without
+# MLIR save a third of the rest (an XLA that lacks this option ignores it). The soak runs optimised code.
 UNOPTIMISED = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     " --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"

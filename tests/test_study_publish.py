@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -158,10 +159,14 @@ def test_raw_data_keep_the_main_numbers(tmp_path: Path) -> None:
     }
 
 
-def test_records_of_the_earlier_format_are_read() -> None:
-    (record, *_) = read_records(ROOT / "results" / "sweep" / "killed")
-    point = record.evaluation["evaluations"][0]
-    assert "reward/approach" in point["sampled"] and point["episodes"] == 32
+def test_records_of_the_earlier_format_are_read(tmp_path: Path) -> None:
+    """Which has a list of evaluations, each with all its numbers."""
+    write_record(tmp_path, run_of(0, 1.5))
+    (file,) = tmp_path.rglob("seed0.json")
+    evaluations = run_of(0, 1.5).evaluation["evaluations"]
+    file.write_text(json.dumps({**json.loads(file.read_text()), "evaluations": evaluations}))
+    (record,) = read_records(tmp_path)
+    assert record.evaluation["evaluations"] == evaluations
 
 
 # -- what is committed -------------------------------------------------------------------------------------------------
