@@ -56,7 +56,7 @@ def placed(
     return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
 
 
-def moving(env: Any, state: State, velocity: Sequence[float]) -> State:
+def moving(env: Any, state: State, velocity: Sequence[float | jax.Array]) -> State:
     """The state with the first robot's trunk moving at a velocity (3,), m/s, world frame."""
     qvel = state.data.qvel.at[env.index.base_qvel[0, :3]].set(jnp.asarray(velocity))
     return dataclasses.replace(state, data=state.data.replace(qvel=qvel))

@@ -467,6 +467,7 @@ def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
 def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
     """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
     env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
+
     def start_at(key: Array, height: Array, speed: Array) -> Any:
         position = jnp.array([[1.0, 0.0, 0.0]]).at[0, 2].set(height)
         return moving(env, placed(env, position, state=env.reset(key)), [0.0, 0.0, speed])
