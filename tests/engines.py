@@ -25,13 +25,15 @@ from mqe_jax.planners import scripted_policy
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
 
-def comparable(task: str, engine: str, num_envs: int, solver_iterations: int) -> Any:
+def comparable(task: str, engine: str, num_envs: int, solver_iterations: int | None) -> Any:
     """An environment of a task with joint targets as actions, whose episodes do not end."""
-    options: dict[str, Any] = {"control": "position", "episode_length": 1000.0, "solver_iterations": solver_iterations}
+    options: dict[str, Any] = {"control": "position", "episode_length": 1000.0}
+    if solver_iterations is not None:
+        options["solver_iterations"] = solver_iterations
     return make(task, impl=engine, num_envs=num_envs, **options)
 
 
-def settled(task: str, num_envs: int, seed: int = 0, solver_iterations: int = 4) -> tuple[Any, State]:
+def settled(task: str, num_envs: int, seed: int = 0, solver_iterations: int | None = None) -> tuple[Any, State]:
     """Environments of a task on MuJoCo's C engine in which the robots stand after their drop."""
     env = comparable(task, "c", num_envs, solver_iterations)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(3 * seed), num_envs))
@@ -82,7 +84,7 @@ def ahead(obs: jax.Array) -> jax.Array:
     return jnp.zeros((len(obs), 3)).at[:, 0].set(0.5)
 
 
-def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int = 4) -> dict[str, np.ndarray]:
+def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int | None = None) -> dict[str, np.ndarray]:
     """Reference trajectories of the C engine under those actions: initial states, and qpos (T, 2 N, nq).
 
     The first half of the environments have standing robots, the others are in play.
@@ -98,7 +100,7 @@ def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int =
         **{f"data/{name}": np.asarray(field) for name, field in data.items()},
         **{f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(others))},
         "seed": np.array(seed),
-        "solver_iterations": np.array(solver_iterations),
+        "solver_iterations": np.array(env.params.solver_iterations),
         "qpos": np.asarray(rolled(env, states, actions_of(env, 2 * num_envs, seed))[1]),
     }
 
@@ -174,7 +176,7 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", default=list(TASKS))
     parser.add_argument("--num-envs", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--solver-iterations", type=int, default=4)
+    parser.add_argument("--solver-iterations", type=int, help="default: those of the task")
     options = parser.parse_intermixed_args()
     for task in options.tasks:
         began, file = time.perf_counter(), options.folder / f"{task}.npz"
