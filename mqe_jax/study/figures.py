@@ -70,6 +70,9 @@ def draw_curves(cells: Cells) -> bytes:
                 records = cells.get(Cell(task, algorithm, setting))
                 if records is not None:
                     _draw_band(axes, records, REWARD, _color(algorithm, algorithms), _label(algorithm))
+            if not axes.lines:
+                axes.text(0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes)
+                axes.set_xticks([])
             values = paper.VALUES.get(setting, {}).get(task, {})
             _draw_values(axes, {name: x for name, x in values.items() if name in (*algorithms, "best")})
             _style_axes(axes, paper.TITLES.get(task, task))
