@@ -24,7 +24,7 @@ def _figure(width: float, height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure((width, height), dpi=130, layout="constrained")
+    figure = Figure((width, height), dpi=105, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
