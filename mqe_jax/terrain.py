@@ -232,8 +232,8 @@ class DoorGap(Gate):
 class RoughGround:
     """Perlin-noise ground instead of the flat floor; a height field, on all engines.
 
-    On Warp its contacts chatter: joints of a standing robot move at up to 4.4 rad/s (0.2 rad/s on the C engine), whatever
-    the number of solver iterations.
+    On Warp its contacts chatter: joints of a standing robot move at up to 4.4 rad/s (0.2 rad/s on the C engine),
+    whatever the number of solver iterations.
     """
 
     amplitude: Ranged = 0.03
