@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mqe_jax.cli.arguments import Train, parse
+from mqe_jax.cli.arguments import Sweep, Train, parse
 from mqe_jax.cli.flags import given
 from mqe_jax.cli.setup import parse_overrides, train_config
 from mqe_jax.errors import InputError, NonFiniteError
@@ -263,6 +263,17 @@ def test_single_cells_are_trained_with_the_settings_of_their_part(tmp_path: Path
             assert config == configs[cell][0] and command.num_seeds == len(configs[cell])
             cells.add(cell.setting)
     assert cells == {paper.HIERARCHICAL, paper.SCRATCH, "tuned"}
+
+
+def test_every_cell_has_one_command() -> None:
+    commands = [parse(words[1:]) for words in page_commands() if words[0] == "mqe"]
+    cells = [
+        cell
+        for command in commands
+        if isinstance(command, Sweep) and command.cells
+        for cell in sweeps.select(sweeps.load_sweep(ROOT / command.file), command.cells)
+    ]
+    assert len(cells) == len(set(cells)) and set(cells) == set(study_page.planned(study_page.RESULTS))
 
 
 def test_the_pages_commands_exist() -> None:

@@ -146,6 +146,20 @@ def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
         build(Sweep, {"tasks": ["go1gate"], **change})
 
 
+def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:
+    text = FILE + "variants: {hierarchical: {}, scratch: {env: {control: position}}}\n"
+    sweep = load(tmp_path, text)
+
+    def names(*patterns: str) -> list[str]:
+        return [job.cell.path.as_posix() for job in sweeps.plan(sweep, tmp_path, config_of, patterns)]
+
+    assert names() == ["go1gate/mappo", "go1gate/mappo+scratch", "go1gate/jrpo", "go1gate/jrpo+scratch"]
+    assert names("go1gate/jrpo") == ["go1gate/jrpo"]
+    assert names("go1gate/jrpo+scratch", "*/mappo") == ["go1gate/mappo", "go1gate/jrpo+scratch"]
+    with pytest.raises(InputError, match=r"cells: 'go1gate/mapo' matches no cell \(did you mean 'go1gate/mappo'\?\)"):
+        names("*/mappo", "go1gate/mapo")
+
+
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
     sweep = load(tmp_path)
     sweeps.prepare(sweep, tmp_path / "study")
@@ -165,6 +179,9 @@ def test_the_commands_say_what_is_left_and_report(
     assert cli.main([*arguments, "--dry-run"]) == 0
     out = capfd.readouterr().out
     assert "go1gate jrpo hierarchical" in out and "time unknown" in out and not (tmp_path / "study").exists()
+    assert cli.main([*arguments, "--cells", "*/mappo", "--json"]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["left"]["jobs"] == [] and [configs[0].ppo.ratio for configs in trained] == ["dimension"]
     assert cli.main([*arguments, "--json"]) == 0
     result = json.loads(capfd.readouterr().out)
     assert result["left"]["jobs"] == [] and len(trained) == 2

@@ -6,7 +6,6 @@ The text between `<!-- begin NAME -->` and `<!-- end NAME -->` of docs/results/p
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +28,7 @@ from mqe_jax.study.estimates import (
 )
 from mqe_jax.study.records import Cell, read_records
 from mqe_jax.study.report import markdown, report
-from mqe_jax.study.sweep import load_sweep
+from mqe_jax.study.sweep import load_sweep, select
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results" / "paper"
@@ -74,8 +73,8 @@ def planned(results: Path) -> dict[Cell, set[int]]:
     cells: dict[Cell, set[int]] = {}
     for path in sorted(results.glob("*.yaml")):
         sweep = load_sweep(path)
-        for task, algorithm, setting in itertools.product(sweep.tasks, sweep.algorithms, sweep.variants):
-            cells.setdefault(Cell(task, algorithm, setting), set()).update(sweep.seeds)
+        for cell in select(sweep):
+            cells.setdefault(cell, set()).update(sweep.seeds)
     return cells
 
 
@@ -182,6 +181,15 @@ def _versus_best(wanted: Callable[[str], bool]) -> Callable[[Columns, Cells, Pat
     return section
 
 
+def _commands(columns: Columns, cells: Cells, results: Path) -> str:
+    """Returns the command that trains each cell, by sweep file."""
+    lines = ["```bash"]
+    for path in sorted(results.glob("*.yaml")):
+        file = f"results/paper/{path.name}"
+        lines += [f"mqe sweep {file} --cells {cell.path.as_posix()}" for cell in select(load_sweep(path))]
+    return "\n".join([*lines, "```"])
+
+
 def _aggregates(columns: Columns, cells: Cells, results: Path) -> str:
     tables = [markdown(table) for table in aggregate_tables(cells).values()]
     return "\n\n".join(tables) or "No two algorithms have finished the same task yet."
@@ -195,5 +203,6 @@ SECTIONS: Mapping[str, Callable[[Columns, Cells, Path], str]] = {
     paper.SCRATCH: _of(paper.SCRATCH),
     TUNED: _versus_best(lambda setting: setting == TUNED),
     "ablations": _versus_best(lambda setting: setting != TUNED and setting not in paper.SETTINGS),
+    "commands": _commands,
 }
 """Generated sections of the page by name."""

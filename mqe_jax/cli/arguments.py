@@ -230,6 +230,9 @@ class Sweep:
     json: Json = False
     folder: Path | None = None
     """Folder of the sweep. Default: runs/NAME of the file."""
+    cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
+    """Train these cells only: TASK/ALGORITHM, followed by +SETTING for settings other than hierarchical; may be a
+    pattern such as '*/mat', and may be repeated."""
     dry_run: bool = False
     """Print the remaining training runs and their estimated time, without training."""
     impl: Impl = "auto"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
         name = settings.config and settings.config.replace("{task}", task)
         return train_config(task, name, algorithm=algorithm)
 
-    jobs = sweeps.plan(settings, folder, config_of)
+    jobs = sweeps.plan(settings, folder, config_of, arguments.cells)
     result = _estimate(folder, jobs)
     if arguments.dry_run:
         if not arguments.json:
@@ -39,7 +40,8 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
     try:
         others = sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
     except KeyboardInterrupt:
-        echo(f"mqe: stopped; resume with: mqe sweep {arguments.file} --folder {folder}")
+        cells = "".join(f" --cells {shlex.quote(cell)}" for cell in arguments.cells)
+        echo(f"mqe: stopped; resume with: mqe sweep {arguments.file} --folder {folder}{cells}")
         raise
     if others:
         cells = ", ".join(job.cell.path.as_posix() for job in others)
@@ -47,7 +49,8 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
     files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
     if files:
         echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
-    return {"left": _estimate(folder, sweeps.plan(settings, folder, config_of)), "report": [str(f) for f in files]}
+    left = sweeps.plan(settings, folder, config_of, arguments.cells)
+    return {"left": _estimate(folder, left), "report": [str(file) for file in files]}
 
 
 def report(arguments: Report) -> dict[str, Any]:

@@ -9,6 +9,7 @@ FOLDER/report/...    the report, regenerated when the sweep ends (`mqe_jax.study
 from __future__ import annotations
 
 import contextlib
+import fnmatch
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,7 @@ from typing import Annotated, Any
 import yaml
 from annotated_types import MinLen
 
-from mqe_jax.errors import InputError, InUseError
+from mqe_jax.errors import InputError, InUseError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import NonNegativeInt, PositiveInt, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.paper import HIERARCHICAL
@@ -95,20 +96,40 @@ def load_sweep(path: Path) -> Sweep:
         raise InputError(f"{path}: {error}") from None
 
 
-def plan(sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig]) -> list[Job]:
-    """Returns the remaining jobs in the order of training.
+def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
+    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+SETTING], match a pattern; all without patterns.
+
+    Raises:
+        InputError: for a pattern that matches no cell.
+    """
+    product = itertools.product(sweep.tasks, sweep.algorithms, sweep.variants)
+    cells = {cell.path.as_posix(): cell for cell in itertools.starmap(Cell, product)}
+    wanted = set()
+    for pattern in patterns or ("*",):
+        found = [name for name in cells if fnmatch.fnmatchcase(name, pattern)]
+        if not found:
+            allowed = f"allowed: {', '.join(cells)}, or patterns such as */mat"
+            raise InputError(f"cells: {pattern!r} matches no cell{nearest(pattern, cells)}; {allowed}")
+        wanted.update(found)
+    return [cell for name, cell in cells.items() if name in wanted]
+
+
+def plan(
+    sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig], cells: Sequence[str] = ()
+) -> list[Job]:
+    """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
 
     `config_of(task, algorithm)` gives the settings that those of the sweep override. Runs with raw data are complete.
     The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 
     Raises:
-        InputError: for a task, an algorithm or a setting that is not allowed.
+        InputError: for a task, an algorithm, a setting or a pattern that is not allowed.
     """
     jobs = []
-    for task, algorithm, variant in itertools.product(sweep.tasks, sweep.algorithms, sweep.variants):
-        config = override(override(config_of(task, algorithm), sweep.settings), sweep.variants[variant])
-        cell = Cell(task, algorithm, variant)
+    for cell in select(sweep, cells):
+        config = override(config_of(cell.task, cell.algorithm), sweep.settings)
+        config = override(config, sweep.variants[cell.setting])
         left = [seed for seed in sweep.seeds if not _raw(folder, cell, seed).is_file()]
         started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
         fresh = [seed for seed in left if seed not in started]
