@@ -194,7 +194,7 @@ def test_the_page_agrees_with_the_committed_raw_data() -> None:
 
 def test_a_page_that_disagrees_is_found(tmp_path: Path) -> None:
     shutil.copytree(study_page.RESULTS / "raw", tmp_path / "raw")
-    for part in PARTS:
+    for part in [*PARTS, study_page.RESULTS / study_page.FRESH]:
         shutil.copy(part, tmp_path)
     text = study_page.PAGE.read_text(encoding="utf-8")
     (tmp_path / "raw" / "go1gate" / "mappo" / "seed0.json").unlink()

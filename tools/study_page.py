@@ -6,6 +6,7 @@ The text between `<!-- begin NAME -->` and `<!-- end NAME -->` of docs/results/p
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +33,8 @@ from mqe_jax.study.sweep import load_sweep, select
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results" / "paper"
+FRESH = "fresh_episodes.json"
+"""File of a results folder: task -> seed -> success rate and reward of the tuned policies over 512 fresh episodes."""
 PAGE = ROOT / "docs" / "results" / "paper.md"
 
 Columns = Mapping[str, Sequence[Any]]
@@ -172,13 +175,28 @@ def _of(setting: str) -> Callable[[Columns, Cells, Path], str]:
     return lambda columns, cells, results: _table(_rows(columns, lambda row: row["setting"] == setting), _PAPERS)
 
 
-def _versus_best(wanted: Callable[[str], bool]) -> Callable[[Columns, Cells, Path], str]:
-    def section(columns: Columns, cells: Cells, results: Path) -> str:
-        rows = _rows(columns, lambda row: wanted(row["setting"]))
-        rows = [{**row, "exceeds": "yes" if row["ours"] == ABOVE else "no" if row["ours"] else ""} for row in rows]
-        return _table(rows, _OTHERS)
+def _versus_best(columns: Columns, wanted: Callable[[str], bool], names: Mapping[str, str] = _OTHERS) -> str:
+    rows = _rows(columns, lambda row: wanted(row["setting"]))
+    return _table(
+        [{**row, "exceeds": "yes" if row["ours"] == ABOVE else "no" if row["ours"] else ""} for row in rows], names
+    )
 
-    return section
+
+def _tuned(columns: Columns, cells: Cells, results: Path) -> str:
+    """Returns the table of the tuned settings, with the success rates of each seed over fresh episodes."""
+    fresh = json.loads((results / FRESH).read_text(encoding="utf-8"))["tasks"]
+    shown = [
+        ", ".join(f"{100 * seed['success_rate']:.1f}" for _, seed in sorted(fresh[task].items())) + "%"
+        if setting == TUNED
+        else ""
+        for task, setting in zip(columns["task"], columns["setting"], strict=True)
+    ]
+    names = {**_OTHERS, "fresh": "success rate, 512 fresh episodes"}
+    return _versus_best({**columns, "fresh": shown}, lambda setting: setting == TUNED, names)
+
+
+def _ablations(columns: Columns, cells: Cells, results: Path) -> str:
+    return _versus_best(columns, lambda setting: setting != TUNED and setting not in paper.SETTINGS)
 
 
 def _commands(columns: Columns, cells: Cells, results: Path) -> str:
@@ -201,8 +219,8 @@ SECTIONS: Mapping[str, Callable[[Columns, Cells, Path], str]] = {
     "below": _behind,
     "aggregates": _aggregates,
     paper.SCRATCH: _of(paper.SCRATCH),
-    TUNED: _versus_best(lambda setting: setting == TUNED),
-    "ablations": _versus_best(lambda setting: setting != TUNED and setting not in paper.SETTINGS),
+    TUNED: _tuned,
+    "ablations": _ablations,
     "commands": _commands,
 }
 """Generated sections of the page by name."""
