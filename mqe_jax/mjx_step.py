@@ -8,6 +8,7 @@ It also misses or misplaces contacts between a capsule and an edge of a box, whi
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import jax
@@ -38,8 +39,12 @@ class MarginStep:
     def __init__(self, model: mujoco.MjModel) -> None:
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             raise ValueError("the integrator must be Euler")
-        self.model = mjx.put_model(model, impl="jax")
-        self._inflation = np.where(np.isin(model.geom_type, _ROUND), model.geom_margin, 0.0).astype(np.float32)
+        inflation = np.where(np.isin(model.geom_type, _ROUND), model.geom_margin, 0.0)
+        without_margins = copy.copy(model)  # which MJX refuses beside a height field; `_collision` sets them
+        without_margins.geom_margin[:] = 0.0
+        without_margins.geom_rbound[:] += inflation
+        self.model = mjx.put_model(without_margins, impl="jax")
+        self._inflation = inflation.astype(np.float32)
         self._size = model.geom_size.astype(np.float32)
         self._size[:, 0] += self._inflation
         self._margin = model.geom_margin.astype(np.float32) - self._inflation

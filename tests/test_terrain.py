@@ -57,6 +57,15 @@ def rough_scene() -> CompiledScene:
     return compile_scene(Scene(track, num_robots=1))
 
 
+def test_mjx_accepts_rough_ground() -> None:
+    """MJX refuses margins beside a height field; `MarginStep` adds those of the robot's shapes later."""
+    model = rough_scene().model
+    assert model.nhfield == 1 and model.geom_margin.max() > 0.0
+    assert Physics(model, impl="jax", num_envs=1).init(
+        jnp.asarray(model.qpos0), jnp.zeros(model.nv), jnp.zeros((0, 3)), jnp.zeros(model.nu)
+    ).qpos.shape == (model.nq,)
+
+
 def height_at(x: float, y: float) -> float:
     """Height of the rough ground, m, interpolated between its points 0.1 m apart."""
     heights = ROUGH.heights(4.0, 3.0)
