@@ -204,3 +204,36 @@ def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
     assert float(entropy(beyond)) == pytest.approx(3 * 0.5 * math.log(2 * math.pi * math.e) - 1 - 2 - 3, rel=1e-5)
     np.testing.assert_array_equal(jax.grad(entropy)(beyond), [1.0, 1.0, 0.0])
     np.testing.assert_array_equal(jax.grad(lambda x: -entropy(x))(beyond), [0.0, -1.0, -1.0])
+
+
+def test_layer_norm_has_mean_zero_and_variance_one_before_scale_and_shift() -> None:
+    x = 3.0 + 5.0 * jax.random.normal(KEY, (7, 64))
+    y = np.asarray(nn.layer_norm(nn.layer_norm_init(64), x))
+    np.testing.assert_allclose(y.mean(axis=-1), 0.0, atol=1e-5)
+    np.testing.assert_allclose(y.std(axis=-1), 1.0, atol=1e-4)
+    params = {"scale": jnp.full(64, 2.0), "shift": jnp.full(64, -1.0)}
+    np.testing.assert_allclose(nn.layer_norm(params, x), 2.0 * y - 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_normalised_layers_by_hand(recurrent: bool) -> None:
+    """OpenRL's order: dense, activation, norm; dense, norm; recurrent unit, norm; action layer."""
+    settings = ActorCritic(
+        layer_norm=True, hidden_sizes=(5,), recurrent=recurrent, gru_size=4, critic_input="own", action_gain=1.0
+    )
+    dims = EnvDims(agents=2, observation=3, privileged=0, action=2, teams=((0, 1),), values=2)
+    network = settings.build(dims)
+    obs = jax.random.normal(KEY, (6, 2, 3))
+    params = jax.tree.map(lambda x: x + 0.1, network.init(KEY))
+    memory = network.initial_memory(6)
+    mean, _, after = network.act(params, memory.actor, obs, None)
+
+    actor = params["actor"]
+    norm = lambda i, x: nn.layer_norm(actor["norm"][str(i)], x)  # noqa: E731
+    x = norm(0, jnp.maximum(nn.dense(actor["hidden"]["0"], obs), 0.0))
+    x = norm(1, nn.dense(actor["linear"], x))
+    if recurrent:
+        state = nn.gru(actor["gru"], memory.actor, x)
+        np.testing.assert_allclose(after, state, atol=1e-5)  # the recurrent state itself is not normalised
+        x = norm(2, state)
+    np.testing.assert_allclose(mean, nn.dense(actor["head"], x), atol=1e-5)

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from mqe_jax.study import paper, statistics
-from mqe_jax.study.estimates import REWARD, Array, Cells, band, evaluated, score_matrices
+from mqe_jax.study.estimates import REWARD, TUNED, Array, Cells, band, evaluated, score_matrices
 from mqe_jax.study.records import Cell, Record
 
 _INK, _PALE = "#23252b", "#8a8f99"
 _COLORS = {"jrpo": "#4f86e0", "mat": "#3fae49", "mappo": "#b5316f"}
 _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
 _DASHES = (0, (4, 3))
-_COLORS_OF_SETTINGS = (_COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
+_COLORS_OF_SETTINGS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
 
 
 def _figure(width: float, height: float) -> Any:
@@ -93,15 +93,13 @@ def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
 def draw_evaluations(cells: Cells, others: Cells) -> bytes:
     """Returns the evaluations during training as PNG: cells of `others`, a panel for each of their tasks.
 
-    Evaluations are of the unmodified task, actions sampled. Pale lines are MAPPO's of `cells` with the paper's
-    settings; dashed lines are the paper's best value of the task.
+    Evaluations are of the unmodified task, actions sampled. Every panel has a legend of its own. Pale lines are
+    MAPPO's of `cells` with the paper's settings; dashed lines are the paper's best value of the task.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells if any(other.task == cell.task for other in others)))
-    kinds = list(dict.fromkeys((cell.setting, cell.algorithm) for cell in others))
-    colors = dict(zip(kinds, itertools.cycle((_COLORS["mappo"], *_COLORS_OF_SETTINGS)), strict=False))
     across = min(2, len(tasks))
     rows = -(-len(tasks) // across)
-    figure = _figure(max(5.0, 3.7 * across), 2.5 * rows + 0.9)
+    figure = _figure(max(5.0, 3.7 * across), 2.7 * rows + 0.6)
     plain = evaluated({cell: runs for cell, runs in cells.items() if cell.setting == paper.HIERARCHICAL})
     chosen, reference = evaluated(others), False
     for axes, task in itertools.zip_longest(figure.subplots(rows, across, squeeze=False).ravel(), tasks):
@@ -112,16 +110,18 @@ def draw_evaluations(cells: Cells, others: Cells) -> bytes:
         if runs is not None:
             _draw_band(axes, runs, REWARD, _PALE, "")
             reference = True
-        for (setting, algorithm), color in colors.items():
-            runs = chosen.get(Cell(task, algorithm, setting))
-            if runs is not None:
-                _draw_band(axes, runs, REWARD, color, "")
+        drawn = sorted((cell for cell in chosen if cell.task == task), key=lambda cell: cell.setting != TUNED)
+        for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_SETTINGS)):
+            _draw_band(axes, chosen[cell], REWARD, color, f"{_label(cell.algorithm)}, {cell.setting}")
         value = paper.best(task)
         if value is not None:
             _draw_values(axes, {"best": value})
         _style_axes(axes, paper.TITLES.get(task, task))
-    entries = {f"{_label(algorithm)}, {setting}": colors[setting, algorithm] for setting, algorithm in kinds}
-    _key(figure, entries | ({"MAPPO, paper's settings": _PALE} if reference else {}), "paper's best, after 40 M steps")
+        if drawn:
+            bottom, top = axes.get_ylim()
+            axes.set_ylim(bottom, top + 0.09 * len(drawn) * (top - bottom))  # room for the legend
+            axes.legend(frameon=False, fontsize=6.5, loc="upper left")
+    _key(figure, {"MAPPO, paper's settings": _PALE} if reference else {}, "paper's best, after 40 M steps")
     return _png(figure)
 
 

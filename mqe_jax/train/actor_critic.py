@@ -36,6 +36,9 @@ class ActorCritic(GaussianSettings):
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"
     """Activation after each hidden layer."""
+    layer_norm: bool = False
+    """Normalise each hidden layer and the output of the recurrent unit, with one more normalised linear layer after the
+    hidden layers, as in OpenRL's networks."""
     recurrent: bool = True
     """Use a gated recurrent unit after the hidden layers of actor and critic."""
     gru_size: PositiveInt = 64
@@ -62,7 +65,21 @@ def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, setti
     }
     if settings.recurrent:
         params["gru"] = nn.gru_init(gru_key, width, settings.gru_size)
+    if settings.layer_norm:
+        params["linear"] = nn.dense_init(jax.random.fold_in(hidden_key, 1), width, width)
+        widths = (*settings.hidden_sizes, width, *((settings.gru_size,) if settings.recurrent else ()))
+        params["norm"] = {str(i): nn.layer_norm_init(size) for i, size in enumerate(widths)}
     return params
+
+
+def _hidden(params: Params, x: jax.Array, settings: ActorCritic) -> jax.Array:
+    """Applies the hidden layers: (..., n_in) -> (..., width)."""
+    activation = _ACTIVATIONS[settings.activation]
+    if not settings.layer_norm:
+        return nn.mlp(params["hidden"], x, activation, activate_last=True)
+    for i in range(len(settings.hidden_sizes)):
+        x = nn.layer_norm(params["norm"][str(i)], activation(nn.dense(params["hidden"][str(i)], x)))
+    return nn.layer_norm(params["norm"][str(len(settings.hidden_sizes))], nn.dense(params["linear"], x))
 
 
 def _trunk(
@@ -72,8 +89,8 @@ def _trunk(
 
     `memory` is the recurrent state. Only the recurrent unit is sequential; the other layers are batched over all steps.
     """
-    x = nn.mlp(params["hidden"], x, _ACTIVATIONS[settings.activation], activate_last=True)
-    if "gru" in params:
+    x = _hidden(params, x, settings)
+    if settings.recurrent:
 
         def step(h: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             first_t, x_t = inputs
@@ -81,6 +98,8 @@ def _trunk(
             return h, h
 
         memory, x = jax.lax.scan(step, memory, (is_first, x), unroll=min(x.shape[0], 8))
+        if settings.layer_norm:
+            x = nn.layer_norm(params["norm"][str(len(settings.hidden_sizes) + 1)], x)
     return nn.dense(params["head"], x), memory
 
 

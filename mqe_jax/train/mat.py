@@ -79,20 +79,6 @@ def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:
 # -- layers ----------------------------------------------------------------------------------------------------------
 
 
-def layer_norm(params: Params, x: jax.Array) -> jax.Array:
-    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) -> (..., W).
-
-    Source: Ba et al., arXiv 1607.06450.
-    """
-    x = x - jnp.mean(x, axis=-1, keepdims=True)
-    x = x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
-    return x * params["scale"] + params["shift"]
-
-
-def _layer_norm_init(width: int) -> Params:
-    return {"scale": jnp.ones((width,)), "shift": jnp.zeros((width,))}
-
-
 def attention(params: Params, query: jax.Array, context: jax.Array, mask: np.ndarray, heads: int) -> jax.Array:
     """Multi-head attention of `query` to `context` under `mask` (A, A): (..., A, W), (..., A, W) -> (..., A, W).
 
@@ -115,7 +101,7 @@ def _gelu(x: jax.Array) -> jax.Array:
 
 
 def _head(params: Params, x: jax.Array) -> jax.Array:
-    return nn.dense(params["out"], layer_norm(params["norm"], _gelu(nn.dense(params["hidden"], x))))
+    return nn.dense(params["out"], nn.layer_norm(params["norm"], _gelu(nn.dense(params["hidden"], x))))
 
 
 # -- encoder and decoder ---------------------------------------------------------------------------------------------
@@ -137,28 +123,28 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
             f"attention{i}": {name: square(small) for name in ("query", "key", "value", "projection")}
             for i in range(attentions)
         }
-        layers |= {f"norm{i}": _layer_norm_init(width) for i in range(attentions + 1)}
+        layers |= {f"norm{i}": nn.layer_norm_init(width) for i in range(attentions + 1)}
         return {**layers, "mlp": {"0": square(large), "1": square(small)}}
 
     def head(k: jax.Array, n_out: int) -> Params:
         return {
             "hidden": square(large),
-            "norm": _layer_norm_init(width),
+            "norm": nn.layer_norm_init(width),
             "out": nn.dense_init(k, width, n_out, small),
         }
 
     start = 1.0 if settings.deviation == "sigmoid" else settings.log_std_init
     return {
         "encoder": {
-            "norm_in": _layer_norm_init(dims.observation),
+            "norm_in": nn.layer_norm_init(dims.observation),
             "embed": nn.dense_init(keys[0], dims.observation, width),
-            "norm": _layer_norm_init(width),
+            "norm": nn.layer_norm_init(width),
             "blocks": [block(1) for _ in range(settings.blocks)],
         },
         "value_head": head(keys[1], 1),
         "decoder": {
             "embed": nn.dense_init(keys[2], dims.action, width),
-            "norm": _layer_norm_init(width),
+            "norm": nn.layer_norm_init(width),
             "blocks": [block(2) for _ in range(settings.blocks)],
             "head": head(keys[3], dims.action),
         },
@@ -168,10 +154,10 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
 
 def encode(params: Params, obs: jax.Array, order: Order, heads: int) -> jax.Array:
     """Returns features of each agent from the observations of its team: (..., A, O) -> (..., A, W)."""
-    x = layer_norm(params["norm"], _gelu(nn.dense(params["embed"], layer_norm(params["norm_in"], obs))))
+    x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs))))
     for block in params["blocks"]:
-        x = layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.team, heads))
-        x = layer_norm(block["norm1"], x + nn.mlp(block["mlp"], x, _gelu))
+        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.team, heads))
+        x = nn.layer_norm(block["norm1"], x + nn.mlp(block["mlp"], x, _gelu))
     return x
 
 
@@ -181,11 +167,11 @@ def decode(params: Params, features: jax.Array, action: jax.Array, order: Order,
     An agent's own and later actions have no effect on its mean; the first agent's token is zero.
     """
     token = jnp.where((order.rank > 0)[:, None], action[..., order.previous, :], 0.0)
-    x = layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
+    x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
     for block in params["blocks"]:
-        x = layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.causal, heads))
-        x = layer_norm(block["norm1"], features + attention(block["attention1"], features, x, order.causal, heads))
-        x = layer_norm(block["norm2"], x + nn.mlp(block["mlp"], x, _gelu))
+        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.causal, heads))
+        x = nn.layer_norm(block["norm1"], features + attention(block["attention1"], features, x, order.causal, heads))
+        x = nn.layer_norm(block["norm2"], x + nn.mlp(block["mlp"], x, _gelu))
     return _head(params["head"], x)
 
 

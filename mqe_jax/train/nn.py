@@ -81,6 +81,21 @@ def mlp(
     return x
 
 
+def layer_norm_init(width: int) -> Params:
+    """Initialises a layer normalisation: scale one and shift zero (width,)."""
+    return {"scale": jnp.ones((width,)), "shift": jnp.zeros((width,))}
+
+
+def layer_norm(params: Params, x: jax.Array) -> jax.Array:
+    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) -> (..., W).
+
+    Source: Ba et al., arXiv 1607.06450.
+    """
+    x = x - jnp.mean(x, axis=-1, keepdims=True)
+    x = x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
+    return x * params["scale"] + params["shift"]
+
+
 def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
     """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each orthogonal.
 
