@@ -209,7 +209,8 @@ def _commands(columns: Columns, cells: Cells, results: Path) -> str:
 
 
 def _aggregates(columns: Columns, cells: Cells, results: Path) -> str:
-    tables = [markdown(table) for table in aggregate_tables(cells).values()]
+    ours = {cell: records for cell, records in cells.items() if cell.setting in paper.SETTINGS}
+    tables = [markdown(table) for table in aggregate_tables(ours).values()]
     return "\n\n".join(tables) or "No two algorithms have finished the same task yet."
 
 

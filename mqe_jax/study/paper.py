@@ -57,8 +57,10 @@ def value(setting: str, task: str, algorithm: str) -> float | None:
     """Returns the paper's value to compare a cell with, or None.
 
     That is the value of the same cell; from scratch, the best algorithm's; for a setting that the paper does not have,
-    `best` of the task.
+    `best` of the task, or the value from scratch if the setting's name starts with `scratch-`.
     """
+    if setting.startswith(f"{SCRATCH}-"):
+        setting = SCRATCH
     if setting not in SETTINGS:
         return best(task)
     cell = VALUES[setting].get(task, {})
