@@ -174,6 +174,17 @@ def test_other_settings_are_compared_by_their_evaluations(tmp_path: Path) -> Non
     assert cell.algorithm == "mat"
 
 
+def test_settings_from_scratch_are_not_drawn_beside_those_with_the_walk_policy(tmp_path: Path) -> None:
+    write_record(tmp_path, made_up(Cell("go1gate", "mappo"), 0))
+    record = made_up(Cell("go1gate", "mappo", "scratch-bounded"), 0)
+    point = {"episodes": 32, "sampled": {_REWARD: 0.1, "success_rate": 0.0}, "deterministic": {_REWARD: 0.1}}
+    points = [{"env_steps": steps, **point} for steps in (20_000_000, 40_000_000)]
+    write_record(tmp_path, Record(record.cell, 0, record.curve, {"evaluations": points, "absolute": points[0]}))
+    assert "evaluations.png" not in {path.name for path in report(tmp_path)}
+    rows = list(csv.DictReader((tmp_path / "report" / "comparison.csv").open()))
+    assert [row["paper"] for row in rows] == ["2.75", "0"]
+
+
 @pytest.mark.parametrize(
     ("low", "middle", "high", "verdict"),
     [

@@ -28,7 +28,7 @@ from mqe_jax.study.estimates import (
     group,
 )
 from mqe_jax.study.records import Cell, read_records
-from mqe_jax.study.report import markdown, report
+from mqe_jax.study.report import markdown, report, split
 from mqe_jax.study.sweep import load_sweep, select
 
 ROOT = Path(__file__).parents[1]
@@ -209,8 +209,7 @@ def _commands(columns: Columns, cells: Cells, results: Path) -> str:
 
 
 def _aggregates(columns: Columns, cells: Cells, results: Path) -> str:
-    ours = {cell: records for cell, records in cells.items() if cell.setting in paper.SETTINGS}
-    tables = [markdown(table) for table in aggregate_tables(ours).values()]
+    tables = [markdown(table) for table in aggregate_tables(split(cells)[0]).values()]
     return "\n\n".join(tables) or "No two algorithms have finished the same task yet."
 
 

@@ -111,7 +111,6 @@ def draw_evaluations(cells: Cells, others: Cells) -> bytes:
             _draw_band(axes, runs, REWARD, _PALE, "")
             reference = True
         drawn = sorted((cell for cell in chosen if cell.task == task), key=lambda cell: cell.setting != TUNED)
-        drawn = [cell for cell in drawn if not cell.setting.startswith(paper.SCRATCH)]
         for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_SETTINGS)):
             _draw_band(axes, chosen[cell], REWARD, color, f"{_label(cell.algorithm)}, {cell.setting}")
         value = paper.best(task)

@@ -53,13 +53,18 @@ GATE_STEPS = 20_000_000
 """Environment steps of the appendix figure."""
 
 
+def from_scratch(setting: str) -> bool:
+    """Returns whether a setting trains without the walk policy: `scratch`, or a name that starts with `scratch-`."""
+    return setting == SCRATCH or setting.startswith(f"{SCRATCH}-")
+
+
 def value(setting: str, task: str, algorithm: str) -> float | None:
     """Returns the paper's value to compare a cell with, or None.
 
     That is the value of the same cell; from scratch, the best algorithm's; for a setting that the paper does not have,
-    `best` of the task, or the value from scratch if the setting's name starts with `scratch-`.
+    `best` of the task, or the value from scratch if it trains without the walk policy.
     """
-    if setting.startswith(f"{SCRATCH}-"):
+    if from_scratch(setting):
         setting = SCRATCH
     if setting not in SETTINGS:
         return best(task)

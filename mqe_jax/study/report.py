@@ -44,23 +44,19 @@ def report(folder: Path) -> list[Path]:
         files["curves.png"] = draw_curves(drawn)
         text += ["![Learning curves](curves.png)", ""]
     if others:
-        files["evaluations.png"] = draw_evaluations(cells, others)
+        walking = {cell: runs for cell, runs in others.items() if not paper.from_scratch(cell.setting)}
+        if walking:
+            files["evaluations.png"] = draw_evaluations(cells, walking)
+            text += ["![Evaluations during training](evaluations.png)", ""]
         versus = {name: finals[name] for name in ("task", "algorithm", "setting", "paper")} | comparison(finals)
         files["comparison.csv"] = table(versus).encode()
-        text += [
-            "![Evaluations during training](evaluations.png)",
-            "",
-            "## Against the paper",
-            "",
-            markdown(versus),
-            "",
-        ]
-    aggregates = aggregate_tables(cells)
+        text += ["## Against the paper", "", markdown(versus), ""]
+    aggregates = aggregate_tables(drawn or cells)
     for name, columns in aggregates.items():
         files[f"{name}.csv"] = table(columns).encode()
         text += [f"## {_HEADINGS[name]}", "", markdown(columns), ""]
     if aggregates:
-        files["profiles.png"] = draw_profiles(cells)
+        files["profiles.png"] = draw_profiles(drawn or cells)
         text += ["![Performance profiles](profiles.png)", ""]
     gate = cells.get(Cell("go1gate", "mappo"))
     if gate is not None and all(any(name in run.curve for run in gate) for name in paper.GATE_TERMS):
@@ -92,7 +88,7 @@ _EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% 
 `training`: average step reward over the last {LAST:.0%} of training steps, as in the paper's figure. `absolute`:
 average step reward of the best checkpoint over the final evaluation's episodes, actions sampled; `success` likewise.
 `paper`: read from the paper's figure after 40 M steps (from scratch: the best algorithm's value)."""
-_OTHER_SETTINGS = """In other settings `paper` is the paper's best value of the task with the walk policy. Their
+_OTHER_SETTINGS = """In other settings `paper` is the best value of the task (`scratch-...`: from scratch). Their
 training rewards may include shaping, so that figure and comparison use evaluations of the unmodified task."""
 _HEADINGS = {
     "aggregate": "Over all tasks, as fractions of each task's range of scores",
