@@ -192,6 +192,20 @@ def test_the_page_agrees_with_the_committed_raw_data() -> None:
         assert (study_page.PAGE.parent / name).is_file(), name
 
 
+def test_cells_below_the_paper_stand_beside_ablations_of_the_same_settings() -> None:
+    text = study_page.PAGE.read_text(encoding="utf-8")
+    section = re.search(r"<!-- begin below -->(.*?)<!-- end below -->", text, re.DOTALL)
+    assert section is not None
+    rows = {tuple(line.split(" | ")[:3]): line for line in section[1].splitlines() if line.startswith("| `")}
+    assert all(cells[2] in paper.SETTINGS for cells in rows)
+    football = rows["| `go1football-defender`", "MAPPO", "hierarchical"]
+    assert (
+        "bounded-deviation" in football and "curriculum" not in football
+    )  # a change of the tuned settings, with shaping
+    for (_, _, setting), line in rows.items():
+        assert setting == "scratch" or "scratch" not in line
+
+
 def test_a_page_that_disagrees_is_found(tmp_path: Path) -> None:
     shutil.copytree(study_page.RESULTS / "raw", tmp_path / "raw")
     for part in [*PARTS, study_page.RESULTS / study_page.FRESH]:

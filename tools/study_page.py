@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +125,13 @@ _PAPERS = {
     "absolute": "best checkpoint",
     "success": "success rate",
 }
+_BEHIND = {
+    "task": "task",
+    "algorithm": "algorithm",
+    "setting": "setting",
+    "training": "average step reward",
+    "paper": "paper",
+}
 _OTHERS = {
     "task": "task",
     "setting": "setting",
@@ -159,16 +166,31 @@ def _state(columns: Columns, cells: Cells, results: Path) -> str:
 
 
 def _behind(columns: Columns, cells: Cells, results: Path) -> str:
-    """Returns the list of cells below the paper's values."""
-    rows = _rows(columns, lambda row: row["ours"] in (BELOW, ABOUT_BELOW))
-    if not rows:
+    """Returns the table of the cells below the paper's values, with the ablations of the paper's settings in each.
+
+    An ablation's sweep file has no `config`: its training rewards are those of the unmodified task.
+    """
+    sweeps = [load_sweep(path) for path in sorted(results.glob("*.yaml"))]
+    plain = {cell for sweep in sweeps if sweep.config is None for cell in select(sweep)}
+    shown: list[dict[str, Any]] = []
+    for row in _rows(columns, lambda row: row["ours"] in (BELOW, ABOUT_BELOW) and row["setting"] in paper.SETTINGS):
+        related = _rows(columns, lambda other, row=row: _is_ablation(other, row, plain))
+        values = [f"{other['setting']} {_shown(other, 'training')}" for other in related]
+        shown.append({**row, "ablations": "; ".join(values)})
+    if not shown:
         return "No finished cell is below the paper's value."
-    names = [
-        f"`{row['task']}` {_shown(row, 'algorithm')}, {row['setting']}"
-        + ("" if row["ours"] == BELOW else " (the paper's value is within the interval)")
-        for row in rows
-    ]
-    return "Below the paper's value:\n\n" + "\n".join(f"- {name}" for name in names)
+    return _table(shown, {**_BEHIND, "ablations": "with a change"})
+
+
+def _is_ablation(other: Mapping[str, Any], row: Mapping[str, Any], plain: Collection[Cell]) -> bool:
+    """Whether a row is a finished cell with a change of the settings of another row's cell."""
+    setting = other["setting"]
+    return (
+        (other["task"], other["algorithm"]) == (row["task"], row["algorithm"])
+        and setting not in paper.SETTINGS
+        and Cell(other["task"], other["algorithm"], setting) in plain
+        and setting.startswith(f"{paper.SCRATCH}-") == (row["setting"] == paper.SCRATCH)
+    )
 
 
 def _of(setting: str) -> Callable[[Columns, Cells, Path], str]:

@@ -18,6 +18,10 @@ _COLORS = {"jrpo": "#4f86e0", "mat": "#3fae49", "mappo": "#b5316f"}
 _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
 _DASHES = (0, (4, 3))
 _COLORS_OF_SETTINGS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
+_LINES = (*_COLORS_OF_SETTINGS, _PALE, "#ffffff")
+"""Colours that a PNG has exactly."""
+_SHADES = 64
+"""Number of further colours of a PNG: with these it has a quarter of its size."""
 
 
 def _figure(width: float, height: float) -> Any:
@@ -30,12 +34,15 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _png(figure: Any) -> bytes:
-    from PIL import Image
+    from PIL import Image, ImageColor
 
     content, small = io.BytesIO(), io.BytesIO()
     figure.savefig(content, format="png")
     image = Image.open(content).convert("RGB")
-    image.quantize(64, dither=Image.Dither.NONE).save(small, format="png", optimize=True)  # a quarter of the size
+    common = image.quantize(_SHADES, dither=Image.Dither.NONE).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*itertools.chain.from_iterable(map(ImageColor.getrgb, _LINES)), *common[: 3 * _SHADES]])
+    image.quantize(palette=palette, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
     return small.getvalue()
 
 
