@@ -27,14 +27,14 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise
 
 
-def check_folder(folder: Path) -> None:
-    """Creates a folder, and raises an InputError if it cannot be written."""
+def check_folder(folder: Path, field: str = "run_dir") -> None:
+    """Creates a folder, and raises an InputError that names the field if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise InputError(f"run_dir: {folder} cannot be written ({error.strerror or error})") from None
+        raise InputError(f"{field}: {folder} cannot be written ({error.strerror or error})") from None
 
 
 @contextlib.contextmanager

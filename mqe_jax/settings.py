@@ -65,6 +65,7 @@ AnyFloat = Annotated[
 ]
 PositiveInt = Annotated[int, Gt(0)]
 NonNegativeInt = Annotated[int, Ge(0)]
+Seed = Annotated[int, Ge(0), Lt(2**32)]
 Range = Annotated[
     tuple[float, float], pydantic.AfterValidator(_ordered), Allowed("two numbers (lowest, highest), in this order")
 ]
@@ -135,6 +136,17 @@ def to_mapping(settings: Any) -> dict[str, Any]:
     return {field.name: _plain(field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings)}
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML reader that refuses a name given twice in one mapping, of which PyYAML keeps the last."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        names = [key.value for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
+        if twice := next((name for i, name in enumerate(names) if name in names[:i]), None):
+            raise yaml.YAMLError(f"{twice!r} is given twice")
+        return super().construct_mapping(node, deep)
+
+
 def load_yaml(path: str | Path) -> dict[str, Any]:
     """Reads names and values from a YAML file; an empty file gives an empty mapping.
 
@@ -142,7 +154,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
         InputError: naming the file, if it cannot be read or is not a mapping.
     """
     try:
-        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        values = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: cannot be read as YAML settings ({reason})") from None

@@ -95,6 +95,26 @@ def test_brax_wrap_names_what_it_does_not_take() -> None:
         wrap(type("Foreign", (), {"unwrapped": object()})())  # type: ignore[arg-type]
 
 
+def test_brax_action_of_another_size_is_named() -> None:
+    pytest.importorskip("brax", reason="needs the extra brax")
+    from mqe_jax.adapters.brax import Env
+
+    env = Env(task_env("go1gate"))
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    with pytest.raises(InputError, match=rf"action: shape \(3,\); expected \({env.action_size},\)"):
+        jax.eval_shape(env.step, state, jnp.zeros(3))
+
+
+def test_jaxmarl_missing_agent_is_named() -> None:
+    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    from mqe_jax.adapters.jaxmarl import Env
+
+    env = Env(task_env("go1gate"))
+    _, state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    with pytest.raises(InputError, match=r"actions: for \['robot_0'\]; expected one for each of robot_0, robot_1"):
+        jax.eval_shape(env.step, jax.random.PRNGKey(1), state, {"robot_0": jnp.zeros(3)})
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_jaxmarl_rollout(task: str) -> None:
     """Under LogWrapper: dicts by agent, truncation in the infos, one value per agent, new episodes after a reset."""

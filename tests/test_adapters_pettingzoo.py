@@ -104,7 +104,9 @@ def test_bad_input_is_named() -> None:
         env.step({"robot_0": np.zeros(3, np.float32)})
     with pytest.raises(InputError, match="render_mode: 'human'"):
         adapter.parallel_env(render_mode="human")
-    with pytest.raises(InputError, match="episode_length: give either this or"):
+    with pytest.raises(InputError, match="max_cycles: -1 must be at least 1"):
+        adapter.parallel_env("go1gate", max_cycles=-1, impl="c", control="position")
+    with pytest.raises(InputError, match="episode_length: give either this or max_cycles"):
         adapter.parallel_env("go1gate", max_cycles=4, **SHORT)
     with pytest.raises(InputError, match="need the id of a task"):
         adapter.parallel_env(env.task, max_cycles=4)

@@ -170,6 +170,23 @@ def test_bench_prints_its_figures_and_appends_them(
     assert len(table.read_text().splitlines()) == 3
 
 
+def test_a_table_that_cannot_be_appended_to_is_refused_before_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(commands.benchmark, "bench", lambda *arguments, **settings: pytest.fail("measured"))
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    for path, words in (("/proc/none/x.csv", "cannot be written"), ("other.csv", "has other columns"), (".", "read")):
+        assert cli.main(["bench", "fake", "--csv", path]) == 2
+        err = capfd.readouterr().err
+        assert err.startswith("mqe: csv: ") and words in err
+
+
+def test_resume_says_where_there_is_nothing_to_resume(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        assert cli.main(["train", "fake", "--run-dir", "new", "--resume", *SMALL]) == 0
+    assert capfd.readouterr().err.count("new has no checkpoint to resume from; starting a new run") == 1
+
+
 def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
     assert cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
@@ -210,6 +227,12 @@ BAD = {
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),
     "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
+    "dump folder": (
+        ["eval", "go1plane", "--control", "position", "--episodes", "2", "--dump-diverged", "/proc/none"],
+        ["dump_diverged: /proc/none cannot be written"],
+    ),
+    "negative seed": (["eval", "fake", "--seed", "-1"], ["seed: -1 is not allowed", "between 0 and 4294967295"]),
+    "large seed": (["train", "fake", "--seed", "99999999999999999999"], ["seed: 99999999999999999999", "4294967296"]),
     "recording": (["replay", "none.npz"], ["none.npz"]),
     "weights": (["walk", "eval", "--weights", "none.safetensors"], ["none.safetensors"]),
     "checkpoint": (["walk", "convert", "a.jit", "b.jit", "-o", "w.safetensors"], ["a.jit"]),

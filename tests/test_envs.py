@@ -331,8 +331,12 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
         gate.step(state, jnp.zeros((2, 12), jnp.int32))
     with pytest.raises(ValueError, match=r"action: contains NaN"):
         gate.step(state, jnp.full((2, 12), jnp.nan))
-    with pytest.raises(ValueError, match="num_envs: 0"):
-        VectorEnv(gate, 0)
+    for count, allowed in ((0, "must be at least 1"), (1.5, "must be an integer")):
+        with pytest.raises(InputError, match=f"num_envs: {count} {allowed}"):
+            VectorEnv(gate, count)  # type: ignore[arg-type]
+    for shape in ((2, 2, 12), (3, 12)):  # another number of environments, no axis of agents
+        with pytest.raises(InputError, match=r"action: shape .*; expected \(3, 2, 12\) \(environments, agents"):
+            VectorEnv(gate, 3).step(state, jnp.zeros(shape))
 
 
 def test_overrides_reach_every_level() -> None:

@@ -145,7 +145,11 @@ def test_files(tmp_path: Path) -> None:
     assert load_yaml(path) == {"a": 1}
     path.write_text("")
     assert load_yaml(path) == {}
-    for text, message in (("a: [", "file.yaml: cannot be read as YAML"), ("3", "file.yaml: holds int; it must be")):
+    for text, message in (
+        ("a: [", "file.yaml: cannot be read as YAML"),
+        ("3", "file.yaml: holds int; it must be"),
+        ("a: {b: 1, b: 2}", "file.yaml: .*'b' is given twice"),
+    ):
         path.write_text(text)
         with pytest.raises(InputError, match=message) as error:
             load_yaml(path)

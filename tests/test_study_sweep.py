@@ -146,6 +146,17 @@ def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
         build(Sweep, {"tasks": ["go1gate"], **change})
 
 
+def test_a_missing_file_is_named_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        sweeps.load_sweep(tmp_path / "none.yaml")
+    assert str(error.value).startswith(f"{tmp_path / 'none.yaml'}: cannot be read as YAML")
+
+
+def test_a_folder_that_cannot_be_written_is_named() -> None:
+    with pytest.raises(InputError, match="folder: /proc/none cannot be written"):
+        sweeps.prepare(build(Sweep, {"tasks": ["go1gate"]}), Path("/proc/none"))
+
+
 def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:
     text = FILE + "variants: {hierarchical: {}, scratch: {env: {control: position}}}\n"
     sweep = load(tmp_path, text)

@@ -20,12 +20,15 @@ def missing(library: str, error: ImportError) -> InputError:
     )
 
 
-def task_env(task: str | QuadrupedEnv, *, max_steps: int | None = None, **overrides: Any) -> QuadrupedEnv:
+def task_env(
+    task: str | QuadrupedEnv, *, max_steps: int | None = None, limit: str = "max_steps", **overrides: Any
+) -> QuadrupedEnv:
     """Returns the environment of a task; a given environment is returned unchanged and accepts no overrides.
 
     Args:
         task: id, or an environment.
         max_steps: time limit in environment steps, instead of the task's.
+        limit: name of the adapter's argument for `max_steps`, for errors.
         overrides: arguments of `mqe_jax.make`.
 
     Raises:
@@ -33,14 +36,14 @@ def task_env(task: str | QuadrupedEnv, *, max_steps: int | None = None, **overri
     """
     if isinstance(task, QuadrupedEnv):
         if overrides or max_steps is not None:
-            names = ", ".join([*overrides, *(["max_steps"] if max_steps is not None else [])])
+            names = ", ".join([*overrides, *([limit] if max_steps is not None else [])])
             raise InputError(f"task: overrides ({names}) need the id of a task, not an environment")
         return task
     if max_steps is None:
         return envs.make(task, **overrides)
     if max_steps < 1:
-        raise InputError(f"max_steps: {max_steps} must be at least 1")
+        raise InputError(f"{limit}: {max_steps} must be at least 1")
     if "episode_length" in overrides:
-        raise InputError("episode_length: give either this or the time limit in steps, not both")
+        raise InputError(f"episode_length: give either this or {limit}, not both")
     dt = envs.make(task, **overrides).dt
     return envs.make(task, **overrides, episode_length=max_steps * dt)

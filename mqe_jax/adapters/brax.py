@@ -59,7 +59,11 @@ class Env(BraxEnv):
         return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=state.metrics, info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances by one environment step."""
+        """Advances by one environment step; raises an InputError for an action of another size."""
+        if jnp.size(action) != self.action_size:
+            raise InputError(
+                f"action: shape {jnp.shape(action)}; expected {(self.action_size,)} (agents * action size)"
+            )
         after = self.env.step(_task_state(state), action.reshape(self.env.num_agents, self.env.action_size))
         obs = after.obs.reshape(-1)
         info = {**state.info, "truncation": after.truncated.astype(jnp.float32), FINAL_OBS: obs}

@@ -129,7 +129,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.render_mode = _checked_mode(render_mode)
         if not isinstance(task, QuadrupedEnv):
             overrides = {"num_envs": num_envs, **overrides}
-        self.env = task_env(task, max_steps=max_episode_steps, **overrides)
+        self.env = task_env(task, max_steps=max_episode_steps, limit="max_episode_steps", **overrides)
         self.num_envs = num_envs
         self.metadata = {**SingleEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = self.env.action_space

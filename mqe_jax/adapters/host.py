@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs.base import check_num_envs
 from mqe_jax.errors import InputError
 from mqe_jax.viz.cameras import Camera, default_camera
 from mqe_jax.viz.geometry import rendering_model
@@ -59,8 +60,7 @@ class HostEnvs:
     """The environments' states; None before the first reset."""
 
     def __init__(self, env: QuadrupedEnv, num_envs: int) -> None:
-        if num_envs < 1:
-            raise InputError(f"num_envs: {num_envs} must be at least 1")
+        check_num_envs(num_envs)
         self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.state: State | None = None

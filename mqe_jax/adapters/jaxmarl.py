@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mqe_jax.adapters import missing, task_env
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.errors import InputError
 
 try:
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv
@@ -82,6 +83,8 @@ class Env(MultiAgentEnv):
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step without a reset; the key replaces the state's own random key."""
+        if not set(self.agents) <= set(actions):
+            raise InputError(f"actions: for {list(actions)}; expected one for each of {', '.join(self.agents)}")
         action = jnp.stack([actions[agent] for agent in self.agents])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated

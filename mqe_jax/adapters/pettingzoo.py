@@ -77,7 +77,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         )
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise InputError(f"render_mode: {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
-        self.task = task_env(task, max_steps=max_cycles, **overrides)
+        self.task = task_env(task, max_steps=max_cycles, limit="max_cycles", **overrides)
         self.metadata = {**type(self).metadata, "name": self.task.name}
         self.render_mode = render_mode
         self.possible_agents = [f"robot_{i}" for i in range(self.task.num_agents)]

@@ -40,7 +40,7 @@ FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 First steps:
   mqe tasks                                   list the tasks
   mqe render go1gate -o gate.gif              render a task
-  mqe train go1gate --config demo             train two robots to pass a gate (minutes on a CPU)
+  mqe train go1gate --config demo             train two robots at a gate (minutes on a CPU)
   mqe eval runs/go1gate                       evaluate the trained policy
   mqe render runs/go1gate -o gate.mp4         render the trained policy
   mqe view go1gate                            live view and teleoperation in the browser
@@ -75,7 +75,7 @@ class Train:
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Run folder. Default: runs/TASK."""
     resume: bool = False
-    """Continue exactly from the newest checkpoint in the run folder."""
+    """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
     num_seeds: int = 1
     """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
     --run-dir."""

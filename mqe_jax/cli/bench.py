@@ -15,8 +15,22 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.settings import fail
+
+COLUMNS: tuple[str, ...] = (
+    "task",
+    "impl",
+    "num_envs",
+    "env_steps_per_s",
+    "bare_env_steps_per_s",
+    "ratio",
+    "compile_s",
+    "overflow",
+    "device",
+    "jax",
+)
+"""Names of the results, in order."""
 
 
 def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, float, Any]:
@@ -97,18 +111,30 @@ def device_name() -> str:
     return f"{cores} CPU cores"
 
 
-def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a CSV file, written atomically; InputError if the file has other columns."""
-    rows: list[dict[str, Any]] = []
-    if path.exists():
+def read_csv(path: Path) -> list[dict[str, Any]]:
+    """Returns the rows of a table of measurements, none where the file does not exist, and creates its folder.
+
+    Raises:
+        InputError: if the folder cannot be written, or the file cannot be read or has other columns.
+    """
+    check_folder(path.parent, "csv")
+    if not path.exists():
+        return []
+    try:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
-            if list(reader.fieldnames or []) != list(row):
-                raise InputError(f"csv: {path} has other columns; it must have {', '.join(row)}")
-            rows = list(reader)
-    path.parent.mkdir(parents=True, exist_ok=True)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise InputError(f"csv: {path} has other columns; it must have {', '.join(COLUMNS)}")
+            return list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"csv: {path} cannot be read ({getattr(error, 'strerror', None) or error})") from None
+
+
+def append_csv(path: Path, row: Mapping[str, Any]) -> None:
+    """Appends a row to a CSV file, written atomically; errors as in `read_csv`."""
+    rows = read_csv(path)
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(row), lineterminator="\n")
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows([*rows, row])
     write_atomically(path, text.getvalue().encode())

@@ -23,6 +23,7 @@ from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import fail, override
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import runner
+from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.policy import load_policy
 from mqe_jax.viz import curves, recording
 from mqe_jax.viz import render as rendering
@@ -125,6 +126,8 @@ def train(arguments: Train) -> None:
         folders = [run_dir / f"seed{each.seed}" for each in configs]
     vector_env, eval_env = environments(arguments.impl, config, len(configs))
     recorder = _recorder(vector_env.env, arguments.dump_diverged)
+    if arguments.resume and not any(map(latest, folders)):
+        echo(f"mqe: {run_dir} has no checkpoint to resume from; starting a new run")
     try:
         runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
     except KeyboardInterrupt:
@@ -247,6 +250,8 @@ def draw(
 def bench(arguments: Bench) -> dict[str, Any]:
     """Measures throughput; prints a table, or returns the object for `--json`."""
     overrides = _overrides(arguments)
+    if arguments.csv is not None:
+        benchmark.read_csv(arguments.csv)  # before the measurement, which would be lost
     env, vector_env = make_env(arguments.task, arguments.impl, overrides, arguments.num_envs)
     key = jax.random.PRNGKey(arguments.seed)
     result = benchmark.bench(env, vector_env, key, steps=arguments.steps, repeats=arguments.repeats)

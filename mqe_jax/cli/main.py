@@ -12,7 +12,10 @@ from mqe_jax.errors import InputError, NonFiniteError
 
 
 def _run(command: Command) -> None:
-    as_json = bool(getattr(getattr(command, "action", command), "json", False))
+    action = getattr(command, "action", command)
+    as_json = bool(getattr(action, "json", False))
+    if not 0 <= (seed := getattr(action, "seed", 0)) < 2**32:
+        raise InputError(f"seed: {seed} is not allowed; it must be between 0 and 4294967295")
     with standard_output(reserved=as_json) as out:
         result = command.run()
         if as_json and result is not None:

@@ -26,7 +26,7 @@ class DivergenceRecorder:
     """Files written."""
 
     def __init__(self, env: Any, folder: Path) -> None:
-        check_folder(folder)
+        check_folder(folder, "dump_diverged")
         self.written: list[Path] = []
         self._env, self._folder = env, folder
         self._previous: Trace | None = None

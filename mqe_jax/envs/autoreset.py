@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.envs.base import QuadrupedEnv, check_num_envs
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 
@@ -49,8 +49,7 @@ class VectorEnv:
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
         """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
-        if num_envs < 1:
-            raise InputError(f"num_envs: {num_envs} must be at least 1")
+        check_num_envs(num_envs)
         self.env = env.with_num_envs(num_envs * copies)
         self.num_envs = num_envs
         self.name = env.name
@@ -66,7 +65,14 @@ class VectorEnv:
         return jax.vmap(self.env.reset)(jax.random.split(key, self.num_envs))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
+        """Advances all environments by one step with actions (N, A, action_size); resets those that ended.
+
+        Raises:
+            InputError: as `QuadrupedEnv.step`, and for another number of environments.
+        """
+        shape = (self.num_envs, self.num_agents, self.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
 
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action))

@@ -37,6 +37,14 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 
+def check_num_envs(num_envs: int) -> None:
+    """Raises an InputError unless the number of environments is an integer of at least 1."""
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer):
+        raise InputError(f"num_envs: {num_envs!r} must be an integer")
+    if num_envs < 1:
+        raise InputError(f"num_envs: {num_envs} must be at least 1")
+
+
 class QuadrupedEnv(Task):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
@@ -53,8 +61,7 @@ class QuadrupedEnv(Task):
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
         self.control = check_mode(control)
-        if num_envs < 1:
-            raise InputError(f"num_envs: {num_envs} must be at least 1")
+        check_num_envs(num_envs)
         self.num_agents = self.params.num_agents
         self.robot = robots.get(self.params.robot)
         scene = self.scene()

@@ -22,7 +22,7 @@ from annotated_types import MinLen
 
 from mqe_jax.errors import InputError, InUseError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
-from mqe_jax.settings import NonNegativeInt, PositiveInt, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.settings import PositiveInt, Seed, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.paper import HIERARCHICAL
 from mqe_jax.study.records import Cell, Record, read_curve, write_record
 from mqe_jax.train.checkpoint import list_checkpoints
@@ -45,7 +45,7 @@ class Sweep:
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
     """Names of the algorithms, as in `mqe train --algorithm`."""
-    seeds: Annotated[tuple[NonNegativeInt, ...], MinLen(1)] = (0, 1, 2, 3, 4)
+    seeds: Annotated[tuple[Seed, ...], MinLen(1)] = (0, 1, 2, 3, 4)
     """Random seeds."""
     seeds_together: PositiveInt | None = None
     """Seeds trained in one program; none trains all of them at once."""
@@ -90,8 +90,9 @@ def load_sweep(path: Path) -> Sweep:
     Raises:
         InputError: naming the file, for invalid content.
     """
+    values = load_yaml(path)
     try:
-        return build(Sweep, load_yaml(path))
+        return build(Sweep, values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -184,7 +185,7 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     Raises:
         InputError: if the folder contains a sweep with different settings.
     """
-    check_folder(folder)
+    check_folder(folder, "folder")
     path = folder / SWEEP_FILE
     if path.is_file():
         before = load_sweep(path)

@@ -15,9 +15,9 @@ from mqe_jax.settings import (
     Allowed,
     Fraction,
     NonNegative,
-    NonNegativeInt,
     Positive,
     PositiveInt,
+    Seed,
     fail,
     load_yaml,
     override,
@@ -147,7 +147,7 @@ class TrainConfig:
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Further overrides during training only, not in evaluation."""
-    seed: NonNegativeInt = 0
+    seed: Seed = 0
     """Random seed."""
     num_envs: PositiveInt = 500
     """Number of parallel environments."""
