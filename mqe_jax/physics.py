@@ -12,10 +12,13 @@ environments (friction, masses, motor strength) are passed to `Physics.step` as 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import io
 import threading
 from collections.abc import Mapping
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -68,7 +71,19 @@ def resolve_impl(impl: str = "auto") -> str:
     return impl
 
 
+def load_mjx() -> ModuleType:
+    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is not installed."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        from mujoco import mjx
+    for line in printed.getvalue().splitlines():
+        if not line.endswith("No module named 'warp'"):
+            print(line)
+    return mjx
+
+
 def _has_warp() -> bool:
+    load_mjx()
     from mujoco.mjx import warp as mjx_warp
 
     return bool(mjx_warp.WARP_INSTALLED)
@@ -115,8 +130,7 @@ class Physics:
         if self.impl == "c":
             self._engine = _CEngine(model, num_substeps)
             return
-        from mujoco import mjx
-
+        mjx = load_mjx()
         if self.impl == "warp":
             self._mjx_step, self._mjx_model = mjx.step, _quiet(mjx.put_model(model, impl="warp"))
             self._template = mjx.make_data(
@@ -132,8 +146,7 @@ class Physics:
     @functools.cached_property
     def _template(self) -> mjx.Data:
         """Template of the C engine, created on first use: importing MJX takes a second, which `mqe tasks` avoids."""
-        from mujoco import mjx
-
+        mjx = load_mjx()
         with jax.ensure_compile_time_eval():
             return _without_pointers(mjx.make_data(self.model, impl="cpp"))
 

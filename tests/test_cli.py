@@ -10,6 +10,7 @@ import jax
 import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
+import mqe_jax
 from mqe_jax import cli
 from mqe_jax.cli import arguments, commands, setup
 from mqe_jax.envs import QuadrupedEnv
@@ -58,6 +59,11 @@ def test_alone_it_says_what_to_do_first(capfd: pytest.CaptureFixture[str]) -> No
     assert cli.main([]) == 0
     out = capfd.readouterr().out
     assert "mqe train go1gate" in out and "mqe render" in out
+
+
+def test_the_version_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capfd.readouterr().out == f"mqe {mqe_jax.__version__}\n"
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in arguments.COMMANDS), ["walk", "eval"]])
@@ -303,3 +309,25 @@ def test_tasks_are_listed_without_importing_mjx() -> None:
     code = "import sys; from mqe_jax.cli import main; print(main(['tasks']), 'mujoco.mjx' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "go1football-2vs2" in out and out.splitlines()[-1] == "0 False"
+
+
+def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:
+    assert setup.train_config("go1seesaw", "demo").task == "go1seesaw"
+    assert "the settings of demo are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
+    setup.train_config("go1gate", "demo")
+    assert not capfd.readouterr().err
+
+
+def test_importing_mjx_without_warp_prints_nothing() -> None:
+    code = """
+import sys
+class Missing:
+    def find_spec(self, name, *rest):
+        if name.split(".")[0] == "warp":
+            raise ModuleNotFoundError("No module named 'warp'")
+sys.meta_path.insert(0, Missing())
+from mqe_jax.physics import load_mjx
+print(load_mjx().__name__)
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout == "mujoco.mjx\n"

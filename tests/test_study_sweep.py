@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,15 @@ def test_a_missing_file_is_named_once(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_named() -> None:
     with pytest.raises(InputError, match="folder: /proc/none cannot be written"):
         sweeps.prepare(build(Sweep, {"tasks": ["go1gate"]}), Path("/proc/none"))
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [("settings: {ppo: {clips: 1}}\n", "settings.ppo"), ("variants: {a: {ppo: {clips: 1}}}\n", "variants.a.ppo")],
+)
+def test_a_wrong_setting_is_named_with_its_place(text: str, name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"^{re.escape(name)}"):
+        sweeps.plan(load(tmp_path, "tasks: [go1gate]\n" + text), tmp_path, config_of)
 
 
 def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:

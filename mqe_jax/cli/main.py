@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+import mqe_jax
 from mqe_jax.cli.arguments import FIRST_STEPS, Command, parse
 from mqe_jax.cli.output import print_json, standard_output
 from mqe_jax.errors import InputError, NonFiniteError
@@ -32,6 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments:
         print(FIRST_STEPS)
+        return 0
+    if list(arguments) == ["--version"]:
+        print(f"mqe {mqe_jax.__version__}")
         return 0
     try:
         _run(parse(arguments))

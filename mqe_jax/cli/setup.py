@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import yaml
 
+from mqe_jax.cli.output import echo
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import override
@@ -102,4 +103,7 @@ def train_config(
         return load_config(find_config(f"paper/{algorithm}"), overrides)
     if name is None:
         name = f"tuned/{task}" if (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file() else "paper/mappo"
-    return override(override(load_config(find_config(name)), changes), overrides)
+    config = load_config(find_config(name))
+    if config.task not in (None, task):
+        echo(f"mqe: the settings of {name} are for {config.task!r}; training {task!r} with them")
+    return override(override(config, changes), overrides)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
+import socket
 
 from mqe_jax.cli.commands import find_player
 from mqe_jax.cli.output import echo
@@ -22,6 +24,7 @@ def view(arguments: View) -> None:
         fail("num_envs", arguments.num_envs, "between 1 and 16")
     if not 0 < arguments.port < 65536:
         fail("port", arguments.port, "between 1 and 65535")
+    _check_address(arguments.host, arguments.port)
     player = find_player(arguments, "scripted")
     env, vector_env = make_env(player.task, arguments.impl, player.overrides, arguments.num_envs)
     act, memory = player.act(env, deterministic=not arguments.sample), player.memory(arguments.num_envs)
@@ -34,3 +37,17 @@ def view(arguments: View) -> None:
         echo(f"mqe: warning: every machine that reaches {arguments.host} can open this page and control the robots")
     echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
     viewer.run()
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raises an InputError for a host that is not this machine, on which viser would wait without an end.
+
+    A port in use is no error: viser takes the next one.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as server:
+            server.bind(address)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            fail("host", host, f"an address of this machine ({error.strerror or error})")

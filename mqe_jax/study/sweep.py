@@ -129,8 +129,8 @@ def plan(
     """
     jobs = []
     for cell in select(sweep, cells):
-        config = override(config_of(cell.task, cell.algorithm), sweep.settings)
-        config = override(config, sweep.variants[cell.setting])
+        config = _overridden(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
+        config = _overridden(config, f"variants.{cell.setting}", sweep.variants[cell.setting])
         left = [seed for seed in sweep.seeds if not _raw(folder, cell, seed).is_file()]
         started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
         fresh = [seed for seed in left if seed not in started]
@@ -139,6 +139,14 @@ def plan(
             for i in range(0, len(group), size):
                 jobs.append(_job(folder, cell, config, group[i : i + size]))
     return jobs
+
+
+def _overridden(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
+    """Returns settings with those of the mapping `name` in a sweep file; its errors have this prefix."""
+    try:
+        return override(config, changes)
+    except InputError as error:
+        raise InputError(f"{name}.{error}") from None
 
 
 def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) -> Job:

@@ -77,10 +77,18 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
         metadata = json.loads(header.get("metadata", ""))
     except (SafetensorError, OSError, json.JSONDecodeError, KeyError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: damaged, truncated or not a {kind} ({reason})") from None
+        raise InputError(f"{path}: damaged, truncated or not a {kind} ({reason}){_older(path)}") from None
     if header.get("checksum") != str(_checksum(arrays)):
-        raise InputError(f"{path}: damaged (its content does not match its checksum)")
+        raise InputError(f"{path}: damaged (its content does not match its checksum){_older(path)}")
     return arrays, metadata
+
+
+def _older(path: Path) -> str:
+    """Returns what happens without a damaged checkpoint if the run has an older one, or an empty string."""
+    older = [other for other in list_checkpoints(path.parent.parent) if other.name < path.name]
+    if not older or path.parent != checkpoint_folder(path.parent.parent):
+        return ""
+    return f"; without this file the run resumes from {older[-1].name}"
 
 
 def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
