@@ -189,7 +189,7 @@ def _is_ablation(other: Mapping[str, Any], row: Mapping[str, Any], plain: Collec
         (other["task"], other["algorithm"]) == (row["task"], row["algorithm"])
         and setting not in paper.SETTINGS
         and Cell(other["task"], other["algorithm"], setting) in plain
-        and setting.startswith(f"{paper.SCRATCH}-") == (row["setting"] == paper.SCRATCH)
+        and paper.from_scratch(setting) == paper.from_scratch(row["setting"])
     )
 
 

@@ -21,7 +21,9 @@ _COLORS_OF_SETTINGS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHE
 _LINES = (*_COLORS_OF_SETTINGS, _PALE, "#ffffff")
 """Colours that a PNG has exactly."""
 _SHADES = 64
-"""Number of further colours of a PNG: with these it has a quarter of its size."""
+"""Maximum number of further colours of a PNG: with these it has a quarter of its size."""
+_NEAR = 8
+"""Difference to an exact colour, of 255, up to which Pillow could take a further one in its place."""
 
 
 def _figure(width: float, height: float) -> Any:
@@ -39,9 +41,11 @@ def _png(figure: Any) -> bytes:
     content, small = io.BytesIO(), io.BytesIO()
     figure.savefig(content, format="png")
     image = Image.open(content).convert("RGB")
-    common = image.quantize(_SHADES, dither=Image.Dither.NONE).getpalette() or []
+    lines = np.array([ImageColor.getrgb(color) for color in _LINES])
+    shades = np.array(image.quantize(_SHADES, dither=Image.Dither.NONE).getpalette())[: 3 * _SHADES].reshape(-1, 3)
+    distances = np.abs(shades[:, None] - lines).max(axis=-1).min(axis=-1)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*itertools.chain.from_iterable(map(ImageColor.getrgb, _LINES)), *common[: 3 * _SHADES]])
+    palette.putpalette([*lines.ravel(), *shades[distances > _NEAR].ravel()])
     image.quantize(palette=palette, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
     return small.getvalue()
 
