@@ -23,7 +23,17 @@ from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import override, to_mapping
 from mqe_jax.study import paper
 from mqe_jax.study import sweep as sweeps
-from mqe_jax.study.records import EVALUATED, MAX_COLUMNS, MAX_ROWS, MODES, Cell, Record, read_records, write_record
+from mqe_jax.study.records import (
+    EVALUATED,
+    MAX_COLUMNS,
+    MAX_ROWS,
+    MODES,
+    Cell,
+    Record,
+    read_records,
+    table,
+    write_record,
+)
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
@@ -49,7 +59,7 @@ def run_of(seed: int, score: float, cell: Cell = CELL) -> Record:
     curve = {"env_steps": steps, "seconds": steps / 7, REWARD: score * steps / 3e4, "success": steps / 2e5}
     curve |= {"reward/goal": 0.1 * np.sqrt(steps), "reward/never": np.zeros(100)}
     evaluations = [{"env_steps": 50_000, **point}, {"env_steps": 100_000, **point}]
-    return Record(cell, seed, curve, {"evaluations": evaluations, "absolute": {"env_steps": 100_000, **point}})
+    return Record(cell, seed, curve, {"evaluations": evaluations, "absolute": {"env_steps": 100_000, **point}}, 14285.7)
 
 
 def policy_of(seed: int, **network: Any) -> Policy:
@@ -146,11 +156,11 @@ def test_raw_data_keep_the_main_numbers(tmp_path: Path) -> None:
     before = run_of(0, 1.23456789)
     write_record(tmp_path, before)
     (after,) = read_records(tmp_path)
-    assert set(after.curve) == {"env_steps", "seconds", REWARD, "success", "reward/goal"}
+    assert set(after.curve) == {"env_steps", REWARD, "success", "reward/goal"} and after.seconds == 14_286
     assert [point["env_steps"] for point in after.evaluation["evaluations"]] == [50_000, 100_000]
     for point in after.evaluation["evaluations"]:
-        assert point["sampled"] == {REWARD: 1.2346, "success_rate": 0.5, "episode_return": 9}
-        assert point["deterministic"] == {REWARD: 1.2346, "episode_return": 9}
+        assert point["sampled"] == {REWARD: 1.2346, "success_rate": 0.5}
+        assert point["deterministic"] == {REWARD: 1.2346}
     assert after.evaluation["absolute"]["sampled"]["reward/goal"] == 0.25
     assert after.evaluation["absolute"]["episodes"] == 32
     write_record(tmp_path / "again", after)
@@ -169,6 +179,30 @@ def test_records_of_the_earlier_format_are_read(tmp_path: Path) -> None:
     assert record.evaluation["evaluations"] == evaluations
 
 
+def test_publishing_a_folder_to_itself_rewrites_earlier_formats(tmp_path: Path) -> None:
+    """Here with a column `seconds` and the episode return of each evaluation; what figures and tables show stays."""
+    write_record(tmp_path, run_of(0, 1.23456))
+    present = {name: content for name, (content, _) in tree(tmp_path).items()}
+    (curve_file,), (file,) = tmp_path.rglob("seed0.csv"), tmp_path.rglob("seed0.json")
+    (run,) = read_records(tmp_path)
+    steps = run.curve["env_steps"]
+    curve_file.write_text(table({"env_steps": steps, "seconds": steps / 7, **run.curve, "success": steps / 3e5}))
+    values = json.loads(file.read_text())
+    assert values.pop("seconds") == 14_286
+    values["evaluations"]["sampled/episode_return"] = [9.0, 9.0]
+    file.write_text(json.dumps(values))
+    assert publish_sweep.publish([tmp_path], tmp_path, policies=[]) == []
+    after = {name: content for name, (content, _) in tree(tmp_path).items()}
+    assert after.keys() == present.keys()
+    json_name, csv_name = (path.relative_to(tmp_path).as_posix() for path in (file, curve_file))
+    assert after[json_name] == present[json_name]
+    assert after[csv_name].startswith(b"env_steps,average_step_reward,success,reward/goal\n2000,")
+    (rewritten,) = read_records(tmp_path)
+    np.testing.assert_array_equal(rewritten.curve[REWARD], run.curve[REWARD])
+    np.testing.assert_allclose(rewritten.curve["success"], steps / 3e5, rtol=5e-4)
+    assert max(len(row.split(b",")[2].lstrip(b"0.")) for row in after[csv_name].splitlines()[1:]) == 4
+
+
 # -- what is committed -------------------------------------------------------------------------------------------------
 
 
@@ -177,10 +211,10 @@ def test_published_raw_data_are_small() -> None:
     files = [path for path in raw.rglob("seed*") if path.is_file()]
     runs = read_records(study_page.RESULTS)
     assert len(files) == 2 * len(runs)
-    assert sum(path.stat().st_size for path in files) <= 5000 * len(runs)
+    assert sum(path.stat().st_size for path in files) <= 4200 * len(runs)
     for run in runs:
         assert len(run.curve) <= MAX_COLUMNS and len(run.curve["env_steps"]) <= MAX_ROWS
-        assert run.evaluation["absolute"] is not None
+        assert run.evaluation["absolute"] is not None and run.seconds is not None
         for point in run.evaluation["evaluations"]:
             assert set(point) == {"env_steps", *MODES} and set(point["sampled"]) == set(EVALUATED)
 

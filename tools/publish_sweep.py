@@ -4,7 +4,8 @@
 results/paper/raw, and the policy of each cell's best seed (by the absolute metric) to results/paper/policies, with its
 parameters as float16. It then updates the report, its figures in docs/results and the tables in docs/results/paper.md;
 without a SWEEP only these. Policies are in SWEEP/runs/CELL/seedN/best/ or SWEEP/best/CELL/seedN/, where CELL is
-TASK/ALGORITHM[+SETTING]. Cells and seeds published earlier are kept; unchanged files are not rewritten.
+TASK/ALGORITHM[+SETTING]. Cells and seeds published earlier are kept; unchanged files are not rewritten. With
+results/paper itself as SWEEP, published raw data of earlier formats are rewritten in the present one.
 """
 
 from __future__ import annotations

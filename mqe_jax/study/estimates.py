@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.study import paper, statistics
-from mqe_jax.study.records import Cell, Record, table
+from mqe_jax.study.records import REWARD, Cell, Record, table
 
 Array = NDArray[np.float64]
 Cells = Mapping[Cell, Sequence[Record]]
 
-REWARD = "average_step_reward"
 TUNED = "tuned"
 """Setting of cells trained with `configs/tuned`."""
 LAST = 0.02

@@ -1,11 +1,12 @@
 """Raw data of a sweep: per run, a CSV file with its curve and a JSON file with its evaluations.
 
-FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    the training curve: at most 50 rows, 10 columns, 5 digits
-FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, main numbers of the evaluations during training as columns,
-                                                 absolute metric
+FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.csv    the training curve: at most 50 rows and 9 columns; 5 digits of
+                                                 the columns that figures show, 4 of others
+FOLDER/raw/TASK/ALGORITHM[+SETTING]/seed0.json   identity, duration, main numbers of the evaluations during training as
+                                                 columns, absolute metric
 
-Files of the earlier format (100 rows, 6 digits, evaluations as a list with all numbers) are read as well. The complete
-data are in the run folders.
+Files of earlier formats (100 rows, 6 digits, a column `seconds`, evaluations as a list with all numbers) are read as
+well. The complete data are in the run folders.
 """
 
 from __future__ import annotations
@@ -25,15 +26,19 @@ from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
-from mqe_jax.study.paper import HIERARCHICAL
+from mqe_jax.study.paper import GATE_TERMS, HIERARCHICAL
 
-MAX_ROWS, MAX_COLUMNS, RAW_DIGITS, DIGITS = 50, 10, 5, 6
-"""Limits of the raw data, and significant digits in the report's tables."""
-COLUMNS = ("env_steps", "seconds", "average_step_reward", "success", "episode_length")
+MAX_ROWS, MAX_COLUMNS, RAW_DIGITS, OTHER_DIGITS, DIGITS = 50, 9, 5, 4, 6
+"""Limits of the raw data: rows, columns, significant digits, those of a curve's columns other than `SHOWN`; and
+significant digits in the report's tables."""
+REWARD = "average_step_reward"
+SHOWN = (REWARD, *GATE_TERMS)
+"""Columns of curves that figures and tables show."""
+COLUMNS = ("env_steps", REWARD, "success", "episode_length")
 """Columns that every curve keeps; nonzero reward terms fill the rest, largest mean magnitude first."""
 MODES = ("sampled", "deterministic")
 """Actions of an evaluation: sampled from the policy, or its mean."""
-EVALUATED = ("average_step_reward", "success_rate", "episode_return")
+EVALUATED = (REWARD, "success_rate")
 """Numbers that are kept of each evaluation during training, for both modes."""
 
 Curve = dict[str, NDArray[np.float64]]
@@ -60,19 +65,20 @@ class Record:
 
     `evaluation` holds `evaluations`, a list of {env_steps, sampled, deterministic}, and `absolute`, one such entry
     with its number of episodes, or None; `sampled` and `deterministic` map names such as average_step_reward and
-    success_rate to numbers or None.
+    success_rate to numbers or None. `seconds` is the wall-clock duration of the training (s), None if unknown.
     """
 
     cell: Cell
     seed: int
     curve: Curve
     evaluation: Mapping[str, Any]
+    seconds: float | None = None
 
 
 def thin(curve: Curve) -> Curve:
     """Returns a curve of at most `MAX_ROWS` rows: means over groups of consecutive rows of about equal size.
 
-    `env_steps` and `seconds` are those at the end of a group; means ignore NaN.
+    `env_steps` are those at the end of a group; means ignore NaN.
     """
     steps = len(curve["env_steps"])
     ends = np.unique(np.linspace(0, steps, min(steps, MAX_ROWS) + 1).round().astype(int))
@@ -82,8 +88,7 @@ def thin(curve: Curve) -> Curve:
     thinned: Curve = {}
     for name in names:
         parts = [curve[name][a:b] for a, b in itertools.pairwise(ends)]
-        at_end = name in ("env_steps", "seconds")
-        thinned[name] = np.array([part[-1] if at_end else _mean(part) for part in parts])
+        thinned[name] = np.array([part[-1] if name == "env_steps" else _mean(part) for part in parts])
     return thinned
 
 
@@ -111,9 +116,14 @@ def read_curve(path: Path) -> Curve:
         raise InputError(f"{path}: no such file") from None
     except (OSError, TypeError, ValueError):
         raise InputError(f"{path}: is not a metrics.csv or a thinned curve") from None
-    if not {"env_steps", "average_step_reward"} <= set(curve) or not rows:
+    if not {"env_steps", REWARD} <= set(curve) or not rows:
         raise InputError(f"{path}: has no rows with columns env_steps and average_step_reward")
     return curve
+
+
+def duration(curve: Curve) -> float | None:
+    """Returns the wall-clock time at the end of a curve, s; None without a column `seconds`."""
+    return float(curve["seconds"][-1]) if "seconds" in curve else None
 
 
 def number(value: float, digits: int = DIGITS) -> str:
@@ -139,9 +149,14 @@ def write_record(folder: Path, record: Record) -> None:
     path = folder / "raw" / cell.path / f"seed{record.seed}"
     path.parent.mkdir(parents=True, exist_ok=True)
     identity = {"task": cell.task, "algorithm": cell.algorithm, "setting": cell.setting, "seed": record.seed}
-    write_atomically(path.with_suffix(".csv"), table(thin(record.curve), RAW_DIGITS).encode())
+    time = {} if record.seconds is None else {"seconds": record.seconds}
+    columns = {
+        name: [number(x, RAW_DIGITS if name in SHOWN else OTHER_DIGITS) for x in values]
+        for name, values in thin(record.curve).items()
+    }
+    write_atomically(path.with_suffix(".csv"), table(columns).encode())
     evaluation = {"evaluations": _columns(record.evaluation["evaluations"]), "absolute": record.evaluation["absolute"]}
-    text = json.dumps(_rounded({**identity, **evaluation}), separators=(",", ":")) + "\n"
+    text = json.dumps(_rounded({**identity, **time, **evaluation}), separators=(",", ":")) + "\n"
     write_atomically(path.with_suffix(".json"), text.encode())
 
 
@@ -160,7 +175,9 @@ def read_records(folder: Path) -> list[Record]:
             values = json.loads(path.read_text(encoding="utf-8"))
             cell = Cell(values["task"], values["algorithm"], values["setting"])
             evaluation = {"evaluations": _points(values.get("evaluations", [])), "absolute": values.get("absolute")}
-            records.append(Record(cell, int(values["seed"]), read_curve(path.with_suffix(".csv")), evaluation))
+            curve = read_curve(path.with_suffix(".csv"))
+            seconds = values.get("seconds", duration(curve))
+            records.append(Record(cell, int(values["seed"]), curve, evaluation, seconds))
         except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise

@@ -24,7 +24,7 @@ from mqe_jax.errors import InputError, InUseError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import PositiveInt, Seed, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.paper import HIERARCHICAL
-from mqe_jax.study.records import Cell, Record, read_curve, write_record
+from mqe_jax.study.records import Cell, Record, duration, read_curve, write_record
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.monitor import read_evaluations
@@ -233,5 +233,6 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
             for config, run_dir in zip(job.configs, job.folders, strict=True):
                 evaluation = read_evaluations(run_dir)
                 kept = {name: evaluation[name] for name in ("evaluations", "absolute")}
-                write_record(folder, Record(job.cell, config.seed, read_curve(run_dir / "metrics.csv"), kept))
+                curve = read_curve(run_dir / "metrics.csv")
+                write_record(folder, Record(job.cell, config.seed, curve, kept, duration(curve)))
     return left
