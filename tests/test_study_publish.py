@@ -233,11 +233,13 @@ def test_cells_below_the_paper_stand_beside_ablations_of_the_same_settings() -> 
     rows = {tuple(line.split(" | ")[:3]): line for line in section[1].splitlines() if line.startswith("| `")}
     assert all(cells[2] in paper.SETTINGS for cells in rows)
     football = rows["| `go1football-defender`", "MAPPO", "hierarchical"]
-    assert (
-        "bounded-deviation" in football and "curriculum" not in football
-    )  # a change of the tuned settings, with shaping
+    assert "bounded-deviation" in football and "openrl-network" in football
+    assert "plain" not in football  # a change of the tuned settings, with shaping
     for (_, _, setting), line in rows.items():
         assert setting == "scratch" or "scratch" not in line
+    assert len({task for task, _, setting in rows if setting == "scratch"}) == sum("scratch" in key for key in rows)
+    hard = rows["| `go1sheep-hard`", "MAT", "scratch"]  # our best algorithm, as the paper's
+    assert "JRPO 1.6" in hard and "MAPPO scratch-openrl 1.6" in hard
 
 
 def test_a_page_that_disagrees_is_found(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.errors import InputError
 from mqe_jax.study import paper
-from mqe_jax.study.estimates import band, comparison, evaluated, group
+from mqe_jax.study.estimates import band, comparison, evaluated, group, score_matrices
 from mqe_jax.study.records import MAX_COLUMNS, MAX_ROWS, Cell, Record, read_records, thin, write_record
 from mqe_jax.study.report import report
 
@@ -99,6 +99,15 @@ def test_the_better_algorithm_wins_the_aggregate(study: Path) -> None:
     pairs = list(csv.DictReader((study / "report" / "improvement.csv").open()))
     chance = {(row["first"], row["second"]): float(row["probability"]) for row in pairs}
     assert chance["mat", "mappo"] == 1.0 and chance["mappo", "mat"] == 0.0
+
+
+def test_aggregates_need_half_of_the_tasks() -> None:
+    tasks = ("go1gate", "go1seesaw", "go1pushbox")
+    cells = {cell: [made_up(cell, 0), made_up(cell, 1)] for cell in (Cell(task, "mappo") for task in tasks)}
+    for task in tasks[:2]:
+        assert score_matrices(cells, "hierarchical") == {}
+        cells[Cell(task, "mat")] = [made_up(Cell(task, "mat"), seed) for seed in range(2)]
+    assert score_matrices(cells, "hierarchical")["mat"].shape == (2, 2)
 
 
 def test_the_appendix_figure_ends_at_20_million_steps(study: Path) -> None:

@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
@@ -24,6 +26,7 @@ from mqe_jax.study.estimates import (
     Cells,
     aggregate_tables,
     comparison,
+    final_reward,
     final_table,
     group,
 )
@@ -130,6 +133,7 @@ _BEHIND = {
     "algorithm": "algorithm",
     "setting": "setting",
     "training": "average step reward",
+    "mean": "mean",
     "paper": "paper",
 }
 _OTHERS = {
@@ -168,29 +172,49 @@ def _state(columns: Columns, cells: Cells, results: Path) -> str:
 def _behind(columns: Columns, cells: Cells, results: Path) -> str:
     """Returns the table of the cells below the paper's values, with the ablations of the paper's settings in each.
 
-    An ablation's sweep file has no `config`: its training rewards are those of the unmodified task.
+    An ablation's sweep file has no `config`: its training rewards are those of the unmodified task. From scratch the
+    paper's value is that of its best algorithm; so is ours, and the others count as ablations.
     """
     sweeps = [load_sweep(path) for path in sorted(results.glob("*.yaml"))]
     plain = {cell for sweep in sweeps if sweep.config is None for cell in select(sweep)}
+    rows = _rows(columns, lambda row: _cell(row) in plain)
     shown: list[dict[str, Any]] = []
-    for row in _rows(columns, lambda row: row["ours"] in (BELOW, ABOUT_BELOW) and row["setting"] in paper.SETTINGS):
-        related = _rows(columns, lambda other, row=row: _is_ablation(other, row, plain))
-        values = [f"{other['setting']} {_shown(other, 'training')}" for other in related]
-        shown.append({**row, "ablations": "; ".join(values)})
+    for row in rows:
+        task, setting = row["task"], row["setting"]
+        peers = [other for other in rows if other["task"] == task and other["setting"] == setting == paper.SCRATCH]
+        if row["ours"] not in (BELOW, ABOUT_BELOW) or setting not in paper.SETTINGS:
+            continue
+        if any(other["training"] > row["training"] for other in peers):
+            continue
+        related = [other for other in rows if other in peers or _is_ablation(other, row)]
+        values = [f"{_name(other, row)} {_shown(other, 'training')}" for other in related if other is not row]
+        mean = np.mean([final_reward(record) for record in cells[_cell(row)]])
+        shown.append({**row, "mean": float(mean), "ablations": "; ".join(values)})
     if not shown:
         return "No finished cell is below the paper's value."
     return _table(shown, {**_BEHIND, "ablations": "with a change"})
 
 
-def _is_ablation(other: Mapping[str, Any], row: Mapping[str, Any], plain: Collection[Cell]) -> bool:
-    """Whether a row is a finished cell with a change of the settings of another row's cell."""
-    setting = other["setting"]
+def _cell(row: Mapping[str, Any]) -> Cell:
+    return Cell(row["task"], row["algorithm"], row["setting"])
+
+
+def _is_ablation(other: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
+    """Whether a row is a cell with a change of the settings of another row's cell."""
+    scratch = row["setting"] == paper.SCRATCH
     return (
-        (other["task"], other["algorithm"]) == (row["task"], row["algorithm"])
-        and setting not in paper.SETTINGS
-        and Cell(other["task"], other["algorithm"], setting) in plain
-        and paper.from_scratch(setting) == paper.from_scratch(row["setting"])
+        other["task"] == row["task"]
+        and (scratch or other["algorithm"] == row["algorithm"])
+        and other["setting"] not in paper.SETTINGS
+        and paper.from_scratch(other["setting"]) == scratch
     )
+
+
+def _name(other: Mapping[str, Any], row: Mapping[str, Any]) -> str:
+    """Returns how a row differs from another one of the same task: algorithm, setting, or both."""
+    algorithm = [] if other["algorithm"] == row["algorithm"] else [paper.ALGORITHMS[other["algorithm"]]]
+    setting = [] if other["setting"] == row["setting"] else [other["setting"]]
+    return " ".join([*algorithm, *setting])
 
 
 def _of(setting: str) -> Callable[[Columns, Cells, Path], str]:

@@ -173,16 +173,14 @@ def score_matrices(cells: Cells, setting: str) -> dict[str, Array]:
     """Returns each algorithm's scores (runs, tasks) of a setting as fractions of each task's range.
 
     Only tasks and seeds common to all algorithms are used; the score is the absolute metric if all runs have it,
-    otherwise the final training reward. Empty for fewer than two algorithms.
+    otherwise the final training reward. Empty for fewer than two algorithms, or if fewer than half of the setting's
+    tasks are common.
     """
     chosen = {cell: records for cell, records in cells.items() if cell.setting == setting}
     algorithms = list(dict.fromkeys(cell.algorithm for cell in chosen))
-    tasks = [
-        task
-        for task in dict.fromkeys(cell.task for cell in chosen)
-        if all(Cell(task, algorithm, setting) in chosen for algorithm in algorithms)
-    ]
-    if len(algorithms) < 2 or not tasks:
+    every = list(dict.fromkeys(cell.task for cell in chosen))
+    tasks = [task for task in every if all(Cell(task, algorithm, setting) in chosen for algorithm in algorithms)]
+    if len(algorithms) < 2 or not tasks or 2 * len(tasks) < len(every):
         return {}
     used = {(a, t): chosen[Cell(t, a, setting)] for a in algorithms for t in tasks}
     seeds = set.intersection(*({record.seed for record in records} for records in used.values()))
