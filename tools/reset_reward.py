@@ -31,9 +31,11 @@ STEPS = 200  # of a rollout
 SHOWN = 5  # significant digits
 
 
-def measure(task: str, team: str, num_envs: int, rollouts: int, impl: str) -> list[dict[str, float]]:
+def measure(
+    task: str, team: str, num_envs: int, rollouts: int, impl: str, steps: int = STEPS, **params: Any
+) -> list[dict[str, float]]:
     """Returns the average step reward of each rollout, for Push Box also with resets counted."""
-    env = VectorEnv(mqe_jax.make(task, impl=impl, control="position"), num_envs)
+    env = VectorEnv(mqe_jax.make(task, impl=impl, control="position", **params), num_envs)
     box = task == "go1pushbox"
 
     def step(state: State, key: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
@@ -46,7 +48,7 @@ def measure(task: str, team: str, num_envs: int, rollouts: int, impl: str) -> li
 
     @partial(jax.jit, donate_argnums=0)
     def rollout(state: State, key: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
-        return jax.lax.scan(step, state, jax.random.split(key, STEPS))
+        return jax.lax.scan(step, state, jax.random.split(key, steps))
 
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     rows = []
