@@ -35,8 +35,11 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
-def find_player(arguments: Eval | Render | View, default: str) -> Player:
-    """Returns the player selected by RUN|TASK, --policy and --planner; `default` applies to a task without either."""
+def find_player(arguments: Eval | Render | View) -> Player:
+    """Returns the player selected by RUN|TASK, --policy and --planner.
+
+    A task without either has its scripted policy, or forward if it has none.
+    """
     target = arguments.target
     if arguments.planner is not None and arguments.policy is not None:
         raise InputError("planner: give --planner or --policy, not both")
@@ -53,8 +56,7 @@ def find_player(arguments: Eval | Render | View, default: str) -> Player:
         run = Path(target) if run is None and arguments.planner is None else run
     if run is not None:
         return Player(task, overrides, load_policy(run), arguments.opponent)
-    if default == "scripted" and task not in PLANNERS:
-        default = "forward"
+    default = "scripted" if task in PLANNERS else "forward"
     return Player(task, overrides, arguments.planner or default, arguments.opponent)
 
 
@@ -143,7 +145,7 @@ def evaluate(arguments: Eval) -> dict[str, Any]:
     """Evaluates a policy; prints a table, or returns the object for `--json`."""
     if arguments.episodes < 1:
         fail("episodes", arguments.episodes, "at least 1")
-    player = find_player(arguments, "random")
+    player = find_player(arguments)
     num_envs = min(arguments.num_envs, arguments.episodes)
     env, vector_env = make_env(player.task, arguments.impl, player.overrides, num_envs)
     recorder = _recorder(env, arguments.dump_diverged)
@@ -205,7 +207,7 @@ def render(arguments: Render) -> None:
     if arguments.at is not None and not arguments.at >= 0:
         fail("at", arguments.at, "at least 0")
     check_output(arguments.output)
-    player = find_player(arguments, "scripted")
+    player = find_player(arguments)
     env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
     renderer = draw(
         env,
@@ -214,7 +216,7 @@ def render(arguments: Render) -> None:
         seed=arguments.seed,
         episodes=arguments.best_of,
         seconds=arguments.seconds,
-        deterministic=not arguments.sample,
+        deterministic=arguments.deterministic,
         size=None if arguments.width is None else (arguments.width, round(arguments.width * 9 / 32) * 2),
         fps=arguments.fps,
         view=arguments.view,
@@ -232,7 +234,7 @@ def draw(
     seed: int,
     episodes: int = 1,
     seconds: float = 20.0,
-    deterministic: bool = True,
+    deterministic: bool = False,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
     view: str | None = None,
