@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
@@ -20,6 +21,7 @@ from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.train import checkpoint
 from mqe_jax.train.nn import mlp_init
 from mqe_jax.train.policy import load_policy
+from mqe_jax.viz import recording
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 
@@ -199,6 +201,35 @@ def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
     assert cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
     assert (tmp_path / "new" / "clip.png").stat().st_size > 500
+
+
+def test_the_best_of_several_episodes_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """`--json` prints each of them, and which one it is."""
+    frames = np.zeros((6, 1))
+    recorded = [
+        recording.Episode(frames[:n], frames[:n], frames[:n], 0.1, success, reward)
+        for n, success, reward in ((6, 0.5, 2.0), (4, 1.0, 0.5), (5, 1.0, 1.0))
+    ]
+    rendered = []
+    monkeypatch.setattr(commands.recording, "record", lambda *arguments, **named: recorded)
+    monkeypatch.setattr(
+        commands.rendering, "render_episode", lambda env, episode, path, **named: rendered.append(episode) or "egl"
+    )
+    assert cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"]) == 0
+    (line,) = capfd.readouterr().out.splitlines()
+    assert [len(episode) for episode in rendered] == [5]
+    assert json.loads(line) == {
+        "task": "fake",
+        "renderer": "egl",
+        "rendered": 2,
+        "episodes": [
+            {"success": 0.5, "average_step_reward": 2.0, "seconds": 0.5},
+            {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3},
+            {"success": 1.0, "average_step_reward": 1.0, "seconds": 0.4},
+        ],
+    }
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "view"])

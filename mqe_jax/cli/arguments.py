@@ -128,6 +128,7 @@ class Render:
     """Id of a task, or run folder."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .webp, .gif or .png."""
+    json: Json = False
     planner: PlannerName = None
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""

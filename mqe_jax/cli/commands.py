@@ -196,8 +196,8 @@ def replay(arguments: Replay) -> dict[str, Any]:
     return result
 
 
-def render(arguments: Render) -> None:
-    """Renders an episode to a file."""
+def render(arguments: Render) -> dict[str, Any]:
+    """Renders an episode to a file; returns the object for `--json`, with all episodes."""
     for name in ("best_of", "seconds", "speed"):
         if not (value := getattr(arguments, name)) > 0:
             fail(name, value, "greater than 0")
@@ -209,7 +209,7 @@ def render(arguments: Render) -> None:
     check_output(arguments.output)
     player = find_player(arguments)
     env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
-    renderer = draw(
+    result = draw(
         env,
         player,
         arguments.output,
@@ -223,7 +223,8 @@ def render(arguments: Render) -> None:
         speed=arguments.speed,
         at=arguments.at,
     )
-    echo(f"mqe: wrote {arguments.output} ({renderer})")
+    echo(f"mqe: wrote {arguments.output} ({result['renderer']})")
+    return {"task": player.task, **result}
 
 
 def draw(
@@ -240,13 +241,28 @@ def draw(
     view: str | None = None,
     speed: float = 1.0,
     at: float | None = None,
-) -> str:
-    """Runs `episodes` episodes and renders the best one; returns the name of the renderer."""
+) -> dict[str, Any]:
+    """Runs `episodes` episodes and renders the best one.
+
+    Returns the name of the renderer, the index of the rendered episode, and each episode's success, average step reward
+    and length (s).
+    """
     act, memory = player.act(env, deterministic), player.memory(episodes)
     recorded = recording.record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
-    return rendering.render_episode(
-        env, recording.best(recorded), path, size=size, fps=fps, view=view, speed=speed, at=at
-    )
+    best = recording.best(recorded)
+    renderer = rendering.render_episode(env, best, path, size=size, fps=fps, view=view, speed=speed, at=at)
+    return {
+        "renderer": renderer,
+        "rendered": next(i for i, episode in enumerate(recorded) if episode is best),
+        "episodes": [
+            {
+                "success": episode.success,
+                "average_step_reward": episode.reward,
+                "seconds": round((len(episode) - 1) * episode.dt, 6),
+            }
+            for episode in recorded
+        ],
+    }
 
 
 def bench(arguments: Bench) -> dict[str, Any]:
