@@ -7,24 +7,28 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
 import mqe_jax
 from mqe_jax import cli
-from mqe_jax.cli import arguments, commands, setup
+from mqe_jax.cli import arguments, commands, setup, view
+from mqe_jax.cli.players import Player
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
-from mqe_jax.errors import NonFiniteError
+from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.train import checkpoint
 from mqe_jax.train.nn import mlp_init
+from mqe_jax.train.policy import load_policy
+from mqe_jax.viz import recording
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 
 
 def replace_make_env(patch: pytest.MonkeyPatch, make_env: Any) -> None:
     """Replaces the function that makes environments, for training and for the other commands."""
-    for module in (setup, commands):
+    for module in (setup, commands, view):
         patch.setattr(module, "make_env", make_env)
 
 
@@ -199,6 +203,67 @@ def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytes
     assert (tmp_path / "new" / "clip.png").stat().st_size > 500
 
 
+def test_the_best_of_several_episodes_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """`--json` prints each of them, and which one it is."""
+    frames = np.zeros((6, 1))
+    recorded = [
+        recording.Episode(frames[:n], frames[:n], frames[:n], 0.1, success, reward)
+        for n, success, reward in ((6, 0.5, 2.0), (4, 1.0, 0.5), (5, 1.0, 1.0))
+    ]
+    rendered = []
+    monkeypatch.setattr(commands.recording, "record", lambda *arguments, **named: recorded)
+    monkeypatch.setattr(
+        commands.rendering, "render_episode", lambda env, episode, path, **named: rendered.append(episode) or "egl"
+    )
+    assert cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"]) == 0
+    (line,) = capfd.readouterr().out.splitlines()
+    assert [len(episode) for episode in rendered] == [5]
+    assert json.loads(line) == {
+        "task": "fake",
+        "renderer": "egl",
+        "rendered": 2,
+        "episodes": [
+            {"success": 0.5, "average_step_reward": 2.0, "seconds": 0.5},
+            {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3},
+            {"success": 1.0, "average_step_reward": 1.0, "seconds": 0.4},
+        ],
+    }
+
+
+@pytest.mark.parametrize("command", ["eval", "render", "view"])
+def test_evaluation_clip_and_viewer_run_the_same_policy(
+    command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run's sampled actions unless --deterministic is given; a task's scripted policy, forward without one."""
+    played: list[tuple[Any, bool]] = []
+
+    def act(self: Player, env: Any, deterministic: bool) -> None:
+        played.append((self.policy, deterministic))
+        raise InputError("stop")
+
+    monkeypatch.setattr(Player, "act", act)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: True)  # for the viewer's packages
+    flags = {"render": ["-o", "clip.png"], "view": ["--port", "49876"]}.get(command, [])
+    for target in (str(run_folder), "go1gate", "fake"):
+        for more in ([], ["--deterministic"]):
+            assert cli.main([command, target, *flags, *more]) == 2
+    assert [deterministic for _, deterministic in played] == [False, True] * 3
+    assert not isinstance(played[0][0], str)
+    assert [policy for policy, _ in played[2::2]] == ["scripted", "forward"]
+
+
+def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
+    env = FakeEnv()
+    player = Player("fake", {}, load_policy(run_folder))
+    obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs
+    for deterministic in (False, True):
+        act = player.act(env, deterministic)
+        one, two = (act(obs, player.memory(2), jax.random.PRNGKey(key))[0] for key in (1, 2))
+        assert bool((one == two).all()) is deterministic
+
+
 BAD = {
     "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
     "flag": (["bench", "--nope", "3"], ["--nope"]),
@@ -218,6 +283,7 @@ BAD = {
     "episodes": (["eval", "fake", "--episodes", "0"], ["episodes", "0", "at least 1"]),
     "planner": (["eval", "fake", "--planner", "randm"], ["'randm'", "random"]),
     "no scripted planner": (["eval", "fake", "--planner", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
+    "joints of a planner": (["eval", "go1gate", "--control", "position"], ["'position'", "--planner random or idle"]),
     "commands of a planner": (
         ["eval", "go1gate", "--planner", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
         ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],

@@ -22,9 +22,11 @@ import tyro
 from mqe_jax.cli.options import (
     Command,
     Control,
+    Deterministic,
     DumpDiverged,
     Impl,
     Json,
+    PlannerName,
     Repeated,
     Robot,
     Seed,
@@ -92,10 +94,10 @@ class Train:
 
 @dataclass(frozen=True)
 class Eval:
-    """Evaluate a trained run, or a scripted policy on a task, over complete episodes from fresh resets."""
+    """Evaluate a trained run, or a task's scripted policy, over complete episodes from fresh resets."""
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN|TASK")]
-    """Run folder, or id of a task (then with --planner or --policy)."""
+    """Run folder, or id of a task."""
     json: Json = False
     episodes: int = 512
     """Number of evaluation episodes, split evenly over environments."""
@@ -105,11 +107,8 @@ class Eval:
     control: Control = None
     robot: TaskRobot = None
     seed: Seed = 0
-    deterministic: bool = False
-    """Use the policy's mean actions instead of sampling."""
-    planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: random."""
+    deterministic: Deterministic = False
+    planner: PlannerName = None
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -129,9 +128,8 @@ class Render:
     """Id of a task, or run folder."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .webp, .gif or .png."""
-    planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: scripted if available, else forward."""
+    json: Json = False
+    planner: PlannerName = None
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -156,8 +154,7 @@ class Render:
     control: Control = None
     robot: TaskRobot = None
     seed: Seed = 0
-    sample: bool = False
-    """Sample actions from the policy instead of using its mean."""
+    deterministic: Deterministic = False
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:

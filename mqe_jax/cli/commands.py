@@ -35,8 +35,11 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
-def find_player(arguments: Eval | Render | View, default: str) -> Player:
-    """Returns the player selected by RUN|TASK, --policy and --planner; `default` applies to a task without either."""
+def find_player(arguments: Eval | Render | View) -> Player:
+    """Returns the player selected by RUN|TASK, --policy and --planner.
+
+    A task without either has its scripted policy, or forward if it has none.
+    """
     target = arguments.target
     if arguments.planner is not None and arguments.policy is not None:
         raise InputError("planner: give --planner or --policy, not both")
@@ -53,8 +56,7 @@ def find_player(arguments: Eval | Render | View, default: str) -> Player:
         run = Path(target) if run is None and arguments.planner is None else run
     if run is not None:
         return Player(task, overrides, load_policy(run), arguments.opponent)
-    if default == "scripted" and task not in PLANNERS:
-        default = "forward"
+    default = "scripted" if task in PLANNERS else "forward"
     return Player(task, overrides, arguments.planner or default, arguments.opponent)
 
 
@@ -143,7 +145,7 @@ def evaluate(arguments: Eval) -> dict[str, Any]:
     """Evaluates a policy; prints a table, or returns the object for `--json`."""
     if arguments.episodes < 1:
         fail("episodes", arguments.episodes, "at least 1")
-    player = find_player(arguments, "random")
+    player = find_player(arguments)
     num_envs = min(arguments.num_envs, arguments.episodes)
     env, vector_env = make_env(player.task, arguments.impl, player.overrides, num_envs)
     recorder = _recorder(env, arguments.dump_diverged)
@@ -194,8 +196,8 @@ def replay(arguments: Replay) -> dict[str, Any]:
     return result
 
 
-def render(arguments: Render) -> None:
-    """Renders an episode to a file."""
+def render(arguments: Render) -> dict[str, Any]:
+    """Renders an episode to a file; returns the object for `--json`, with all episodes."""
     for name in ("best_of", "seconds", "speed"):
         if not (value := getattr(arguments, name)) > 0:
             fail(name, value, "greater than 0")
@@ -205,23 +207,24 @@ def render(arguments: Render) -> None:
     if arguments.at is not None and not arguments.at >= 0:
         fail("at", arguments.at, "at least 0")
     check_output(arguments.output)
-    player = find_player(arguments, "scripted")
+    player = find_player(arguments)
     env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
-    renderer = draw(
+    result = draw(
         env,
         player,
         arguments.output,
         seed=arguments.seed,
         episodes=arguments.best_of,
         seconds=arguments.seconds,
-        deterministic=not arguments.sample,
+        deterministic=arguments.deterministic,
         size=None if arguments.width is None else (arguments.width, round(arguments.width * 9 / 32) * 2),
         fps=arguments.fps,
         view=arguments.view,
         speed=arguments.speed,
         at=arguments.at,
     )
-    echo(f"mqe: wrote {arguments.output} ({renderer})")
+    echo(f"mqe: wrote {arguments.output} ({result['renderer']})")
+    return {"task": player.task, **result}
 
 
 def draw(
@@ -232,19 +235,34 @@ def draw(
     seed: int,
     episodes: int = 1,
     seconds: float = 20.0,
-    deterministic: bool = True,
+    deterministic: bool = False,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
     view: str | None = None,
     speed: float = 1.0,
     at: float | None = None,
-) -> str:
-    """Runs `episodes` episodes and renders the best one; returns the name of the renderer."""
+) -> dict[str, Any]:
+    """Runs `episodes` episodes and renders the best one.
+
+    Returns the name of the renderer, the index of the rendered episode, and each episode's success, average step reward
+    and length (s).
+    """
     act, memory = player.act(env, deterministic), player.memory(episodes)
     recorded = recording.record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
-    return rendering.render_episode(
-        env, recording.best(recorded), path, size=size, fps=fps, view=view, speed=speed, at=at
-    )
+    best = recording.best(recorded)
+    renderer = rendering.render_episode(env, best, path, size=size, fps=fps, view=view, speed=speed, at=at)
+    return {
+        "renderer": renderer,
+        "rendered": next(i for i, episode in enumerate(recorded) if episode is best),
+        "episodes": [
+            {
+                "success": episode.success,
+                "average_step_reward": episode.reward,
+                "seconds": round((len(episode) - 1) * episode.dt, 6),
+            }
+            for episode in recorded
+        ],
+    }
 
 
 def bench(arguments: Bench) -> dict[str, Any]:

@@ -65,12 +65,14 @@ def demo(arguments: Demo) -> None:
         video,
         seed=config.seed + 1,
         episodes=16,
+        deterministic=True,
         size=(640, 360),
     )
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
-    print(f"took {(time.perf_counter() - began) / 60:.1f} minutes; evaluate it again with: mqe eval {run_dir}")
+    minutes = (time.perf_counter() - began) / 60
+    print(f"took {minutes:.1f} minutes; evaluate it again with: mqe eval {run_dir} --deterministic")
 
 
 def _measure(env: VectorEnv, policy: policy.Policy, episodes: int, config: TrainConfig) -> dict[str, Any]:

@@ -50,6 +50,18 @@ Control = Annotated[
         "Default: command, or the run's mode.",
     ),
 ]
+PlannerName = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME",
+        help="Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), "
+        "forward (straight on at half speed). Default for a task: scripted if it has one, else forward.",
+    ),
+]
+Deterministic = Annotated[
+    bool,
+    tyro.conf.arg(help="Use a trained policy's mean actions; otherwise they are sampled, as in training."),
+]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
 TaskRobot = Annotated[
     str | None,

@@ -97,7 +97,10 @@ def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
     """Returns the task's scripted policy for a batch: observations (N, A, O) to actions (N, A, 3)."""
     plan = scripted_policy(env)
     if env.control != "command":
-        raise InputError(f"planner: 'scripted' outputs walk commands; control must be 'command', not {env.control!r}")
+        raise InputError(
+            f"planner: 'scripted' outputs walk commands; control must be 'command', not {env.control!r}; "
+            "with it give --planner random or idle"
+        )
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(f"commands: {env.params.commands}; planner 'scripted' outputs {TaskParams.commands}")
     return jax.vmap(plan)

@@ -25,9 +25,9 @@ def view(arguments: View) -> None:
     if not 0 < arguments.port < 65536:
         fail("port", arguments.port, "between 1 and 65535")
     _check_address(arguments.host, arguments.port)
-    player = find_player(arguments, "scripted")
+    player = find_player(arguments)
     env, vector_env = make_env(player.task, arguments.impl, player.overrides, arguments.num_envs)
-    act, memory = player.act(env, deterministic=not arguments.sample), player.memory(arguments.num_envs)
+    act, memory = player.act(env, arguments.deterministic), player.memory(arguments.num_envs)
 
     from mqe_jax.view.session import Session
     from mqe_jax.view.viewer import Viewer

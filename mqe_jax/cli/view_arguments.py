@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Control, Impl, Json, Seed, Set, TaskRobot, implementation
+from mqe_jax.cli.options import Control, Deterministic, Impl, Json, PlannerName, Seed, Set, TaskRobot, implementation
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,7 @@ class View:
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
     """Id of a task, or run folder."""
-    planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), forward
-    (straight on at half speed). Default for a task: scripted if available, else forward."""
+    planner: PlannerName = None
     opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -34,8 +32,7 @@ class View:
     control: Control = None
     robot: TaskRobot = None
     seed: Seed = 0
-    sample: bool = False
-    """Sample actions from the policy instead of using its mean."""
+    deterministic: Deterministic = False
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:

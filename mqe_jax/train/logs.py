@@ -133,7 +133,9 @@ class TensorBoardLog:
 class WandbLog:
     """A Weights & Biases run, logged offline to `run_dir/wandb` unless WANDB_MODE=online is set.
 
-    `wandb sync` uploads it later. A resumed training run keeps its run id.
+    `wandb sync` uploads it later. A resumed training run keeps its run id. The file is written by wandb's own process,
+    for whose last rows `close` does not wait: they follow at the latest when the program ends. `wandb.teardown()` waits
+    for them, but ends all runs of the program, so it is left to the caller.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -160,7 +162,7 @@ class WandbLog:
         self._run.log(values, step=int(row["env_steps"]))
 
     def close(self) -> None:
-        """Finishes the run."""
+        """Finishes the run; the last rows may reach the file later."""
         self._run.finish()
 
 
