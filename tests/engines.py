@@ -186,7 +186,8 @@ def main() -> None:
             states: dict[str, Any] = record(task, options.num_envs, options.seed, options.solver_iterations)
             np.savez_compressed(file, **states)
         elif options.what == "agree":
-            figures = disagreement(task, options.engine, np.load(file))
+            apart = disagreement(task, options.engine, np.load(file))
+            figures = {name: float(f"{value:.4g}") for name, value in apart.items()}
         else:
             figures = crowd(task)
         seconds = round(time.perf_counter() - began)
