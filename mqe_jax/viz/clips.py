@@ -106,5 +106,5 @@ def _write_webp(path: Path, frames: list[np.ndarray], fps: float) -> None:
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
-    options = {"quality": 40, "method": 6, "minimize_size": True}
+    options = {"quality": 30, "method": 6, "minimize_size": True}
     images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, **options)
