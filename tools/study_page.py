@@ -173,7 +173,7 @@ def _behind(columns: Columns, cells: Cells, results: Path) -> str:
     """Returns the table of the cells below the paper's values, with the ablations of the paper's settings in each.
 
     An ablation's sweep file has no `config`: its training rewards are those of the unmodified task. From scratch the
-    paper's value is that of its best algorithm; so is ours, and the others count as ablations.
+    rows are those of MAPPO, with which all tasks were trained, and other algorithms count as ablations.
     """
     sweeps = [load_sweep(path) for path in sorted(results.glob("*.yaml"))]
     plain = {cell for sweep in sweeps if sweep.config is None for cell in select(sweep)}
@@ -184,7 +184,7 @@ def _behind(columns: Columns, cells: Cells, results: Path) -> str:
         peers = [other for other in rows if other["task"] == task and other["setting"] == setting == paper.SCRATCH]
         if row["ours"] not in (BELOW, ABOUT_BELOW) or setting not in paper.SETTINGS:
             continue
-        if any(other["training"] > row["training"] for other in peers):
+        if setting == paper.SCRATCH and row["algorithm"] != "mappo":
             continue
         related = [other for other in rows if other in peers or _is_ablation(other, row)]
         values = [f"{_name(other, row)} {_shown(other, 'training')}" for other in related if other is not row]
@@ -204,7 +204,7 @@ def _is_ablation(other: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
     scratch = row["setting"] == paper.SCRATCH
     return (
         other["task"] == row["task"]
-        and (scratch or other["algorithm"] == row["algorithm"])
+        and other["algorithm"] == row["algorithm"]
         and other["setting"] not in paper.SETTINGS
         and paper.from_scratch(other["setting"]) == scratch
     )

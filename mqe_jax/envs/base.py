@@ -112,6 +112,7 @@ class QuadrupedEnv(Task):
             commands=self.params.commands,
             default_commands=walk_policy.default_commands(self.robot, self.params.gait),
             lag=self.params.randomization.action_lag,
+            position_scale=self.params.position_scale,
         )
 
     # -- public API ---------------------------------------------------------------------------------------------

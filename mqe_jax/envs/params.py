@@ -47,6 +47,10 @@ class TaskParams:
     """Gait of the walk policy: trot, pronk, bound or pace."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
     """Walk commands that the action sets, in order."""
+    position_scale: Positive = 1.0
+    """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
+    joint angles, hips within 0.125 rad.
+    """
     walk_policy: str | None = None
     """Weights file of the walk policy; the shipped one if None."""
     actuator_network: str | None = None

@@ -62,7 +62,7 @@ def _label(algorithm: str) -> str:
 def draw_curves(cells: Cells) -> bytes:
     """Returns the paper's figure as PNG: for each setting a block of tasks, two per row, with bands over seeds.
 
-    Dashed lines are the paper's final values, in the algorithm's colour (dark: its best algorithm from scratch).
+    Dashed lines are the paper's final values, in the algorithm's colour.
     """
     settings = list(dict.fromkeys(cell.setting for cell in cells))
     algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
@@ -85,7 +85,7 @@ def draw_curves(cells: Cells) -> bytes:
                 axes.text(0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes)
                 axes.set_xticks([])
             values = paper.VALUES.get(setting, {}).get(task, {})
-            _draw_values(axes, {name: x for name, x in values.items() if name in (*algorithms, "best")})
+            _draw_values(axes, {name: x for name, x in values.items() if name in algorithms})
             _style_axes(axes, paper.TITLES.get(task, task))
         block.suptitle(paper.SETTINGS.get(setting, setting), color=_INK, fontsize=11)
     _legend(figure, algorithms, paper_line=True)

@@ -87,7 +87,7 @@ def split(cells: Cells) -> tuple[Cells, Cells]:
 _EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% stratified bootstrap interval.
 `training`: average step reward over the last {LAST:.0%} of training steps, as in the paper's figure. `absolute`:
 average step reward of the best checkpoint over the final evaluation's episodes, actions sampled; `success` likewise.
-`paper`: read from the paper's figure after 40 M steps (from scratch: the best algorithm's value)."""
+`paper`: read from the paper's figure after 40 M steps."""
 _OTHER_SETTINGS = """In other settings `paper` is the best value of the task (`scratch-...`: from scratch). Their
 training rewards may include shaping, so that figure and comparison use evaluations of the unmodified task."""
 _HEADINGS = {
