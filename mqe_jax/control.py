@@ -160,7 +160,7 @@ class Controller:
     lag: int = 0
     """Maximum action lag, environment steps."""
     position_scale: float = 1.0
-    """Factor on the actions in the mode `position`."""
+    """Factor on the range of the joint targets in the mode `position`."""
 
     @property
     def action_size(self) -> int:
@@ -209,7 +209,7 @@ class Controller:
         if self.mode == "command":
             commands = commands_from_action(action, self.commands, self.default_commands)
         elif self.mode == "position":
-            target = target.at[:agents].set(walk_policy.joint_targets(self.robot, self.position_scale * action))
+            target = target.at[:agents].set(walk_policy.joint_targets(self.robot, action, self.position_scale))
         else:
             target = target.at[:agents].set(action * self.robot.torque_limit)
         if self.walk_params is None or state.walk is None:

@@ -213,9 +213,9 @@ def walk(
     return joint_targets(robot, action), WalkMemory(history, action, memory.action, gait)
 
 
-def joint_targets(robot: Robot, action: jax.Array) -> jax.Array:
-    """Computes joint targets (..., 12), rad, from actions (..., 12): default + scale x action."""
-    return jnp.asarray(robot.default_joints) + robot.action_scale * action
+def joint_targets(robot: Robot, action: jax.Array, scale: float = 1.0) -> jax.Array:
+    """Computes joint targets (..., 12), rad, from actions (..., 12): default + `scale` x the robot's scale x action."""
+    return jnp.asarray(robot.default_joints) + scale * robot.action_scale * action
 
 
 def init_params(key: jax.Array) -> Params:

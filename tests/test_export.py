@@ -91,9 +91,8 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
     ],
 )
 def test_networks_memories_controls_and_mirrored_teams_agree(task: str, control: str, network: dict[str, Any]) -> None:
-    env = make(
-        task, impl="c", control=control, num_envs=1, **({"position_scale": 2.0} if control == "position" else {})
-    )
+    params = {"position_scale": 2.0} if control == "position" else {}
+    env = make(task, impl="c", control=control, num_envs=1, **params)
     policy = new_policy(env, control, **network, critic_input="observations")
     assert largest_error(to_onnx(policy, env), policy, env, steps=3) < 2e-5
 

@@ -24,6 +24,7 @@ import mqe_jax
 from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.state import State
 from mqe_jax.files import write_atomically
+from mqe_jax.study.records import number
 
 TASKS = ("go1sheep-hard", "go1pushbox")
 TEAMS = {"held": 0.0, "random": 0.5}  # standard deviation of the actions; the paper's initial policies have 0.5
@@ -36,15 +37,15 @@ def measure(
 ) -> list[dict[str, float]]:
     """Returns the average step reward of each rollout, for Push Box also with resets counted."""
     env = VectorEnv(mqe_jax.make(task, impl=impl, control="position", **params), num_envs)
-    box = task == "go1pushbox"
+    weight = env.env.params.rewards.progress  # of the object's displacement, 0 in Sheep Dog (Hard)
 
     def step(state: State, key: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
         action = TEAMS[team] * jax.random.normal(key, (num_envs, env.num_agents, env.action_size))
         after = env.step(state, jnp.clip(action, -1.0, 1.0))
         reward = after.reward[:, 0]
         # After an automatic reset `task.x` is the new episode's initial position.
-        jump = jnp.where(after.terminated | after.truncated, after.task.x - state.task.x, 0.0) if box else 0.0
-        return after, (jnp.mean(reward), jnp.mean(reward + 10.0 * jump))
+        jump = jnp.where(after.terminated | after.truncated, after.task.x - state.task.x, 0.0) if weight else 0.0
+        return after, (jnp.mean(reward), jnp.mean(reward + weight * jump))
 
     @partial(jax.jit, donate_argnums=0)
     def rollout(state: State, key: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
@@ -52,16 +53,19 @@ def measure(
 
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     rows = []
-    for number in range(rollouts):
-        state, (plain, counted) = rollout(state, jax.random.PRNGKey(1 + number))
+    for seed in range(1, rollouts + 1):
+        state, (plain, counted) = rollout(state, jax.random.PRNGKey(seed))
         row = {"reward": float(jnp.mean(plain))}
-        rows.append(row | ({"with_resets": float(jnp.mean(counted))} if box else {}))
+        rows.append(row | ({"with_resets": float(jnp.mean(counted))} if weight else {}))
     return rows
 
 
 def summary(rows: list[dict[str, float]]) -> dict[str, Any]:
     """Returns mean, standard deviation and values over the rollouts."""
-    short = lambda value: float(f"{value:.{SHOWN}g}")  # noqa: E731
+
+    def short(value: float) -> float:
+        return float(number(value, SHOWN))
+
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     return {
         name: {"mean": short(mean(values)), "deviation": short(stdev(values)), "rollouts": [short(v) for v in values]}

@@ -180,14 +180,11 @@ def _behind(columns: Columns, cells: Cells, results: Path) -> str:
     rows = _rows(columns, lambda row: _cell(row) in plain)
     shown: list[dict[str, Any]] = []
     for row in rows:
-        task, setting = row["task"], row["setting"]
-        peers = [other for other in rows if other["task"] == task and other["setting"] == setting == paper.SCRATCH]
-        if row["ours"] not in (BELOW, ABOUT_BELOW) or setting not in paper.SETTINGS:
+        if row["ours"] not in (BELOW, ABOUT_BELOW) or row["setting"] not in paper.SETTINGS:
             continue
-        if setting == paper.SCRATCH and row["algorithm"] != "mappo":
+        if row["setting"] == paper.SCRATCH and row["algorithm"] != "mappo":
             continue
-        related = [other for other in rows if other in peers or _is_ablation(other, row)]
-        values = [f"{_name(other, row)} {_shown(other, 'training')}" for other in related if other is not row]
+        values = [f"{_name(other, row)} {_shown(other, 'training')}" for other in rows if _is_ablation(other, row)]
         mean = np.mean([final_reward(record) for record in cells[_cell(row)]])
         shown.append({**row, "mean": float(mean), "ablations": "; ".join(values)})
     if not shown:
@@ -200,21 +197,18 @@ def _cell(row: Mapping[str, Any]) -> Cell:
 
 
 def _is_ablation(other: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
-    """Whether a row is a cell with a change of the settings of another row's cell."""
-    scratch = row["setting"] == paper.SCRATCH
-    return (
-        other["task"] == row["task"]
-        and other["algorithm"] == row["algorithm"]
-        and other["setting"] not in paper.SETTINGS
-        and paper.from_scratch(other["setting"]) == scratch
-    )
+    """Whether a row is a cell with a change of another row's settings, or of its algorithm from scratch."""
+    if other["task"] != row["task"]:
+        return False
+    if other["algorithm"] != row["algorithm"]:
+        return other["setting"] == row["setting"] == paper.SCRATCH
+    changed = other["setting"] not in paper.SETTINGS
+    return changed and paper.from_scratch(other["setting"]) == paper.from_scratch(row["setting"])
 
 
 def _name(other: Mapping[str, Any], row: Mapping[str, Any]) -> str:
-    """Returns how a row differs from another one of the same task: algorithm, setting, or both."""
-    algorithm = [] if other["algorithm"] == row["algorithm"] else [paper.ALGORITHMS[other["algorithm"]]]
-    setting = [] if other["setting"] == row["setting"] else [other["setting"]]
-    return " ".join([*algorithm, *setting])
+    """Returns how an ablation differs from a row: in its setting, or in its algorithm."""
+    return other["setting"] if other["setting"] != row["setting"] else paper.ALGORITHMS[other["algorithm"]]
 
 
 def _of(setting: str) -> Callable[[Columns, Cells, Path], str]:

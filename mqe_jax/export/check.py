@@ -53,7 +53,7 @@ def reference(policy: Policy, env: Any, inputs: Mapping[str, Any]) -> dict[str, 
     if env.control == "torque":
         outputs["torque"] = own * env.robot.torque_limit
     elif env.control == "position":
-        outputs["joint_target"] = walk_policy.joint_targets(env.robot, env.params.position_scale * own)
+        outputs["joint_target"] = walk_policy.joint_targets(env.robot, own, env.params.position_scale)
     else:
         outputs |= _walk(env, own, inputs)
     return outputs

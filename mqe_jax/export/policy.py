@@ -57,8 +57,8 @@ def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
         target = add_walk(graph, robot, env.controller.walk_params, commands, agents)
         graph.output("joint_target", target, (agents, NUM_JOINTS))
     elif env.control == "position":
-        scaled = graph.op("Mul", own, graph.constant(np.float32(env.params.position_scale)))
-        graph.output("joint_target", add_joint_targets(graph, robot, scaled), (agents, NUM_JOINTS))
+        target = add_joint_targets(graph, robot, own, env.params.position_scale)
+        graph.output("joint_target", target, (agents, NUM_JOINTS))
     else:
         limit = graph.constant(robot.torque_limit)
         graph.output("torque", graph.op("Mul", own, limit), (agents, NUM_JOINTS))

@@ -64,9 +64,9 @@ def add_walk(graph: Graph, robot: Robot, params: walk_policy.Params, commands: s
     return add_joint_targets(graph, robot, action)
 
 
-def add_joint_targets(graph: Graph, robot: Robot, action: str) -> str:
-    """Returns joint targets (N, A, 12), rad: default + scale x action."""
-    scaled = graph.op("Mul", action, graph.constant(robot.action_scale))
+def add_joint_targets(graph: Graph, robot: Robot, action: str, scale: float = 1.0) -> str:
+    """Returns joint targets (N, A, 12), rad: default + `scale` x the robot's scale x action."""
+    scaled = graph.op("Mul", action, graph.constant(scale * robot.action_scale))
     return graph.op("Add", scaled, graph.constant(robot.default_joints))
 
 
