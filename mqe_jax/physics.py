@@ -16,7 +16,6 @@ import contextlib
 import dataclasses
 import functools
 import io
-import threading
 from collections.abc import Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -27,6 +26,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.motors import Motors
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -100,6 +100,8 @@ class Physics:
 
     model: mujoco.MjModel
     """Compiled model."""
+    motors: Motors | None
+    """Motors that drive its actuators; without them the actuators have no speed limit."""
     impl: str
     """Engine: 'jax', 'warp' or 'c'."""
     num_substeps: int
@@ -115,6 +117,7 @@ class Physics:
         self,
         model: mujoco.MjModel,
         *,
+        motors: Motors | None = None,
         impl: str = "auto",
         num_substeps: int = 4,
         num_envs: int = 4096,
@@ -122,13 +125,16 @@ class Physics:
         max_constraints_per_env: int = 160,
     ) -> None:
         self.model = model
+        self.motors = motors
         self.impl = resolve_impl(impl)
         self.num_substeps = num_substeps
         self.num_envs = num_envs
         self.contacts_per_env = contacts_per_env
         self.max_constraints_per_env = max_constraints_per_env
         if self.impl == "c":
-            self._engine = _CEngine(model, num_substeps)
+            from mqe_jax.c_engine import CEngine
+
+            self._engine = CEngine(model, motors)
             return
         mjx = load_mjx()
         if self.impl == "warp":
@@ -215,12 +221,36 @@ class Physics:
         model = self._mjx_model.replace(**fields) if fields else self._mjx_model
 
         def substep(carry: tuple[mjx.Data, jax.Array], _: None) -> tuple[tuple[mjx.Data, jax.Array], None]:
-            data = self._mjx_step(model, carry[0])
+            data = self._mjx_step(*self._driven(model, self._clamped(carry[0]), ctrl))
             return (data, carry[1] | self._full(data)), None
 
         start = (self._without_flags(data), jnp.zeros((), bool))
         data, full = jax.lax.scan(substep, start, None, substeps)[0]
+        data = self._clamped(data.replace(ctrl=ctrl.astype(jnp.float32)))
         return data, full | self._flagged(data)
+
+    def _driven(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
+        """Returns model and data with the armature and the control of the motors for one physics step."""
+        motors = self.motors
+        if motors is None:
+            return model, data
+        position, velocity = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
+        gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+        ctrl, armature = motors.limit(jnp, ctrl.astype(jnp.float32), position, velocity, gain, bias)
+        added = _spread(armature, motors.joint_qvel, self.model.nv)
+        return model.replace(dof_armature=model.dof_armature + added), data.replace(ctrl=ctrl)
+
+    def _clamped(self, data: mjx.Data) -> mjx.Data:
+        """Returns data with the joint speeds that motors and contacts allow."""
+        motors = self.motors
+        if motors is None:
+            return data
+        old = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
+        position, velocity = motors.clamp(jnp, *old)
+        return data.replace(
+            qpos=data.qpos + _spread(position - old[0], motors.joint_qpos, self.model.nq),
+            qvel=data.qvel + _spread(velocity - old[1], motors.joint_qvel, self.model.nv),
+        )
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
         """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
@@ -246,6 +276,13 @@ class Physics:
         return jnp.zeros((), bool)
 
 
+def _spread(values: jax.Array, addresses: np.ndarray, size: int) -> jax.Array:
+    """Returns an array (size,) with the values (J,) at their addresses and zeros elsewhere, by a gather."""
+    source = np.full(size, len(addresses))
+    source[addresses] = np.arange(len(addresses))
+    return jnp.concatenate([values, jnp.zeros(1)])[source]
+
+
 def _contact_cap(model: mujoco.MjModel) -> int:
     """Returns the maximum number of contacts that MJX-JAX keeps, -1 without a cap."""
     names = [model.numeric(i).name for i in range(model.nnumeric)]
@@ -265,73 +302,3 @@ def _without_pointers(data: mjx.Data) -> mjx.Data:
     """Zeroes MJX's memory addresses in this kind of data: they are invalid in another process."""
     zeros = {name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")}
     return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
-
-
-class _CEngine:
-    """MuJoCo's C engine as a pure JAX function: state in, state out, all environments of a batch in one call."""
-
-    def __init__(self, model: mujoco.MjModel, num_substeps: int) -> None:
-        from mujoco.batch import Batch
-
-        self._model = model.__copy__()
-        # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._make = Batch
-        self._batches: dict[tuple[int, tuple[str, ...]], Any] = {}
-        self._lock = threading.Lock()
-        m = model
-        self._sizes = (m.nq, m.nv, m.nv, m.nsensordata)
-
-    def step(self, data: mjx.Data, fields: dict[str, jax.Array], forced: bool, substeps: int) -> mjx.Data:
-        names = tuple(sorted(fields))
-        out = jax.ShapeDtypeStruct((sum(self._sizes),), jnp.float32)
-        forces = (data.xfrc_applied,) if forced else ()
-        mocap = (data.mocap_pos, data.mocap_quat) if self._model.nmocap else ()
-
-        def call(qpos: Any, *rest: Any) -> np.ndarray:
-            return self._call(names, forced, substeps, qpos, *rest)
-
-        row = jax.pure_callback(
-            call,
-            out,
-            data.qpos,
-            data.qvel,
-            data.qacc_warmstart,
-            data.ctrl,
-            *mocap,
-            *forces,
-            *(fields[name] for name in names),
-            vmap_method="broadcast_all",
-        )
-        qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
-        return data.replace(
-            qpos=qpos,
-            qvel=qvel,
-            qacc_warmstart=warmstart,
-            sensordata=sensordata,
-            time=data.time + substeps * self._model.opt.timestep,
-        )
-
-    def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
-        qpos, *rest = (np.asarray(array) for array in arrays)
-        lead = qpos.shape[:-1]
-        count = int(np.prod(lead)) if lead else 1
-        flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
-        with self._lock:
-            batch = self._batches.get((count, names))
-            if batch is None:
-                batch = self._batches[count, names] = self._make(self._model, nsim=count)
-            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
-                batch.bind(name)[:] = next(flat)
-            if self._model.nmocap:
-                batch.bind("mocap_pos")[:] = next(flat)
-                batch.bind("mocap_quat")[:] = next(flat)
-            batch.bind("xfrc_applied")[:] = next(flat) if forced else 0.0
-            batch.bind("time")[:] = 0.0
-            for name in names:
-                batch.expand(name)[:] = next(flat)
-            sensordata = batch.bind("sensordata")
-            batch.step(nstep=substeps)
-            parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
-            row = np.concatenate(parts, axis=1).astype(np.float32)
-        return row.reshape(*lead, -1)

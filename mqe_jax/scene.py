@@ -15,6 +15,7 @@ from mqe_jax.collision import MAX_ROBOTS
 from mqe_jax.errors import InputError
 from mqe_jax.objects import Object, ObjectIndex, index_objects
 from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.motors import Motors
 from mqe_jax.robots.robot import Robot
 from mqe_jax.terrain import Layout, Track, build_terrain
 
@@ -39,6 +40,8 @@ class Scene:
     """Sliding friction of the robots' collision geoms and the ground."""
     torque_robots: int = 0
     """Number of robots, the first ones, whose actuators take torques (N m), not PD joint targets (rad)."""
+    joint_mechanics: bool = False
+    """Whether the robots' joints have rotor inertia, damping and dry friction."""
     foot_sensors: bool = False
     """Whether to add contact force sensors to the feet."""
     timestep: float = 0.005
@@ -75,6 +78,8 @@ class CompiledScene:
     """Index tables of the objects, by name."""
     layout: Layout
     """The track's walls, anchors and spawn poses."""
+    motors: Motors
+    """Motors of the robots."""
     mocap_offset: np.ndarray
     """Offset of each moving wall from its anchor (W, 3), m; the anchor's z is 0."""
     mocap_anchor: np.ndarray
@@ -124,6 +129,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
             visual=visual,
             friction=scene.friction,
             torque_control=number < scene.torque_robots,
+            joint_mechanics=scene.joint_mechanics,
             color=scene.colors[number] if scene.colors else number,
         )
         spec.attach(body, prefix=robots.prefix(number), frame=spec.worldbody.add_frame())
@@ -149,12 +155,12 @@ def compile_scene(scene: Scene) -> CompiledScene:
     """Compiles a scene for the physics and indexes it by name."""
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
+    index = robots.index_robots(model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors)
     return CompiledScene(
         scene=scene,
         model=model,
-        index=robots.index_robots(
-            model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors
-        ),
+        index=index,
+        motors=Motors.of(scene.robot, index, scene.timestep),
         objects=index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),

@@ -272,6 +272,8 @@ class WalkTrain:
     """Curriculum length: iterations over which slopes, forces and pushes are ramped to their maxima."""
     critic_warmup: int = 0
     """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
+    symmetry: float = 0.5
+    """Coefficient of the loss of left-right symmetry; 0: none."""
     anneal: float = 0.25
     """Final fraction of training over which learning rate and entropy bonus are annealed linearly to zero."""
     impl: Impl = "auto"

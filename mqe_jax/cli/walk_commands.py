@@ -27,6 +27,8 @@ def walk_train(arguments: WalkTrain) -> None:
         raise InputError(f"critic_warmup: {arguments.critic_warmup} is not allowed; it must be at least 0")
     if not 0.0 <= arguments.anneal <= 1.0:
         raise InputError(f"anneal: {arguments.anneal} is not allowed; it must be in [0, 1]")
+    if not 0.0 <= arguments.symmetry <= 100.0:
+        raise InputError(f"symmetry: {arguments.symmetry} is not allowed; it must be in [0, 100]")
     robot = robots.get(arguments.robot)
     policy = None if arguments.weights is None else walk_policy.load_params(robot, arguments.weights)
     prepare_folder(arguments.run_dir, arguments.resume, ("metrics.csv", "walk.safetensors"))
@@ -37,6 +39,7 @@ def walk_train(arguments: WalkTrain) -> None:
         initial_std=arguments.initial_std,
         curriculum=arguments.curriculum,
         critic_warmup=arguments.critic_warmup,
+        symmetry_coef=arguments.symmetry,
         anneal=arguments.anneal,
         seed=arguments.seed,
     )

@@ -73,6 +73,7 @@ class QuadrupedEnv(Task):
             robot=self.robot,
             contacts=self.params.contacts,
             friction=self.params.friction,
+            joint_mechanics=self.params.joint_mechanics,
             solver_iterations=self.params.solver_iterations,
             torque_robots=torque_robots,
             max_contacts=self.params.contacts_per_robot * scene.num_robots,
@@ -82,6 +83,7 @@ class QuadrupedEnv(Task):
         self.index, self.objects = self.compiled.index, self.compiled.objects
         self.physics = Physics(
             self.compiled.model,
+            motors=self.compiled.motors,
             impl=impl,
             num_envs=num_envs,
             contacts_per_env=self._scene.max_contacts,

@@ -57,6 +57,8 @@ class TaskParams:
     """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: Positive = 1.0
     """Sliding friction of robots and ground."""
+    joint_mechanics: bool = False
+    """Whether the joints have the robot's rotor inertia, damping and dry friction."""
     solver_iterations: PositiveInt = 4
     """Maximum solver iterations per physics step."""
     contacts: Literal["full", "minimal"] = "full"

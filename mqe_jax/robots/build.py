@@ -32,6 +32,10 @@ _GEOM_TYPES = {
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 MARGIN = 0.003  # m
+# Joint limits: as stiff as the physics step allows; they begin `JOINT_MARGIN` before the limit, which a joint at its
+# motor's speed limit passes by up to 0.25 rad within a physics step.
+JOINT_SOLIMP = (0.98, 0.99, 0.001, 0.5, 2.0)
+JOINT_MARGIN = 0.08  # rad
 
 
 def _add_inertial(body: Any, link: Link) -> None:
@@ -59,6 +63,7 @@ def build_robot(
     visual: bool = True,
     friction: float = 1.0,
     torque_control: bool = False,
+    joint_mechanics: bool = False,
     color: int | None = None,
 ) -> mujoco.MjSpec:
     """Builds one robot with a free base as an `MjSpec`, to be attached to a scene under a prefix.
@@ -70,6 +75,7 @@ def build_robot(
         visual: whether to add the visual geoms.
         friction: sliding friction of its collision geoms, which takes precedence over the other geom's.
         torque_control: actuators take torques (N m) instead of PD joint targets (rad).
+        joint_mechanics: whether its joints have rotor inertia, damping and dry friction.
         color: index of its colour in `COLORS`; `number` if None.
     """
     agent_color = COLORS[(number if color is None else color) % len(COLORS)]
@@ -118,8 +124,20 @@ def build_robot(
         for body, joint, axis in zip((hip, thigh, calf), JOINTS, ((1, 0, 0), (0, 1, 0), (0, 1, 0)), strict=True):
             index = JOINT_NAMES.index(f"{leg}_{joint}")
             limits = (robot.joint_lower[index], robot.joint_upper[index])
-            hinge = mujoco.mjtJoint.mjJNT_HINGE
-            body.add_joint(name=f"{leg}_{joint}", type=hinge, axis=axis, limited=True, range=limits)
+            hinge = body.add_joint(
+                name=f"{leg}_{joint}",
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=axis,
+                limited=True,
+                range=limits,
+                margin=JOINT_MARGIN,
+                solref_limit=SOLREF,
+                solimp_limit=JOINT_SOLIMP,
+            )
+            if joint_mechanics:
+                hinge.armature = robot.rotor_inertia[index]
+                hinge.damping[:] = robot.joint_damping[index]
+                hinge.frictionloss = robot.friction_loss[index]
             add_shapes(body, joint, f"{leg}_", left)
     gain, bias = (1.0, (0.0, 0.0, 0.0)) if torque_control else (robot.kp, (0.0, -robot.kp, -robot.kd))
     for name, limit in zip(JOINT_NAMES, robot.torque_limit, strict=True):

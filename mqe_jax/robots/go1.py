@@ -79,7 +79,12 @@ GO1 = Robot(
     joint_lower=np.tile([-0.803, -1.047, -2.697], 4),
     joint_upper=np.tile([0.803, 4.189, -0.916], 4),
     joint_speed_limit=np.tile([50.0, 28.0, 28.0], 4),
-    torque_limit=np.tile([20.0, 20.0, 25.0], 4),  # of the released controller; the motors' limit is 33.5
+    torque_limit=np.tile([20.0, 20.0, 25.0], 4),  # of the released controller
+    stall_torque=np.full(12, 33.5),  # the motors' torque limit in the public description
+    # Of the robot's model in MuJoCo Menagerie, as are the two after it.
+    rotor_inertia=np.full(12, 0.01),
+    joint_damping=np.tile([1.0, 2.0, 2.0], 4),
+    friction_loss=np.full(12, 0.2),
     kp=20.0,
     kd=0.5,
     action_scale=np.tile([0.125, 0.25, 0.25], 4),

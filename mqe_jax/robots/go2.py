@@ -97,6 +97,11 @@ GO2 = Robot(
     joint_upper=np.array([1.0472, 3.4907, -0.8378] * 2 + [1.0472, 4.5379, -0.8378] * 2),
     joint_speed_limit=np.tile([30.1, 30.1, 15.7], 4),
     torque_limit=np.tile([23.7, 23.7, 45.43], 4),
+    stall_torque=np.tile([23.7, 23.7, 45.43], 4),
+    # Of the robot's model in MuJoCo Menagerie, as are the two after it.
+    rotor_inertia=np.full(12, 0.01),
+    joint_damping=np.full(12, 2.0),
+    friction_loss=np.full(12, 0.2),
     kp=30.0,
     kd=0.75,
     action_scale=np.tile([0.125, 0.25, 0.25], 4),

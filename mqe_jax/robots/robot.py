@@ -191,7 +191,18 @@ class WalkSettings:
     """Minimum height of the trunk origin, m; below it the robot has fallen."""
 
 
-_JOINT_FIELDS = ("default_joints", "joint_lower", "joint_upper", "joint_speed_limit", "torque_limit", "action_scale")
+_JOINT_FIELDS = (
+    "default_joints",
+    "joint_lower",
+    "joint_upper",
+    "joint_speed_limit",
+    "torque_limit",
+    "stall_torque",
+    "action_scale",
+    "rotor_inertia",
+    "joint_damping",
+    "friction_loss",
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -227,9 +238,17 @@ class Robot:
     joint_upper: np.ndarray
     """Upper joint limits (12,), rad."""
     joint_speed_limit: np.ndarray
-    """Speed limits of the motors (12,), rad/s; informational, not enforced by the physics."""
+    """Speed limits of the motors (12,), rad/s (`mqe_jax.robots.motors`)."""
     torque_limit: np.ndarray
     """Torque limits of the controller (12,), N m."""
+    stall_torque: np.ndarray
+    """Torques of the motors at rest (12,), N m; they fall linearly to zero at the speed limit."""
+    rotor_inertia: np.ndarray
+    """Inertia of the rotors at the joints (12,), kg m^2; simulated where `joint_mechanics` is set."""
+    joint_damping: np.ndarray
+    """Viscous friction of the joints (12,), N m s/rad; likewise."""
+    friction_loss: np.ndarray
+    """Dry friction of the joints (12,), N m; likewise."""
     kp: float
     """Proportional gain, N m/rad."""
     kd: float

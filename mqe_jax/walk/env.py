@@ -92,7 +92,12 @@ class WalkEnv:
         )
         self.compiled = compile_scene(scene)
         self.physics = Physics(
-            self.compiled.model, impl=impl, num_envs=num_envs, contacts_per_env=16, max_constraints_per_env=80
+            self.compiled.model,
+            motors=self.compiled.motors,
+            impl=impl,
+            num_envs=num_envs,
+            contacts_per_env=16,
+            max_constraints_per_env=80,
         )
         walk_policy.check_period(scene.timestep, self.physics.num_substeps)
         self.index = self.compiled.index

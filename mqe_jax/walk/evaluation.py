@@ -14,7 +14,7 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
-from mqe_jax.walk.env import WalkEnv
+from mqe_jax.walk.env import WalkEnv, heading_velocity
 from mqe_jax.walk.task import EpisodeSpec, WalkTask
 
 WARM_UP = 1.0  # s at the start of an episode excluded from the errors
@@ -90,6 +90,7 @@ def measure(
 
     Returns:
         rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors after the first second, until a fall;
+        bias_vx, bias_vy, bias_yaw: mean errors likewise; height_error: mean height above the commanded one, m;
         fall_rate: fraction of episodes with a fall; speed: mean velocity along the heading, m/s; drift and drift_p95:
         mean and 95th percentile of the distance covered in the 10 s after the first, m; step_frequency: median
         over episodes and feet of the strongest frequency of the foot's height, Hz.
@@ -118,9 +119,11 @@ def measure(
             quaternion = robot_state.quaternion[0]
             feet = robots.foot_positions(env.robot, robot_state.joint_position[0])
             height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
-            squares = jnp.stack([state.metrics[f"error_{name}"] for name in ("vx", "vy", "yaw")])
+            velocity, yaw_rate = heading_velocity(robot_state)
+            errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]
+            rise = robot_state.position_w[0, 2] - env.robot.stand_height - commands[3]
             speed = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])[0]
-            return state, memory, (squares, speed, robot_state.position_w[0, :2], height, state.terminated)
+            return state, memory, (errors, rise, speed, robot_state.position_w[0, :2], height, state.terminated)
 
         state, memory, record = jax.vmap(one)(state, memory)
         return (state, memory), record
@@ -132,18 +135,19 @@ def measure(
         return jax.lax.scan(advance, (state, memory), None, steps)[1]
 
     specs = sample_specs(env.robot, scenario, spec_key, episodes)
-    squares, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), specs))
+    errors, rise, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), specs))
     alive = ~np.logical_or.accumulate(fallen, axis=0)
     counted = alive.copy()
     counted[:warm] = False
-    rms = np.sqrt((squares * counted[..., None]).sum((0, 1)) / max(counted.sum(), 1))
+    mean = lambda x: float((x * counted).sum(dtype=float) / max(counted.sum(), 1))  # noqa: E731
+    axes = dict(zip(("vx", "vy", "yaw"), np.moveaxis(errors, -1, 0), strict=True))
     upright = alive[-1]
     figures = {
-        "rms_vx": float(rms[0]),
-        "rms_vy": float(rms[1]),
-        "rms_yaw": float(rms[2]),
+        **{f"rms_{name}": mean(np.square(error)) ** 0.5 for name, error in axes.items()},
+        **{f"bias_{name}": mean(error) for name, error in axes.items()},
+        "height_error": mean(rise),
         "fall_rate": float(1.0 - upright.mean()),
-        "speed": float((speed * counted).sum() / max(counted.sum(), 1)),
+        "speed": mean(speed),
     }
     if upright.any():
         travelled = np.linalg.norm(position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1)[upright]

@@ -32,7 +32,7 @@ class WalkRewards:
     track_mean_yaw: float = 0.4
     swing_force: float = -4.0
     stance_speed: float = -4.0
-    body_height: float = -10.0
+    body_height: float = -100.0
     orientation: float = -5.0
     raibert: float = -10.0
     footswing_height: float = -30.0
@@ -118,7 +118,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     return {
         "track_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.error[:2])) / 0.25),
         "track_mean_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.mean_error[:2])) / 0.02),
-        "track_yaw": jnp.exp(-jnp.square(inputs.error[2]) / 0.25),
+        "track_yaw": jnp.exp(-jnp.square(inputs.error[2]) / 0.1),
         "track_mean_yaw": jnp.exp(-jnp.square(inputs.mean_error[2]) / 0.04),
         "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
         "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),

@@ -24,6 +24,7 @@ from mqe_jax.train import checkpoint, nn
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
 from mqe_jax.train.optim import AdamState, adam
+from mqe_jax.walk.symmetry import symmetry_loss
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 
@@ -68,6 +69,8 @@ class WalkConfig:
     """Coefficient of the value loss."""
     adaptation_coef: float = 1.0
     """Coefficient of the adaptation network's regression loss."""
+    symmetry_coef: float = 0.0
+    """Coefficient of the loss of left-right symmetry."""
     max_grad_norm: float = 1.0
     """Global gradient-norm clip."""
     initial_std: float = 1.0
@@ -220,8 +223,13 @@ def make_iteration(
             bonus = jnp.mean(entropy(params["log_std"]))
             total = policy_trained * (policy - scale * config.entropy_coef * bonus)
             total += config.value_coef * value_error + config.adaptation_coef * adaptation
+            symmetry = jnp.zeros(())
+            if config.symmetry_coef > 0:
+                symmetry = symmetry_loss(params["policy"], flat, mean)
+                total += policy_trained * config.symmetry_coef * symmetry
             kl = jnp.mean(kl_divergence(records["mean"][t, n], old_log_std, mean, params["log_std"]))
-            return total, {"kl": kl, "value_loss": value_error, "adaptation_loss": adaptation}
+            losses = {"value_loss": value_error, "adaptation_loss": adaptation, "symmetry_loss": symmetry}
+            return total, {"kl": kl, **losses}
 
         samples = config.rollout_steps * config.num_envs
         size = samples // config.minibatches

@@ -1,0 +1,108 @@
+"""MuJoCo's C engine, called from JAX."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mqe_jax.robots.motors import Motors
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+
+class CEngine:
+    """MuJoCo's C engine as a pure JAX function: state in, state out, all environments of a batch in one call."""
+
+    def __init__(self, model: mujoco.MjModel, motors: Motors | None) -> None:
+        from mujoco.batch import Batch
+
+        self._motors = motors
+        self._model = model.__copy__()
+        # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._make = Batch
+        self._batches: dict[tuple[int, tuple[str, ...]], Any] = {}
+        self._lock = threading.Lock()
+        m = model
+        self._sizes = (m.nq, m.nv, m.nv, m.nsensordata)
+
+    def step(self, data: mjx.Data, fields: dict[str, jax.Array], forced: bool, substeps: int) -> mjx.Data:
+        names = tuple(sorted(fields))
+        out = jax.ShapeDtypeStruct((sum(self._sizes),), jnp.float32)
+        forces = (data.xfrc_applied,) if forced else ()
+        mocap = (data.mocap_pos, data.mocap_quat) if self._model.nmocap else ()
+
+        def call(qpos: Any, *rest: Any) -> np.ndarray:
+            return self._call(names, forced, substeps, qpos, *rest)
+
+        row = jax.pure_callback(
+            call,
+            out,
+            data.qpos,
+            data.qvel,
+            data.qacc_warmstart,
+            data.ctrl,
+            *mocap,
+            *forces,
+            *(fields[name] for name in names),
+            vmap_method="broadcast_all",
+        )
+        qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
+        return data.replace(
+            qpos=qpos,
+            qvel=qvel,
+            qacc_warmstart=warmstart,
+            sensordata=sensordata,
+            time=data.time + substeps * self._model.opt.timestep,
+        )
+
+    def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
+        qpos, *rest = (np.asarray(array) for array in arrays)
+        lead = qpos.shape[:-1]
+        count = int(np.prod(lead)) if lead else 1
+        flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
+        with self._lock:
+            batch = self._batches.get((count, names))
+            if batch is None:
+                batch = self._batches[count, names] = self._make(self._model, nsim=count)
+            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
+                batch.bind(name)[:] = next(flat)
+            if self._model.nmocap:
+                batch.bind("mocap_pos")[:] = next(flat)
+                batch.bind("mocap_quat")[:] = next(flat)
+            batch.bind("xfrc_applied")[:] = next(flat) if forced else 0.0
+            batch.bind("time")[:] = 0.0
+            for name in names:
+                batch.expand(name)[:] = next(flat)
+            sensordata = batch.bind("sensordata")
+            if self._motors is None:
+                batch.step(nstep=substeps)
+            else:
+                self._drive(batch, self._motors, substeps, names)
+            parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
+            row = np.concatenate(parts, axis=1).astype(np.float32)
+        return row.reshape(*lead, -1)
+
+    def _drive(self, batch: Any, motors: Motors, substeps: int, names: tuple[str, ...]) -> None:
+        """Steps a batch, with the motors' limits in every physics step."""
+        model = self._model
+        gain = batch.expand("actuator_gainprm") if "actuator_gainprm" in names else model.actuator_gainprm
+        bias = batch.expand("actuator_biasprm") if "actuator_biasprm" in names else model.actuator_biasprm
+        qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        asked, armature = ctrl.copy(), batch.expand("dof_armature")
+        base = (
+            armature[:, motors.joint_qvel].copy() if "dof_armature" in names else model.dof_armature[motors.joint_qvel]
+        )
+        for _ in range(substeps):
+            joints = qpos[:, motors.joint_qpos], qvel[:, motors.joint_qvel]
+            ctrl[:], added = motors.limit(np, asked, *joints, gain[..., 0], bias[..., :3])
+            armature[:, motors.joint_qvel] = base + added
+            batch.step(nstep=1)
+            joints = motors.clamp(np, qpos[:, motors.joint_qpos], qvel[:, motors.joint_qvel])
+            qpos[:, motors.joint_qpos], qvel[:, motors.joint_qvel] = joints

@@ -1,0 +1,118 @@
+"""Motors: the torque and the speed that a robot's joint motors can give.
+
+A motor gives at most its controller's limit L and at most the torque of a DC motor, S (1 - v / V), in the direction of
+its speed v: S is its stall torque, V its speed limit. Above V it brakes, with L at (1 + `BAND`) V. These bounds are
+evaluated at the start of every physics step.
+
+Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So a leg near its speed
+limits also gets an armature (rotor inertia) for this physics step: the implicit form of the braking above V. It is zero
+while the leg's joints are slower than `SLOW` times its lowest speed limit and none can reach its own limit within the
+step; a robot that walks has none. What contacts still accelerate beyond `CLAMP` V is set to `CLAMP` V.
+
+The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mqe_jax.robots.build import build_robot
+from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.robot import Robot
+
+BAND = 0.2
+SLOW, FAST = 0.5, 0.75  # shares of a leg's lowest speed limit at which its armature begins and is complete
+REACH = 0.25  # range of the share of the speed limit, from 1 upwards, that a joint can reach in a physics step
+CLAMP = 1.4
+
+
+@functools.cache
+def leg_response(robot: Robot) -> np.ndarray:
+    """Returns how strongly torques accelerate a leg's joints in the default pose (3, 3), 1/(kg m^2), as magnitudes."""
+    model = build_robot(robot, 0, visual=False).compile()
+    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data.qpos[7:] = robot.default_joints
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, matrix)
+    return np.abs(np.linalg.inv(matrix)[6:9, 6:9])
+
+
+@dataclasses.dataclass(frozen=True)
+class Motors:
+    """The motors of R robots of one type in a compiled scene, J = 12 R joints."""
+
+    joint_qpos: np.ndarray
+    """Joint angles in qpos (J,)."""
+    joint_qvel: np.ndarray
+    """Joint velocities in qvel (J,)."""
+    speed: np.ndarray
+    """Speed limits V (J,), rad/s."""
+    torque: np.ndarray
+    """Torque limits of the controller L (J,), N m."""
+    stall: np.ndarray
+    """Stall torques S (J,), N m."""
+    response: np.ndarray
+    """Accelerations of a leg's joints per torque (3, 3), 1/(kg m^2)."""
+    timestep: float
+    """Physics step, s."""
+
+    @classmethod
+    def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> Motors:
+        """Returns the motors of all robots of a scene, whose actuators are in the order of the robots' joints."""
+        assert np.array_equal(index.actuator.ravel(), np.arange(index.actuator.size))
+        per_joint = lambda values: np.tile(values, index.num_robots).astype(np.float32)  # noqa: E731
+        return cls(
+            joint_qpos=index.joint_qpos.ravel(),
+            joint_qvel=index.joint_qvel.ravel(),
+            speed=per_joint(robot.joint_speed_limit),
+            torque=per_joint(robot.torque_limit),
+            stall=per_joint(robot.stall_torque),
+            response=leg_response(robot).astype(np.float32),
+            timestep=timestep,
+        )
+
+    def limit(self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> tuple[Any, Any]:
+        """Returns the control and the armature of one physics step.
+
+        Args:
+            xp: numpy or jax.numpy.
+            ctrl: control (..., J), rad or N m.
+            position: joint angles (..., J), rad.
+            velocity: joint velocities (..., J), rad/s.
+            gain: of the actuators (..., J): force = gain x ctrl + bias.
+            bias: constant, position and velocity coefficients (..., J, 3).
+
+        Returns:
+            control under which the actuators' forces are the motors' torques (..., J), equal to `ctrl` where the motors
+            can give what is asked, and armature (..., J), kg m^2.
+        """
+        speed, torque = self.speed, self.torque
+        force = gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity
+        asked = xp.clip(force, -torque, torque)
+        line, brake = self.stall / speed, torque / (BAND * speed)
+        over, under = speed - velocity, -speed - velocity  # both have the sign of the torque that is allowed
+        upper = xp.clip(xp.where(over > 0, line, brake) * over, -torque, torque)
+        lower = xp.clip(xp.where(under < 0, line, brake) * under, -torque, torque)
+        given = xp.clip(asked, lower, upper)
+        ctrl = xp.where(given == asked, ctrl, ctrl + (given - force) / gain)
+
+        legs = (*velocity.shape[:-1], -1, len(self.response))
+        pace, effort = xp.abs(velocity).reshape(legs), xp.abs(given).reshape(legs)
+        limits = speed.reshape(-1, len(self.response))
+        kick = sum(effort[..., i : i + 1] * self.response[i] for i in range(len(self.response)))
+        near = (pace / limits.min(axis=1, keepdims=True) - SLOW) / (FAST - SLOW)
+        reached = ((pace + self.timestep * kick) / limits - 1.0) / REACH
+        share = xp.maximum(near, reached)
+        share = xp.maximum(xp.maximum(share[..., 0], share[..., 1]), share[..., 2])
+        share = xp.broadcast_to(xp.clip(share, 0.0, 1.0)[..., None], pace.shape).reshape(velocity.shape)
+        return ctrl, self.timestep * brake * share
+
+    def clamp(self, xp: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
+        """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `CLAMP` V."""
+        clamped = xp.clip(velocity, -CLAMP * self.speed, CLAMP * self.speed)
+        return position - self.timestep * (velocity - clamped), clamped

@@ -1,0 +1,63 @@
+"""The left-right symmetry of a quadruped, as a loss: a mirrored observation deserves the mirrored action.
+
+Mirroring exchanges left and right legs and reverses y, roll, yaw and the hip joints. The parameters of the four gaits
+stay: exchanging a gait's left and right feet shifts its phase, which the clock shows.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax import walk_policy
+from mqe_jax.robots.robot import JOINT_NAMES
+from mqe_jax.walk_policy import OBSERVATION_SIZE
+
+_OTHER_SIDE = str.maketrans("LR", "RL")
+_JOINTS = np.array([JOINT_NAMES.index(name[0] + name[1].translate(_OTHER_SIDE) + name[2:]) for name in JOINT_NAMES])
+_JOINT_SIGNS = np.array([-1.0 if name.endswith("hip") else 1.0 for name in JOINT_NAMES], np.float32)
+_FEET = np.array([1, 0, 3, 2])
+
+
+def _observation() -> tuple[np.ndarray, np.ndarray]:
+    """Returns source (70,) and sign (70,) of each number of a mirrored observation."""
+    commands = len(walk_policy.COMMANDS)
+    signs = np.ones(commands, np.float32)
+    signs[[walk_policy.command_index(name) for name in ("vy", "yaw_rate", "roll")]] = -1.0
+    blocks: list[tuple[np.ndarray, np.ndarray]] = [
+        (np.arange(3), np.array([1.0, -1.0, 1.0], np.float32)),  # gravity
+        (np.arange(commands), signs),
+        *[(_JOINTS, _JOINT_SIGNS)] * 4,  # position, velocity, last action, the one before
+        (_FEET, np.ones(4, np.float32)),  # clock
+    ]
+    starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
+    source = np.concatenate([source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)])
+    return source, np.concatenate([sign for _, sign in blocks])
+
+
+_SOURCE, _SIGN = _observation()
+
+
+def mirror_history(flat: jax.Array) -> jax.Array:
+    """Mirrors flattened histories (..., T x 70)."""
+    return (flat.reshape(*flat.shape[:-1], -1, OBSERVATION_SIZE)[..., _SOURCE] * _SIGN).reshape(flat.shape)
+
+
+def mirror_action(action: jax.Array) -> jax.Array:
+    """Mirrors actions (..., 12)."""
+    return action[..., _JOINTS] * _JOINT_SIGNS
+
+
+def symmetry_loss(params: walk_policy.Params, flat: jax.Array, mean: jax.Array) -> jax.Array:
+    """Returns the mean square difference () between the actions of mirrored histories and the mirrored actions.
+
+    Args:
+        params: weights of the walk policy.
+        flat: histories (B, 2100).
+        mean: actions (B, 12) of `flat`.
+    """
+    mirrored = mirror_history(flat)
+    latent = jax.lax.stop_gradient(walk_policy.infer_latent(params, mirrored))
+    other = walk_policy.infer_action(params, mirrored, latent)
+    return jnp.mean(jnp.square(other - mirror_action(mean)))

@@ -1,0 +1,125 @@
+"""Motors: torque-speed curves, joint speeds and joint limits under hard driving, the same on every engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import make, robots
+from mqe_jax.robots.motors import CLAMP, Motors, leg_response
+from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.terrain import Plane, Track
+from tests.driving import MODES, drive
+from tests.test_engines import QUICK
+
+SOAK = pytest.mark.soak
+
+
+def motors_of(name: str) -> Motors:
+    scene = Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robot=robots.get(name))
+    return compile_scene(scene).motors
+
+
+def given(motors: Motors, torque: Any, velocity: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Torques and armature (12,) of torque-controlled motors that are asked for `torque` at `velocity`."""
+    ones, bias = np.ones(12), np.zeros((12, 3))
+    rows = np.broadcast_to(torque, 12), np.zeros(12), np.broadcast_to(velocity, 12)
+    ctrl, armature = motors.limit(np, *rows, ones, bias)
+    return np.clip(ctrl, -motors.torque, motors.torque), armature
+
+
+@pytest.mark.parametrize("name", ["go1", "go2"])
+def test_torque_falls_to_zero_at_the_speed_limit_and_brakes_above(name: str) -> None:
+    motors = motors_of(name)
+    speed, limit, stall = motors.speed, motors.torque, motors.stall
+    for share in (0.0, 0.3, 0.9, 1.0):
+        expected = np.minimum(limit, stall * (1 - share))
+        np.testing.assert_allclose(given(motors, 100.0, share * speed)[0], expected, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(given(motors, -100.0, -share * speed)[0], -expected, rtol=1e-5, atol=1e-4)
+        # Against its speed a motor gives what the controller allows.
+        np.testing.assert_allclose(given(motors, -100.0, share * speed)[0], -limit, rtol=1e-5)
+    np.testing.assert_allclose(given(motors, 0.0, 1.1 * speed)[0], -0.5 * limit, rtol=1e-4)
+    np.testing.assert_allclose(given(motors, 100.0, 1.5 * speed)[0], -limit, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["go1", "go2"])
+def test_a_slow_leg_has_no_armature_and_its_control_is_unchanged(name: str) -> None:
+    motors = motors_of(name)
+    torque, armature = given(motors, 4.0, 0.4 * motors.speed.min())
+    assert np.all(torque == 4.0) and np.all(armature == 0.0)
+    # One fast joint gives the whole leg its armature, and no other leg.
+    velocity = np.zeros(12)
+    velocity[4] = motors.speed.min()
+    np.testing.assert_array_equal(given(motors, 0.0, velocity)[1] > 0, np.repeat([False, True, False, False], 3))
+
+
+def test_joint_targets_are_changed_so_that_the_actuators_give_the_motors_torque() -> None:
+    motors, go1 = motors_of("go1"), robots.get("go1")
+    gain, bias = np.full(12, go1.kp), np.tile([0.0, -go1.kp, -go1.kd], (12, 1))
+    position, velocity = go1.default_joints, 0.9 * go1.joint_speed_limit
+    ctrl, _ = motors.limit(np, position + 5.0, position, velocity, gain, bias)
+    force = go1.kp * (ctrl - position) - go1.kd * velocity
+    np.testing.assert_allclose(force, 0.1 * go1.stall_torque, rtol=1e-4)
+
+
+def test_the_clamp_keeps_angle_and_speed_consistent() -> None:
+    motors = motors_of("go1")
+    velocity = np.where(np.arange(12) == 2, 3.0, 0.5) * motors.speed
+    position, clamped = motors.clamp(np, np.zeros(12), velocity)
+    assert clamped[2] == pytest.approx(CLAMP * motors.speed[2]) and np.all(np.delete(clamped == velocity, 2))
+    assert position[2] == pytest.approx(-0.005 * (3.0 - CLAMP) * motors.speed[2]) and np.count_nonzero(position) == 1
+
+
+def test_the_response_is_that_of_a_leg() -> None:
+    """A calf is the lightest link, and a torque at the thigh turns the calf too."""
+    response = leg_response(robots.get("go1"))
+    assert response.shape == (3, 3) and np.all(np.diff(np.diag(response)[1:]) > 0) and response[1, 2] > 20.0
+    np.testing.assert_allclose(response, response.T, rtol=1e-6)
+
+
+# Shares of the speed limit: 99.9% of the joints, and the greatest; rad past a joint limit likewise.
+BARS = {"speed_999": 1.1, "speed_max": 1.5, "excess_999": 0.1, "excess_max": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("robot", "mode", "steps"),
+    [
+        ("go1", "saturated", 5_000),
+        *(pytest.param(robot, mode, 1_000_000, marks=SOAK) for robot in ("go1", "go2") for mode in MODES),
+    ],
+)
+def test_hard_driving_stays_within_the_limits(robot: str, mode: str, steps: int) -> None:
+    figures = drive(robot, mode, steps)
+    assert figures["diverged"] == 0
+    assert all(figures[name] <= bar for name, bar in BARS.items()), figures
+
+
+def test_engines_agree_where_motors_saturate() -> None:
+    """One environment step under saturated torques, from joints in motion."""
+    states = {}
+    for impl in ("c", "jax"):
+        env: Any = make("go1plane", impl=impl, control="torque", num_agents=1, num_envs=4)
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
+        speed = 0.9 * env.robot.joint_speed_limit * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
+        data = state.data.replace(qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(speed))
+        torque = jnp.where(speed > 0, 1.0, -1.0) * env.robot.torque_limit
+        step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)))
+        states[impl] = step.lower(data, torque).compile(compiler_options=QUICK)(data, torque)
+    for field, atol in (("qpos", 1e-4), ("qvel", 0.02)):
+        c, other = (np.asarray(getattr(states[impl], field)) for impl in ("c", "jax"))
+        np.testing.assert_allclose(other, c, atol=atol, err_msg=field)
+    assert np.all(np.asarray(states["c"].ctrl) == np.asarray(torque))  # of the step, not of its last physics step
+
+
+def test_joint_mechanics_are_in_the_model() -> None:
+    env: Any = make("go1plane", impl="c", num_agents=1, joint_mechanics=True)
+    joints, model = env.index.joint_qvel[0], env.compiled.model
+    np.testing.assert_allclose(model.dof_armature[joints], env.robot.rotor_inertia)
+    np.testing.assert_allclose(model.dof_damping[joints], env.robot.joint_damping)
+    np.testing.assert_allclose(model.dof_frictionloss[joints], env.robot.friction_loss)
+    plain: Any = make("go1plane", impl="c", num_agents=1)
+    assert not plain.compiled.model.dof_armature.any() and not plain.compiled.model.dof_frictionloss.any()
