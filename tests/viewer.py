@@ -117,19 +117,19 @@ class Client:
 
     def panel(self) -> Panel:
         """Reads what every new client is sent first."""
-        panel, labels = Panel(), {}
+        panel = Panel()
+        labels: dict[str, str] = {}
         for message in self._messages():
-            kind, uuid = message["type"], message.get("uuid")
+            kind, uuid = message["type"], message.get("uuid", "")
             if kind == "ReplayDoneMessage":
                 return panel
             if kind == "RegisterCommandMessage":
                 panel.commands[message["props"]["label"]] = message["uuid"]
             elif kind == "GuiUpdateMessage":
-                label = labels.get(uuid, uuid)
                 for name in message["updates"].keys() & {"value", "_markdown"}:
-                    panel.values[label] = message["updates"][name]
+                    panel.values[labels[uuid]] = message["updates"][name]
             elif kind.startswith("Gui") and "props" in message:
-                label = "state" if kind == "GuiMarkdownMessage" else message["props"].get("label")
+                label = "state" if kind == "GuiMarkdownMessage" else str(message["props"].get("label"))
                 panel.widgets.setdefault(label, message)
                 labels[uuid] = label
         raise AssertionError("no end of the replay")
