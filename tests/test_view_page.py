@@ -53,6 +53,7 @@ def viewer() -> Iterator[SimpleNamespace]:
             said += line
             if "open http" in line:
                 break
+        threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop the viewer
         yield SimpleNamespace(port=port, process=process, said=said)
         process.send_signal(signal.SIGINT)
         try:
