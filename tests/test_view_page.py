@@ -12,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from browser import open_page
@@ -66,6 +65,54 @@ def viewer() -> Iterator[SimpleNamespace]:
 def test_nothing_listens_beyond_this_machine(viewer: SimpleNamespace) -> None:
     assert f"http://127.0.0.1:{viewer.port}" in viewer.said
     assert listening(viewer.port) == {"0100007F"}
+
+
+def test_1000_bad_messages_leave_the_viewer_stepping(viewer: SimpleNamespace) -> None:
+    """Each is ignored, or closes its own connection only; widgets keep their values, valid messages still count."""
+    with Client(viewer.port) as client:
+        panel = client.panel()
+        for number, frame in enumerate(bad_frames(panel, 1000)):
+            assert viewer.process.poll() is None, f"the viewer ended before message {number}"
+            if not isinstance(frame, dict) and closes(frame):
+                with Client(viewer.port) as other:
+                    other.send(frame)
+                    assert other.closing_code() in (1003, 1007, 1009), frame[:50]
+            else:
+                client.send(frame)
+        client.update(panel.uuid("Speed"), 2.0)
+        client.update(panel.uuid("Driven"), "robot 1")
+        after = wait_for_panel(viewer, lambda after: "1 (driven)" in after.values["state"])
+        later = wait_for_panel(viewer, lambda later: later.seconds > after.seconds)
+        changed = {"state": later.values["state"], "Speed": 2.0, "Driven": "robot 1"}
+        assert later.values == {**panel.values, **changed}
+        assert viewer.process.poll() is None
+        client.update(panel.uuid("Driven"), "none")
+        client.update(panel.uuid("Speed"), 1.0)
+
+
+def closes(frame: bytes | str) -> bool:
+    """Whether a frame is none of a message: text, too long, or not msgpack."""
+    import msgspec
+
+    if isinstance(frame, str) or len(frame) > 2**16:
+        return True
+    try:
+        msgspec.msgpack.decode(frame)
+    except (ValueError, RecursionError):
+        return True
+    return False
+
+
+def wait_for_panel(viewer: SimpleNamespace, condition: Callable[[Panel], bool], seconds: float = 30.0) -> Panel:
+    """Connects anew until the panel meets a condition; returns it."""
+    end = time.monotonic() + seconds
+    while True:
+        with Client(viewer.port) as client:
+            panel = client.panel()
+        if "state" in panel.values and condition(panel):
+            return panel
+        assert time.monotonic() < end, panel.values.get("state")
+        time.sleep(0.2)
 
 
 class Page:
@@ -147,54 +194,6 @@ def test_the_page_pauses_steps_and_resets(page: Page) -> None:
     assert page.page.locator("canvas").count() >= 2  # the scene, and the plots
     if folder := os.environ.get("MQE_SCREENSHOTS"):
         page.page.screenshot(path=str(Path(folder) / "view.png"))
-
-
-def test_1000_bad_messages_leave_the_viewer_stepping(viewer: SimpleNamespace) -> None:
-    """Each is ignored, or closes its own connection only; widgets keep their values, valid messages still count."""
-    with Client(viewer.port) as client:
-        panel = client.panel()
-        for number, frame in enumerate(bad_frames(panel, 1000)):
-            assert viewer.process.poll() is None, f"the viewer ended before message {number}"
-            if not isinstance(frame, dict) and closes(frame):
-                with Client(viewer.port) as other:
-                    other.send(frame)
-                    assert other.closing_code() in (1003, 1007, 1009), frame[:50]
-            else:
-                client.send(frame)
-        client.update(panel.uuid("Speed"), 2.0)
-        client.update(panel.uuid("Driven"), "robot 1")
-        after = wait_for_panel(viewer, lambda after: "1 (driven)" in after.values["state"])
-        later = wait_for_panel(viewer, lambda later: later.seconds > after.seconds)
-        assert {name: value for name, value in later.values.items() if name != "state"} == {
-            "Speed": 2.0,
-            "Driven": "robot 1",
-        }
-        assert viewer.process.poll() is None
-        client.update(panel.uuid("Driven"), "none")
-        client.update(panel.uuid("Speed"), 1.0)
-
-
-def closes(frame: bytes | str) -> bool:
-    """Whether a frame is none of a message: text, too long, or not msgpack."""
-    if isinstance(frame, str) or len(frame) > 2**16:
-        return True
-    try:
-        msgspec.msgpack.decode(frame)
-    except (ValueError, RecursionError):
-        return True
-    return False
-
-
-def wait_for_panel(viewer: SimpleNamespace, condition: Callable[[Panel], bool], seconds: float = 30.0) -> Panel:
-    """Connects anew until the panel meets a condition; returns it."""
-    end = time.monotonic() + seconds
-    while True:
-        with Client(viewer.port) as client:
-            panel = client.panel()
-        if "state" in panel.values and condition(panel):
-            return panel
-        assert time.monotonic() < end, panel.values.get("state")
-        time.sleep(0.2)
 
 
 CONNECT = """address => new Promise(done => {
