@@ -1,43 +1,17 @@
-"""The viewer: its simulation, its scene, its panel, and the page in a real browser."""
+"""The viewer: its simulation, its scene and its arguments."""
 
-import os
-import signal
-import socket
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import open_page
-from fake_env import FakeEnv, FakeVectorEnv
+from fake_env import FakeEnv
+from viewer import Driven, free_port, session
 
 from mqe_jax import cli, make
-from mqe_jax.cli.players import planner
-from mqe_jax.view.session import HOLD_TIME, Drive, Session
-
-STARTUP = 240.0  # s, on a loaded machine without compiled programs
-
-
-class Driven(FakeEnv):
-    """The fake task under walk commands, its second agent in a mirrored frame."""
-
-    control = "command"
-    params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
-    controller = SimpleNamespace(default_commands=np.zeros(15, np.float32))
-
-    def unmirror_action(self, action: jax.Array) -> jax.Array:
-        return action * jnp.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]])
-
-
-def session(env: Any, num_envs: int = 2, name: str = "idle", **options: Any) -> Session:
-    return Session(env, FakeVectorEnv(env, num_envs), planner(name, env), (), **options)
+from mqe_jax.view.session import HOLD_TIME, Drive
 
 
 def test_a_driven_robot_obeys_the_hand_and_the_others_their_policy() -> None:
@@ -108,12 +82,6 @@ def stage() -> Iterator[Any]:
     server.stop()
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: Any) -> None:
     scene, frame, model = stage.stage, stage.frame, stage.env.mj_model
     drawn = sorted(int(body) for batch in scene._batches for body in batch.bodies)
@@ -168,129 +136,3 @@ def test_bad_arguments_are_refused_in_a_line(arguments: list[str], words: tuple[
     assert cli.main(["view", "go1gate", *arguments]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and all(word in said for word in words)
-
-
-def listening(port: int) -> set[str]:
-    """Local addresses, as the kernel writes them, on which a port is listened to."""
-    found = set()
-    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
-        for line in Path(table).read_text().splitlines()[1:]:
-            local, state = line.split()[1], line.split()[3]
-            address, number = local.rsplit(":", 1)
-            if state == "0A" and int(number, 16) == port:
-                found.add(address)
-    return found
-
-
-@pytest.fixture(scope="module")
-def viewer() -> Iterator[SimpleNamespace]:
-    """A running `mqe view` of two idle robots."""
-    pytest.importorskip("viser")
-    port = free_port()
-    command = ["view", "go1gate", "--planner", "idle", "--port", str(port), "--set", "episode_length=600"]
-    command += ["--set", "end_on_collision=false"]
-    # A shell starts background jobs with SIGINT ignored, which children inherit.
-    program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    program += "from mqe_jax.cli import main; sys.exit(main())"
-    with subprocess.Popen(
-        [sys.executable, "-c", program, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        said = ""
-        for line in process.stdout:
-            said += line
-            if "open http" in line:
-                break
-        yield SimpleNamespace(port=port, process=process, said=said)
-        process.send_signal(signal.SIGINT)
-        try:
-            assert process.wait(30) == 130
-        finally:
-            process.kill()
-
-
-@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net/tcp to read the sockets from")
-def test_nothing_listens_beyond_this_machine(viewer: SimpleNamespace) -> None:
-    assert f"http://127.0.0.1:{viewer.port}" in viewer.said
-    assert listening(viewer.port) == {"0100007F"}
-
-
-class Page:
-    """The viewer's page, as rendered."""
-
-    def __init__(self, page: Any) -> None:
-        self.page = page
-
-    def robots(self) -> np.ndarray:
-        """x, y, z, vx, vy, turn of each robot, from the table (A, 6)."""
-        rows = self.page.locator("table").first.locator("tbody tr").all_inner_texts()
-        return np.array([[float(cell) for cell in row.split("\t")[1:]] for row in rows])
-
-    def text(self) -> str:
-        return self.page.locator("body").inner_text()
-
-    def until(self, condition: Callable[[], bool], seconds: float = 60.0) -> None:
-        end = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < end, f"not within {seconds} s; the page says: {self.text()[:400]}"
-            time.sleep(0.1)
-
-    def choose(self, label: str, option: str) -> None:
-        self.page.get_by_label(label, exact=True).first.click()
-        self.page.get_by_role("option", name=option, exact=True).click()
-
-
-@pytest.fixture(scope="module")
-def page(viewer: SimpleNamespace) -> Iterator[Page]:
-    with open_page(640, 480) as tab:
-        tab.goto(f"http://127.0.0.1:{viewer.port}")
-        tab.wait_for_selector("table", timeout=1000 * STARTUP)
-        yield Page(tab)
-
-
-def test_a_robot_is_driven_from_the_page(page: Page) -> None:
-    """Hold the drive button, then press keys: only the selected robot moves on the page."""
-    page.choose("Driven", "robot 2")
-    page.until(lambda: "2 (driven)" in page.text())
-    start = page.robots()
-    button = page.page.get_by_role("button", name="Forward", exact=True)
-    button.scroll_into_view_if_needed()
-    box = button.bounding_box()
-    page.page.mouse.move(box["x"] + 9, box["y"] + 9)
-    page.page.mouse.down()
-    page.until(lambda: page.robots()[1, 3] == 1.0 and page.robots()[1, 0] > start[1, 0] + 0.3)
-    page.page.mouse.up()
-    page.until(lambda: page.robots()[1, 3] == 0.0)
-    moved = page.robots()
-    assert moved[1, 0] - start[1, 0] > 2 * abs(moved[0, 0] - start[0, 0])  # idle robots step in place and drift slowly
-    page.page.mouse.move(5, 5)
-    page.page.keyboard.press("j")
-    page.page.keyboard.press("j")
-    page.until(lambda: page.robots()[1, 5] == 0.25)
-    page.page.keyboard.press("k")
-    page.until(lambda: page.robots()[1, 3] == -0.25)
-    page.until(lambda: page.robots()[1, 0] < moved[1, 0] - 0.1)
-    page.page.keyboard.press("x")
-    page.until(lambda: bool(np.all(page.robots()[1, 3:] == 0.0)))
-    assert np.all(page.robots()[0, 3:] == 0.0)
-
-
-def test_the_page_pauses_steps_and_resets(page: Page) -> None:
-    def seconds() -> float:
-        return float(page.text().split(" at ")[1].split(" s")[0])
-
-    page.page.keyboard.press("p")
-    page.until(lambda: "paused" in page.text())
-    before = seconds()
-    page.page.keyboard.press("n")
-    page.until(lambda: seconds() > before)
-    assert seconds() == pytest.approx(before + 0.02, abs=0.005)
-    page.page.get_by_role("button", name="Reset", exact=True).click()
-    page.until(lambda: bool(np.all(np.abs(page.robots()[:, 0] - 1.0) < 0.05)))
-    page.page.get_by_role("button", name="Continue", exact=True).click()
-    page.until(lambda: seconds() > before + 0.5)
-    page.choose("Camera", "robot 2")
-    page.until(lambda: page.page.get_by_label("Camera", exact=True).first.input_value() == "robot 2")
-    assert page.page.locator("canvas").count() >= 2  # the scene, and the plots
-    if folder := os.environ.get("MQE_SCREENSHOTS"):
-        page.page.screenshot(path=str(Path(folder) / "view.png"))

@@ -25,7 +25,7 @@ class View:
     num_envs: int = 1
     """Number of environments, side by side: 1 to 16."""
     host: str = "127.0.0.1"
-    """Address to listen on; the default is reachable from this machine only. There is no authentication."""
+    """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
     port: int = 8080
     """Port to listen on, or the next free one if it is in use."""
     impl: Impl = "auto"

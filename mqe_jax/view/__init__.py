@@ -1,1 +1,1 @@
-"""The browser viewer: simulation, scene, control panel, and main loop."""
+"""The browser viewer: simulation, scene, control panel, server, and main loop."""

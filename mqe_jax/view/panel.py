@@ -21,6 +21,9 @@ DIRECTIONS = (
 )
 KEY_STEP = 0.25
 """Increment of a key press, as a fraction of the maximum command."""
+HOLD_RATE = 10.0
+"""Messages of a held button per second."""
+_MOST_STEPS = 25  # single steps waiting
 FREE, NONE = "free", "none"
 _COLORS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
 _POINTS = 200
@@ -112,7 +115,7 @@ class Panel:
             pause.label = "Continue" if session.paused else "Pause"
 
         def one(_: Any) -> None:
-            self._wanted_steps += 1
+            self._wanted_steps = min(self._wanted_steps + 1, _MOST_STEPS)
 
         def start_over(_: Any) -> None:
             self._wants_reset = True
@@ -171,7 +174,7 @@ class Panel:
         gui.add_command("Stop", hotkey="X").on_trigger(halt)
         for button, (label, direction, key) in zip(buttons, DIRECTIONS, strict=True):
             vx, vy, turn = direction
-            button.on_hold(lambda _, held=direction: drive.hold(held), callback_hz=10.0)
+            button.on_hold(lambda _, held=direction: drive.hold(held), callback_hz=HOLD_RATE)
             step = (KEY_STEP * vx, KEY_STEP * vy, KEY_STEP * turn)
             gui.add_command(label, hotkey=key).on_trigger(lambda _, by=step: drive.change(by))
 

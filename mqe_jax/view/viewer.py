@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import threading
 import time
 
@@ -11,6 +9,7 @@ import numpy as np
 import viser
 
 from mqe_jax.view.panel import FREE, Panel
+from mqe_jax.view.server import open_server
 from mqe_jax.view.session import Session
 from mqe_jax.view.stage import Stage
 
@@ -27,16 +26,17 @@ class Viewer:
     session: Session
     """The simulation."""
     server: viser.ViserServer
-    """The web server; it listens on `host` only."""
+    """The web server; it listens on `host` only, and accepts connections from its own page only."""
     url: str
     """Address of the page."""
 
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.session = session
-        with contextlib.redirect_stdout(io.StringIO()):  # suppresses viser's banner
-            self.server = viser.ViserServer(host=host, port=port, label=f"mqe view {session.env.name}", verbose=False)
-        self.url = f"http://{self.server.get_host()}:{self.server.get_port()}"
-        self.server.gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False)
+        self.server = open_server(host, port, f"mqe view {session.env.name}")
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+        self.server.gui.configure_theme(
+            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
+        )
         self._stage = Stage(self.server, session.env, session.frame())
         self._panel = Panel(self.server, session, tuple(self._stage.bodies), self._aim)
         camera = self.server.initial_camera

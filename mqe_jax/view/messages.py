@@ -1,0 +1,122 @@
+"""Messages from the page: which of them are accepted.
+
+Every field has bounds. Messages of other types (uploads, forms, share URLs, of which the panel has none) are unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import msgspec
+import viser
+from msgspec import Meta, Struct
+
+from mqe_jax.view.panel import HOLD_RATE
+
+MAX_FRAME = 2**16
+"""Length of a frame, bytes; camera messages, the longest, have about 400."""
+
+Number = Annotated[float, Meta(ge=-1e6, le=1e6)]  # refuses NaN
+Pixels = Annotated[int, Meta(ge=0, le=2**16)]
+Name = Annotated[str, Meta(max_length=64)]
+Vector = tuple[Number, Number, Number]
+
+
+class UnparsableError(ValueError):
+    """A frame that is not a message at all."""
+
+
+class RefusedError(ValueError):
+    """A message with fields that are not allowed."""
+
+
+class _Message(Struct, tag_field="type", forbid_unknown_fields=True):
+    """A message whose field `type` is the tag of its class."""
+
+
+class Camera(_Message, tag="ViewerCameraMessage"):
+    """Pose of the browser's camera."""
+
+    wxyz: tuple[Number, Number, Number, Number]
+    position: Vector
+    fov: Number
+    near: Number
+    far: Number
+    image_height: Pixels
+    image_width: Pixels
+    look_at: Vector
+    up_direction: Vector
+
+    def __post_init__(self) -> None:
+        if math.dist(self.position, self.look_at) < 1e-3 or math.hypot(*self.up_direction) < 1e-3:
+            raise ValueError("`look_at` at `position`, or no `up_direction`")
+
+
+class Value(Struct, forbid_unknown_fields=True):
+    """New value of a widget."""
+
+    value: bool | Number | Name
+
+
+class Update(_Message, tag="GuiUpdateMessage"):
+    """A widget was used."""
+
+    uuid: Name
+    updates: Value
+
+
+class Hold(_Message, tag="GuiButtonHoldMessage"):
+    """A button is held; sent at a rate in Hz."""
+
+    uuid: Name
+    frequency: Number
+
+
+class Command(_Message, tag="CommandTriggerMessage"):
+    """A key was pressed."""
+
+    uuid: Name
+
+
+def check(frame: str | bytes, find: Callable[[str], Any]) -> None:
+    """Raises an UnparsableError or a RefusedError unless a frame is an acceptable message.
+
+    `find` returns the widget or command of a uuid, or None.
+    """
+    if isinstance(frame, str):
+        raise UnparsableError("text")
+    try:
+        fields = msgspec.msgpack.decode(frame)
+    except (ValueError, RecursionError) as error:
+        raise UnparsableError("not msgpack") from error
+    try:
+        message = msgspec.convert(fields, Camera | Update | Hold | Command)
+    except msgspec.ValidationError as error:
+        raise RefusedError(str(error)) from error
+    if isinstance(message, Camera):
+        return
+    target = find(message.uuid)
+    if isinstance(message, Update):
+        _check_value(target, message)
+    elif isinstance(message, Hold):
+        if not isinstance(target, viser.GuiButtonHandle) or message.frequency != HOLD_RATE:
+            raise RefusedError(f"no button {message.uuid!r} held at {message.frequency} Hz")
+    elif not isinstance(target, viser.CommandHandle):
+        raise RefusedError(f"no command {message.uuid!r}")
+
+
+def _check_value(widget: Any, message: Update) -> None:
+    """Raises a RefusedError unless the new value is one that the widget offers."""
+    value = message.updates.value
+    if isinstance(widget, viser.GuiSliderHandle):
+        fits, allowed = isinstance(value, float) and widget.min <= value <= widget.max, f"{widget.min} to {widget.max}"
+    elif isinstance(widget, viser.GuiDropdownHandle):
+        fits, allowed = value in widget.options, ", ".join(widget.options)
+    elif isinstance(widget, viser.GuiButtonHandle):
+        fits, allowed = value is True, "true"
+    else:
+        raise RefusedError(f"no widget {message.uuid!r}")
+    if not fits:
+        raise RefusedError(f"{widget.label} is {value!r}, allowed: {allowed}")

@@ -1,0 +1,231 @@
+"""`mqe view` as a process: its sockets, its page in a real browser, pages of other origins, and bad messages."""
+
+import http.server
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import open_page
+from viewer import Client, Panel, free_port
+from viewer_fuzz import bad_frames
+
+STARTUP = 240.0  # s, on a loaded machine without compiled programs
+
+
+def listening(port: int) -> set[str]:
+    """Local addresses, as the kernel writes them, on which a port is listened to."""
+    found = set()
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        for line in Path(table).read_text().splitlines()[1:]:
+            local, state = line.split()[1], line.split()[3]
+            address, number = local.rsplit(":", 1)
+            if state == "0A" and int(number, 16) == port:
+                found.add(address)
+    return found
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[SimpleNamespace]:
+    """A running `mqe view` of two idle robots."""
+    pytest.importorskip("viser")
+    port = free_port()
+    command = ["view", "go1gate", "--planner", "idle", "--port", str(port), "--set", "episode_length=600"]
+    command += ["--set", "end_on_collision=false"]
+    # A shell starts background jobs with SIGINT ignored, which children inherit.
+    program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    program += "from mqe_jax.cli import main; sys.exit(main())"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        said = ""
+        for line in process.stdout:
+            said += line
+            if "open http" in line:
+                break
+        threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop the viewer
+        yield SimpleNamespace(port=port, process=process, said=said)
+        process.send_signal(signal.SIGINT)
+        try:
+            assert process.wait(30) == 130
+        finally:
+            process.kill()
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net/tcp to read the sockets from")
+def test_nothing_listens_beyond_this_machine(viewer: SimpleNamespace) -> None:
+    assert f"http://127.0.0.1:{viewer.port}" in viewer.said
+    assert listening(viewer.port) == {"0100007F"}
+
+
+def test_1000_bad_messages_leave_the_viewer_stepping(viewer: SimpleNamespace) -> None:
+    """Each is ignored, or closes its own connection only; widgets keep their values, valid messages still count."""
+    with Client(viewer.port) as client:
+        panel = client.panel()
+        for number, frame in enumerate(bad_frames(panel, 1000)):
+            assert viewer.process.poll() is None, f"the viewer ended before message {number}"
+            if not isinstance(frame, dict) and closes(frame):
+                with Client(viewer.port) as other:
+                    other.send(frame)
+                    assert other.closing_code() in (1003, 1007, 1009), frame[:50]
+            else:
+                client.send(frame)
+        client.update(panel.uuid("Speed"), 2.0)
+        client.update(panel.uuid("Driven"), "robot 1")
+        after = wait_for_panel(viewer, lambda after: "1 (driven)" in after.values["state"])
+        later = wait_for_panel(viewer, lambda later: later.seconds > after.seconds)
+        changed = {"state": later.values["state"], "Speed": 2.0, "Driven": "robot 1"}
+        assert later.values == {**panel.values, **changed}
+        assert viewer.process.poll() is None
+        client.update(panel.uuid("Driven"), "none")
+        client.update(panel.uuid("Speed"), 1.0)
+
+
+def closes(frame: bytes | str) -> bool:
+    """Whether a frame is none of a message: text, too long, or not msgpack."""
+    import msgspec
+
+    if isinstance(frame, str) or len(frame) > 2**16:
+        return True
+    try:
+        msgspec.msgpack.decode(frame)
+    except (ValueError, RecursionError):
+        return True
+    return False
+
+
+def wait_for_panel(viewer: SimpleNamespace, condition: Callable[[Panel], bool], seconds: float = 30.0) -> Panel:
+    """Connects anew until the panel meets a condition; returns it."""
+    end = time.monotonic() + seconds
+    while True:
+        with Client(viewer.port) as client:
+            panel = client.panel()
+        if "state" in panel.values and condition(panel):
+            return panel
+        assert time.monotonic() < end, panel.values.get("state")
+        time.sleep(0.2)
+
+
+class Page:
+    """The viewer's page, as rendered."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+
+    def robots(self) -> np.ndarray:
+        """x, y, z, vx, vy, turn of each robot, from the table (A, 6)."""
+        rows = self.page.locator("table").first.locator("tbody tr").all_inner_texts()
+        return np.array([[float(cell) for cell in row.split("\t")[1:]] for row in rows])
+
+    def text(self) -> str:
+        return self.page.locator("body").inner_text()
+
+    def until(self, condition: Callable[[], bool], seconds: float = 60.0) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, f"not within {seconds} s; the page says: {self.text()[:400]}"
+            time.sleep(0.1)
+
+    def choose(self, label: str, option: str) -> None:
+        self.page.get_by_label(label, exact=True).first.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+
+@pytest.fixture(scope="module")
+def page(viewer: SimpleNamespace) -> Iterator[Page]:
+    with open_page(640, 480) as tab:
+        tab.goto(f"http://127.0.0.1:{viewer.port}")
+        tab.wait_for_selector("table", timeout=1000 * STARTUP)
+        yield Page(tab)
+
+
+def test_a_robot_is_driven_from_the_page(page: Page) -> None:
+    """Hold the drive button, then press keys: only the selected robot moves on the page."""
+    page.choose("Driven", "robot 2")
+    page.until(lambda: "2 (driven)" in page.text())
+    start = page.robots()
+    button = page.page.get_by_role("button", name="Forward", exact=True)
+    button.scroll_into_view_if_needed()
+    box = button.bounding_box()
+    page.page.mouse.move(box["x"] + 9, box["y"] + 9)
+    page.page.mouse.down()
+    page.until(lambda: page.robots()[1, 3] == 1.0 and page.robots()[1, 0] > start[1, 0] + 0.3)
+    page.page.mouse.up()
+    page.until(lambda: page.robots()[1, 3] == 0.0)
+    moved = page.robots()
+    assert moved[1, 0] - start[1, 0] > 2 * abs(moved[0, 0] - start[0, 0])  # idle robots step in place and drift slowly
+    page.page.mouse.move(5, 5)
+    page.page.keyboard.press("j")
+    page.page.keyboard.press("j")
+    page.until(lambda: page.robots()[1, 5] == 0.25)
+    page.page.keyboard.press("k")
+    page.until(lambda: page.robots()[1, 3] == -0.25)
+    page.until(lambda: page.robots()[1, 0] < moved[1, 0] - 0.1)
+    page.page.keyboard.press("x")
+    page.until(lambda: bool(np.all(page.robots()[1, 3:] == 0.0)))
+    assert np.all(page.robots()[0, 3:] == 0.0)
+
+
+def test_the_page_pauses_steps_and_resets(page: Page) -> None:
+    def seconds() -> float:
+        return float(page.text().split(" at ")[1].split(" s")[0])
+
+    page.page.keyboard.press("p")
+    page.until(lambda: "paused" in page.text())
+    before = seconds()
+    page.page.keyboard.press("n")
+    page.until(lambda: seconds() > before)
+    assert seconds() == pytest.approx(before + 0.02, abs=0.005)
+    page.page.get_by_role("button", name="Reset", exact=True).click()
+    page.until(lambda: bool(np.all(np.abs(page.robots()[:, 0] - 1.0) < 0.05)))
+    page.page.get_by_role("button", name="Continue", exact=True).click()
+    page.until(lambda: seconds() > before + 0.5)
+    page.choose("Camera", "robot 2")
+    page.until(lambda: page.page.get_by_label("Camera", exact=True).first.input_value() == "robot 2")
+    assert page.page.locator("canvas").count() >= 2  # the scene, and the plots
+    if folder := os.environ.get("MQE_SCREENSHOTS"):
+        page.page.screenshot(path=str(Path(folder) / "view.png"))
+
+
+CONNECT = """address => new Promise(done => {
+    const socket = new WebSocket(address, ["viser-v%s"]);
+    socket.onopen = () => done("open");
+    socket.onerror = () => done("refused");
+})"""
+
+
+def test_a_page_of_another_origin_cannot_open_the_socket(viewer: SimpleNamespace, page: Page) -> None:
+    """A page from another port of this machine is refused, by each name of the viewer; its own page is not."""
+    viser = pytest.importorskip("viser")
+    script = CONNECT % viser.__version__
+
+    class Foreign(http.server.SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b"<!doctype html><title>another origin</title>")
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    tab = page.page.context.browser.new_page()
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Foreign) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        for name in ("localhost", "127.0.0.1"):
+            tab.goto(f"http://{name}:{other.server_port}")
+            assert tab.title() == "another origin"
+            assert tab.evaluate(script, f"ws://localhost:{viewer.port}") == "refused"
+            assert tab.evaluate(script, f"ws://127.0.0.1:{viewer.port}") == "refused"
+        other.shutdown()
+    tab.close()
+    assert len(page.robots()) == 2
+    assert page.page.evaluate(script, f"ws://127.0.0.1:{viewer.port}") == "open"

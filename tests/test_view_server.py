@@ -1,0 +1,224 @@
+"""The viewer's server: which requests it answers and which messages it accepts."""
+
+import http.client
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from viewer import CAMERA, Client, Driven, free_port, session
+
+pytest.importorskip("viser")
+
+import viser
+from websockets.exceptions import InvalidStatus
+
+from mqe_jax.errors import InputError
+from mqe_jax.view.handshake import authorities, refusal
+from mqe_jax.view.messages import HOLD_RATE
+from mqe_jax.view.panel import Panel
+from mqe_jax.view.server import open_server
+
+
+@pytest.fixture(scope="module")
+def shown() -> Iterator[SimpleNamespace]:
+    """The panel of two environments with two robots each, without a scene."""
+    server = open_server("127.0.0.1", free_port(), "test")
+    run = session(Driven())
+    panel = Panel(server, run, ("robot 1", "robot 2"), lambda: None)
+    yield SimpleNamespace(port=server.get_port(), session=run, panel=panel, server=server)
+    server.stop()
+
+
+@pytest.fixture
+def said(capfd: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
+    """Returns the lines on standard error, at the beginning of a second without any from earlier tests."""
+    time.sleep(1.1)
+    capfd.readouterr()
+    return lambda: capfd.readouterr().err.splitlines()
+
+
+def until(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("host", "address", "accepted", "refused"),
+    [
+        ("127.0.0.1", "127.0.0.1", "127.0.0.1 localhost LOCALHOST [::1]", "evil.org 127.0.0.2 localhost. 0.0.0.0"),
+        ("localhost", "::1", "127.0.0.1 localhost [::1]", "::1 evil.org"),
+        ("192.168.1.5", "192.168.1.5", "192.168.1.5", "localhost 127.0.0.1 evil.org"),
+        ("server.lan", "192.168.1.5", "server.lan 192.168.1.5 Server.LAN", "localhost evil.server.lan lan"),
+        ("0.0.0.0", "192.168.1.5", "192.168.1.5 0.0.0.0", "evil.org localhost"),
+        ("::", "fe80::1%eth0", "[::]", "evil.org localhost"),
+    ],
+)
+def test_only_the_servers_own_names_and_origin_are_allowed(
+    host: str, address: str, accepted: str, refused: str
+) -> None:
+    allowed = authorities(host, address, 8080)
+    for name in accepted.split():
+        own = f"{name}:8080"
+        assert refusal([own], [], allowed) is None
+        assert refusal([own], [f"http://{own}"], allowed) is None
+        others = (f"http://{name}:8081", f"https://{own}", f"http://{name}", "http://evil.org:8080", "null", "")
+        for origin in others:
+            assert refusal([own], [origin], allowed) is not None, origin
+        assert refusal([own], [f"http://{own}", "http://evil.org"], allowed) is not None
+        assert refusal([f"{name}:8081"], [], allowed) is not None
+    for name in refused.split():
+        assert refusal([f"{name}:8080"], [f"http://{name}:8080"], allowed) is not None, name
+    assert refusal([], [], allowed) is not None
+    assert refusal([f"{host}:8080"] * 2, [], allowed) is not None
+
+
+def test_port_80_is_implied() -> None:
+    assert refusal(["localhost"], ["http://localhost"], authorities("localhost", "127.0.0.1", 80)) is None
+    assert refusal(["localhost"], ["http://localhost"], authorities("localhost", "127.0.0.1", 8080)) is not None
+
+
+def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(shown: SimpleNamespace, said: Any) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        Client(shown.port, origin="http://evil.org")
+    assert refused.value.response.status_code == 403
+    for name, status in ((f"localhost:{shown.port}", 200), (f"evil.org:{shown.port}", 403)):
+        connection = http.client.HTTPConnection("127.0.0.1", shown.port)
+        connection.request("GET", "/", headers={"Host": name})
+        response = connection.getresponse()
+        text = response.read().decode(errors="replace")
+        assert response.status == status
+        if status == 200:
+            assert response.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+        else:
+            assert text.startswith("mqe view: Host is evil.org") and text.count("\n") == 1
+        connection.close()
+    with Client(shown.port, origin=f"http://127.0.0.1:{shown.port}") as client:
+        assert client.panel().widgets
+    lines = said()
+    assert len(lines) == 2
+    assert lines[0].startswith("mqe: view: refused a connection: Origin is http://evil.org, allowed: http://127.0.0.1:")
+
+
+def test_a_refused_value_changes_nothing_and_is_logged_in_a_line(shown: SimpleNamespace, said: Any) -> None:
+    run, panel = shown.session, shown.panel
+    cases = (
+        ("Speed", 0.0, "Speed is 0.0, allowed: 0.1 to 4.0"),
+        ("Speed", float("nan"), "Expected `float`"),
+        ("Speed", "2", "Speed is '2', allowed: 0.1 to 4.0"),
+        ("Environment", "3", "Environment is '3', allowed: 1, 2"),
+        ("Camera", "x\n\x1b[2J", "Camera is 'x\\n\\x1b[2J', allowed: free, robot 1, robot 2"),
+        ("Driven", 1, "Driven is 1.0, allowed: none, robot 1, robot 2"),
+        ("Pause", 0, "Pause is 0.0, allowed: true"),
+        ("state", "text", "no widget"),
+    )
+    with Client(shown.port) as client:
+        seen = client.panel()
+        for label, value, _ in cases:
+            client.update(seen.uuid(label), value)
+            time.sleep(0.2)  # below the limit of lines per second
+        client.update(seen.uuid("Speed"), 4)
+        client.update(seen.uuid("Environment"), "2")
+        until(lambda: (run.speed, panel.env) == (4.0, 1))
+        client.update(seen.uuid("Speed"), 1)
+        client.update(seen.uuid("Environment"), "1")
+        until(lambda: (run.speed, panel.env) == (1.0, 0))
+    assert (panel.camera, run.drive.robot, run.paused) == ("free", None, False)
+    lines = said()
+    assert len(lines) == len(cases), lines
+    for line, (_, _, words) in zip(lines, cases, strict=True):
+        assert line.startswith("mqe: view: ignored a message: ") and words in line and len(line) < 250
+
+
+def test_log_lines_are_limited(shown: SimpleNamespace, said: Any) -> None:
+    start = time.monotonic()
+    with Client(shown.port) as client:
+        for number in range(200):
+            client.send({"type": "x" * 1000, "number": number})
+        client.send("text")
+        assert client.closing_code() == 1003
+    seconds = int(time.monotonic() - start) + 2
+    lines = said()
+    assert 1 <= len(lines) <= 10 * seconds and max(map(len, lines)) < 250
+
+
+@pytest.mark.parametrize(("frame", "code"), [("text", 1003), (b"", 1007), (b"\xc1", 1007), (bytes(100_000), 1009)])
+def test_a_frame_that_is_no_message_closes_its_connection_only(shown: SimpleNamespace, frame: Any, code: int) -> None:
+    with Client(shown.port) as other, Client(shown.port) as client:
+        client.send(frame)
+        assert client.closing_code() == code
+        assert other.panel().widgets
+
+
+def test_keys_and_held_buttons_count_and_waiting_steps_are_limited(shown: SimpleNamespace) -> None:
+    run, panel = shown.session, shown.panel
+    with Client(shown.port) as client:
+        seen = client.panel()
+        client.send({"type": "CommandTriggerMessage", "uuid": seen.commands["Forward"]})
+        until(lambda: run.drive.now()[0] == 0.25)
+        client.send({"type": "CommandTriggerMessage", "uuid": seen.commands["Stop"]})
+        until(lambda: run.drive.now()[0] == 0.0)
+        client.send({"type": "GuiButtonHoldMessage", "uuid": seen.uuid("Forward"), "frequency": 0.0})
+        client.send({"type": "GuiButtonHoldMessage", "uuid": seen.uuid("Turn left"), "frequency": HOLD_RATE})
+        until(lambda: run.drive.now()[2] > 0.0)
+        assert run.drive.now()[0] == 0.0
+        for _ in range(100):
+            client.update(seen.uuid("One step"), True)
+        client.update(seen.uuid("Reset"), True)
+        until(panel.take_reset)
+    assert 1 <= panel.take_steps() <= 25 and panel.take_steps() == 0
+
+
+def test_no_message_opens_the_page_to_the_internet_or_buffers_an_upload(
+    shown: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(shown.server, "request_share_url", lambda *_: asked.append("share"))
+    with Client(shown.port) as client:
+        seen = client.panel()
+        client.send({"type": "ShareUrlRequest"})
+        upload = {"source_component_uuid": seen.uuid("Speed"), "transfer_uuid": "x", "filename": "x", "mime_type": ""}
+        client.send({"type": "FileTransferStartUpload", **upload, "part_count": 10**9, "size_bytes": 10**15})
+        client.send({"type": "GuiFormDirtyMessage", "uuid": "form"})
+        client.update(seen.uuid("Speed"), 2.0)
+        until(lambda: shown.session.speed == 2.0)
+    assert not asked and not shown.server.gui._current_file_upload_states
+    with Client(shown.port) as client:
+        assert client.panel().widgets.keys() == seen.widgets.keys()
+
+
+def test_a_camera_without_direction_is_refused(shown: SimpleNamespace) -> None:
+    """Otherwise the next change of the followed body would fail for all clients."""
+    with Client(shown.port) as client:
+        seen = client.panel()
+        client.send({**CAMERA, "position": [5.0, 0.0, 1.0]})
+        for bad in ({"look_at": CAMERA["position"]}, {"up_direction": [0.0, 0.0, 0.0]}, {"fov": float("nan")}):
+            client.send({**CAMERA, **bad})
+        client.update(seen.uuid("Camera"), "robot 2")
+        until(lambda: shown.panel.camera == "robot 2")
+        cameras = [one.camera for one in shown.server.get_clients().values()]
+        assert [camera.position.tolist() for camera in cameras] == [[5.0, 0.0, 1.0]]
+        client.update(seen.uuid("Camera"), "free")
+
+
+def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped = []
+
+    class Other:
+        """A server that is not started by websockets.asyncio.server.serve."""
+
+        gui = SimpleNamespace(_gui_input_handle_from_uuid={}, _command_handle_from_uuid={})
+
+        def __init__(self, **_: Any) -> None:
+            pass
+
+        def stop(self) -> None:
+            stopped.append(True)
+
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(InputError, match=r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)"):
+        open_server("127.0.0.1", free_port(), "test")
+    assert stopped == [True]

@@ -1,0 +1,147 @@
+"""For the tests of the viewer: a session without physics, and a client of its server that is no browser."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from fake_env import FakeEnv, FakeVectorEnv
+
+from mqe_jax.cli.players import planner
+from mqe_jax.view.session import Session
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [3.0, 0.0, 2.0],
+    "fov": 0.87,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 480,
+    "image_width": 640,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+"""Message that a browser sends first, with its camera's pose; viser ignores widgets before it."""
+
+
+class Driven(FakeEnv):
+    """The fake task under walk commands, its second agent in a mirrored frame."""
+
+    control = "command"
+    params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
+    controller = SimpleNamespace(default_commands=np.zeros(15, np.float32))
+
+    def unmirror_action(self, action: jax.Array) -> jax.Array:
+        return action * jnp.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]])
+
+
+def session(env: Any, num_envs: int = 2, name: str = "idle", **options: Any) -> Session:
+    return Session(env, FakeVectorEnv(env, num_envs), planner(name, env), (), **options)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@dataclass
+class Panel:
+    """The panel as a newly connected client sees it."""
+
+    widgets: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Message that created each widget, by label; markdown as `state`."""
+    commands: dict[str, str] = field(default_factory=dict)
+    """Uuid of each command, by label."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """Values by label that differ from the initial ones."""
+
+    def uuid(self, label: str) -> str:
+        return self.widgets[label]["uuid"]
+
+    @property
+    def seconds(self) -> float:
+        """Simulated time, s."""
+        return float(self.values["state"].split(" at ")[1].split(" s")[0])
+
+
+class Client:
+    """A websocket connection to the viewer, with its camera's pose sent."""
+
+    def __init__(self, port: int, **options: Any) -> None:
+        import msgspec
+        import viser
+        from websockets.sync.client import connect
+
+        options = {"proxy": None, "max_size": None, "subprotocols": [f"viser-v{viser.__version__}"], **options}
+        self.socket = connect(f"ws://127.0.0.1:{port}", **options)
+        self.socket.send(msgspec.msgpack.encode(CAMERA))
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+    def send(self, frame: dict[str, Any] | bytes | str) -> None:
+        """Sends a frame (dicts as msgpack) and discards what was received."""
+        import msgspec
+
+        self.socket.send(msgspec.msgpack.encode(frame) if isinstance(frame, dict) else frame)
+        try:
+            while True:
+                self.socket.recv(timeout=0)
+        except TimeoutError:
+            pass
+
+    def update(self, uuid: str, value: Any) -> None:
+        self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
+
+    def closing_code(self) -> int:
+        """Waits until the server has closed the connection; returns the code (RFC 6455, 7.4)."""
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            while True:
+                self.socket.recv(timeout=10.0)
+        except ConnectionClosed as closed:
+            assert closed.rcvd is not None
+            return closed.rcvd.code
+
+    def panel(self) -> Panel:
+        """Reads what every new client is sent first."""
+        panel = Panel()
+        labels: dict[str, str] = {}
+        for message in self._messages():
+            kind, uuid = message["type"], message.get("uuid", "")
+            if kind == "ReplayDoneMessage":
+                return panel
+            if kind == "RegisterCommandMessage":
+                panel.commands[message["props"]["label"]] = message["uuid"]
+            elif kind == "GuiUpdateMessage":
+                for name in message["updates"].keys() & {"value", "_markdown"}:
+                    panel.values[labels[uuid]] = message["updates"][name]
+            elif kind.startswith("Gui") and "props" in message:
+                label = "state" if kind == "GuiMarkdownMessage" else str(message["props"].get("label"))
+                panel.widgets.setdefault(label, message)
+                labels[uuid] = label
+        raise AssertionError("no end of the replay")
+
+    def _messages(self) -> Iterator[dict[str, Any]]:
+        """Messages from the server: length, compressed length (uint64 each), zstd of msgpack, arrays."""
+        import msgspec
+        import zstandard
+
+        while True:
+            frame = self.socket.recv(timeout=60.0)
+            assert isinstance(frame, bytes)
+            size, packed = (int.from_bytes(frame[i : i + 8], "little") for i in (0, 8))
+            window = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + packed], max_output_size=size)
+            yield from msgspec.msgpack.decode(window)["messages"]
