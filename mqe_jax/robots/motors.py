@@ -25,10 +25,11 @@ from mqe_jax.robots.build import build_robot
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import Robot
 
-BAND = 0.2
-SLOW, FAST = 0.5, 0.75  # shares of a leg's lowest speed limit at which its armature begins and is complete
-REACH = 0.25  # range of the share of the speed limit, from 1 upwards, that a joint can reach in a physics step
-CLAMP = 1.4
+BAND = 0.15
+SLOW, FAST = .7, .8  # shares of a leg's lowest speed limit at which its armature begins and is complete
+REACH = 1.25  # share of its speed limit that a joint may reach within a physics step without armature
+GAIN = 4.0
+CLAMP = 1.09
 
 
 @functools.cache
@@ -106,11 +107,11 @@ class Motors:
         limits = speed.reshape(-1, len(self.response))
         kick = sum(effort[..., i : i + 1] * self.response[i] for i in range(len(self.response)))
         near = (pace / limits.min(axis=1, keepdims=True) - SLOW) / (FAST - SLOW)
-        reached = ((pace + self.timestep * kick) / limits - 1.0) / REACH
-        share = xp.maximum(near, reached)
-        share = xp.maximum(xp.maximum(share[..., 0], share[..., 1]), share[..., 2])
-        share = xp.broadcast_to(xp.clip(share, 0.0, 1.0)[..., None], pace.shape).reshape(velocity.shape)
-        return ctrl, self.timestep * brake * share
+        near = xp.clip(xp.maximum(xp.maximum(near[..., 0], near[..., 1]), near[..., 2]), 0.0, 1.0)[..., None]
+        full = (self.timestep * brake).reshape(limits.shape)
+        reach = (pace + self.timestep * kick) / limits
+        needed = xp.where(reach > REACH, xp.clip(GAIN * (reach - 1.0) / np.diag(self.response), 0.0, full), 0.0)
+        return ctrl, xp.maximum(near * full, needed).reshape(velocity.shape)
 
     def clamp(self, xp: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
         """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `CLAMP` V."""
