@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Demo
 from mqe_jax.cli.commands import draw
 from mqe_jax.cli.output import echo
@@ -44,11 +45,8 @@ def demo(arguments: Demo) -> None:
     echo("mqe demo: evaluating the untrained policy")
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
-    try:
+    with interrupts.before_exit(lambda: "the same command resumes from here"):
         runner.train(training_env, config, run_dir, resume=True)
-    except KeyboardInterrupt:
-        echo("mqe: stopped; the same command resumes from here")
-        raise
     after = policy.load_policy(run_dir)
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())

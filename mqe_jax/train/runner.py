@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import fail, to_mapping
@@ -150,42 +152,55 @@ class _Training:
         if self._config.evaluation.every is not None and eval_env is not None:
             self._monitor = Monitor(eval_env, self._config)
         self._evaluations: list[EvaluationLog] = []
+        self._logs = contextlib.ExitStack()
+        self._writing = threading.RLock()  # held while files are written and the state is exchanged
 
     def run(self, on_update: OnUpdate | None) -> list[TrainState]:
         """Runs the remaining updates and returns the last states."""
         config = self._config
+        if self._saved == self._env_steps:
+            self._save_policies()  # a run that ended between checkpoint and policy has an older one
         self._save()  # so that a run killed before its first regular checkpoint can be resumed too
         for own, folder in zip(self._configs, self._folders, strict=True):
             write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
         total_steps = config.num_updates * config.steps_per_update
-        with contextlib.ExitStack() as logs:
+        with self._logs as logs:
             makers = (CsvLog, *(LOGGERS[name] for name in config.loggers))
             files: list[list[MetricsLog]] = [[] for _ in self._folders]
             for folder, own_logs in zip(self._folders, files, strict=True):
                 for make_log in makers:
                     own_logs.append(make_log(folder, self._env_steps))
                     logs.callback(own_logs[-1].close)
+            progress_log = logs.enter_context(ProgressLog(config.task or self._env.name, self._env_steps, total_steps))
+            logs.enter_context(interrupts.before_exit(self._end))
             try:
-                with ProgressLog(config.task or self._env.name, self._env_steps, total_steps) as progress_log:
-                    while self._env_steps < total_steps:
-                        rows = self._step(files)
-                        progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
-                        if on_update is not None:
-                            for i, row in enumerate(rows):
-                                on_update(self._seed(i), row)
-                        updates = int(rows[0]["updates"])
-                        evaluates = self._monitor is not None and updates % (config.evaluation.every or 1) == 0
-                        if evaluates or self._env_steps >= total_steps:
-                            self._evaluate()
-                        if evaluates or updates % config.checkpoint.every == 0:
-                            self._save()
+                self._evaluate_if_due()  # left out by a run that ended during this evaluation
+                while self._env_steps < total_steps:
+                    rows = self._step(files)
+                    progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                    if on_update is not None:
+                        for i, row in enumerate(rows):
+                            on_update(self._seed(i), row)
+                    if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
+                        self._save()
                 self._save()
                 self._measure_best()
             except KeyboardInterrupt:
                 self._save()
                 raise
         return [self._seed(i) for i in range(len(self._configs))]
+
+    def _end(self) -> None:
+        """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
+
+        The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
+        """
+        self._writing.acquire()  # for ever, so that the main thread writes nothing more
+        try:
+            self._save()
+        finally:
+            self._logs.close()
 
     def _seed(self, i: int, state: TrainState | None = None) -> TrainState:
         """Returns one seed's state from the current states, or from `state` if given."""
@@ -208,11 +223,12 @@ class _Training:
             row["fps"] *= len(self._folders)
             _check_finite(state, row, folder)
             rows.append(row)
-        for logs, row in zip(files, rows, strict=True):
-            for log in logs:
-                log.write(row)
-        # Assigned after logging, so that an interrupted run saves no update that is not logged.
-        self._state, self._env_steps = after, int(rows[0]["env_steps"])
+        with self._writing:
+            for logs, row in zip(files, rows, strict=True):
+                for log in logs:
+                    log.write(row)
+            # Assigned after logging, so that an interrupted run saves no update that is not logged.
+            self._state, self._env_steps = after, int(rows[0]["env_steps"])
         return rows
 
     def _policies(self) -> list[Policy]:
@@ -224,21 +240,34 @@ class _Training:
 
     def _save(self) -> None:
         """Writes checkpoint and policy of every seed, once per update."""
-        if self._saved == self._env_steps:
-            return
-        seconds = time.perf_counter() - self._start_time
-        kept = self._config.checkpoint.kept if self._single else max(self._config.checkpoint.kept, 2)
-        for i, (config, folder, policy) in enumerate(zip(self._configs, self._folders, self._policies(), strict=True)):
-            metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-            metadata["environments"] = config.checkpoint.environments
-            state = self._seed(i)
-            whole = config.checkpoint.environments
-            tree = without_shared(state, self._shared) if whole else _without_environments(state)
-            save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+        with self._writing:
+            if self._saved == self._env_steps:
+                return
+            seconds = time.perf_counter() - self._start_time
+            kept = self._config.checkpoint.kept if self._single else max(self._config.checkpoint.kept, 2)
+            for i, (config, folder) in enumerate(zip(self._configs, self._folders, strict=True)):
+                metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
+                metadata["environments"] = config.checkpoint.environments
+                state = self._seed(i)
+                whole = config.checkpoint.environments
+                tree = without_shared(state, self._shared) if whole else _without_environments(state)
+                save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+            self._save_policies()
+            self._saved = self._env_steps
+            for log in self._evaluations:
+                log.prune()
+
+    def _save_policies(self) -> None:
+        for folder, policy in zip(self._folders, self._policies(), strict=True):
             save_policy(folder, policy)
-        self._saved = self._env_steps
-        for log in self._evaluations:
-            log.prune()
+
+    def _evaluate_if_due(self) -> bool:
+        """Evaluates after every `evaluation.every` updates and after the last one; returns whether it was due."""
+        updates, last = self._env_steps // self._config.steps_per_update, self._config.num_updates
+        due = self._monitor is not None and updates > 0 and updates % (self._config.evaluation.every or 1) == 0
+        if due or updates >= last:
+            self._evaluate()
+        return due
 
     def _evaluate(self) -> None:
         """Evaluates every seed's policy, once per update."""
@@ -247,8 +276,9 @@ class _Training:
         policies = self._policies()
         steps = [self._env_steps] * len(policies)
         results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
-        for log, result, policy in zip(self._evaluations, results, policies, strict=True):
-            log.add(result, policy)
+        with self._writing:
+            for log, result, policy in zip(self._evaluations, results, policies, strict=True):
+                log.add(result, policy)
 
     def _measure_best(self) -> None:
         """Measures the absolute metric of every seed's best policy, once."""
@@ -257,8 +287,9 @@ class _Training:
         self._evaluate()
         policies, steps = zip(*(log.best_policy() for log in self._evaluations), strict=True)
         results = self._monitor.evaluate(policies, steps, ABSOLUTE_FACTOR * self._config.evaluation.episodes)
-        for log, result in zip(self._evaluations, results, strict=True):
-            log.end(result, self._env_steps)
+        with self._writing:
+            for log, result in zip(self._evaluations, results, strict=True):
+                log.end(result, self._env_steps)
 
 
 def _without_environments(state: TrainState) -> dict[str, Any]:
