@@ -186,9 +186,11 @@ class _Training:
                         self._save()
                 self._save()
                 self._measure_best()
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+                if isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" not in str(error):
+                    raise
                 self._save()
-                raise
+                raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
         return [self._seed(i) for i in range(len(self._configs))]
 
     def _end(self) -> None:
