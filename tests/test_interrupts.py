@@ -20,6 +20,7 @@ from mqe_jax import cli
 from mqe_jax.cli import setup
 from mqe_jax.train.checkpoint import list_checkpoints
 
+pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
 SIGNALS = pytest.mark.parametrize("number", list(ENDS), ids=lambda number: number.name)
 FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-steps", str(300 * 16)]
@@ -94,7 +95,7 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
     """As soon as it has handlers, in its first imports, and leaves nothing behind."""
     process = start([*GATE, "--run-dir", str(tmp_path / "run")])
     wait_for(lambda: handles(process, signal.SIGTERM), process)
-    assert end(process, number, seconds=2) == [ENDS[number][1]]
+    assert end(process, number, seconds=5) == [ENDS[number][1]]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -132,7 +133,7 @@ def run(body: str, folder: Path, ready: Path) -> subprocess.Popen[str]:
 def test_a_long_computation_in_c_delays_nothing(number: signal.Signals, tmp_path: Path) -> None:
     """Python's own handlers would wait for its end; it stands for a compilation or an update."""
     body = "(folder / 'ready').touch(); hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"
-    assert end(run(body, tmp_path, tmp_path / "ready"), number, seconds=2) == [ENDS[number][1]]
+    assert end(run(body, tmp_path, tmp_path / "ready"), number, seconds=5) == [ENDS[number][1]]
 
 
 def test_children_and_unfinished_files_go(tmp_path: Path) -> None:
@@ -178,7 +179,7 @@ with interrupts.before_exit(lambda: time.sleep(1000)):
     process = run(body, tmp_path, tmp_path / "ready")
     process.send_signal(signal.SIGTERM)
     time.sleep(1.1)
-    assert end(process, signal.SIGINT, seconds=2) == ["mqe: interrupted"]
+    assert end(process, signal.SIGINT, seconds=5) == ["mqe: interrupted"]
 
 
 def test_a_saving_that_fails_is_reported(tmp_path: Path) -> None:
@@ -218,13 +219,12 @@ def test_signals_at_random_moments(number: signal.Signals, tmp_path: Path) -> No
         wait_for(lambda process=process: handles(process, signal.SIGTERM), process)
         if i % 3:
             wait_for(lambda run_dir=run_dir: updates(run_dir) > 0, process)
-        moment = moments.uniform(0.0, training / 2 if i % 3 else starting)
-        time.sleep(moment)
+        moment = time.monotonic() + moments.uniform(0.0, training / 2 if i % 3 else starting)
+        while time.monotonic() < moment and updates(run_dir) < (90 if i % 3 else 1):
+            time.sleep(0.01)
         done, began = updates(run_dir), time.monotonic()
         lines = end(process, number)
         saved = [int(path.stem.removeprefix("step_")) // 32 for path in list_checkpoints(run_dir)]
-        print(
-            f"{number.name}: {done} updates, {moment:.2f} s, {time.monotonic() - began:.2f} s to end, {saved}, {lines}"
-        )
+        print(f"{number.name}: {done} updates, {time.monotonic() - began:.2f} s to end, {saved}, {lines}")
         assert subprocess.run(command, capture_output=True).returncode == 0
         assert_same_run(whole, run_dir)
