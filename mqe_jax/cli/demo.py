@@ -22,6 +22,7 @@ from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy, runner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
 from mqe_jax.viz.clips import check_output
 
@@ -39,7 +40,7 @@ def demo(arguments: Demo) -> None:
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
     untrained = make_learner(vector_env, config)
-    state = jax.jit(untrained.init)(runner.initial_key(config))
+    state = jax.jit(untrained.init)(initial_key(config))
     before = policy.policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
     del state
     echo("mqe demo: evaluating the untrained policy")

@@ -7,12 +7,11 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import yaml
 
@@ -24,10 +23,8 @@ from mqe_jax.train.checkpoint import (
     checkpoint_step,
     latest,
     list_checkpoints,
-    load_checkpoint,
     nonfinite,
     prepare_folder,
-    read_metadata,
     save_checkpoint,
 )
 from mqe_jax.train.config import TrainConfig, load_config
@@ -35,15 +32,13 @@ from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
-from mqe_jax.train.seeds import shared_leaves, stack, take, with_shared, without_shared
-from mqe_jax.train.types import PyTree, Recorder, VectorEnv, join_traces
-
-CONFIG_FILE = "config.yaml"
+from mqe_jax.train.seeds import shared_leaves, stack, take, without_shared
+from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
+from mqe_jax.train.types import Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
 _FINITE_METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
-_MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 
 
 def train(
@@ -140,7 +135,7 @@ class _Training:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
         self._config = configs[0]
         self._shared = shared = shared_leaves(learner.init)
-        first = [_first_state(env, learner, c, path, shared) for c, path in zip(configs, checkpoints, strict=True)]
+        first = [first_state(env, learner, c, path, shared) for c, path in zip(configs, checkpoints, strict=True)]
         states = [state for state, _ in first]
         self._single = len(configs) == 1
         self._state = states[0] if self._single else stack(states, shared)
@@ -252,7 +247,7 @@ class _Training:
                 metadata["environments"] = config.checkpoint.environments
                 state = self._seed(i)
                 whole = config.checkpoint.environments
-                tree = without_shared(state, self._shared) if whole else _without_environments(state)
+                tree = without_shared(state, self._shared) if whole else without_environments(state)
                 save_checkpoint(folder, tree, self._env_steps, metadata, kept)
             self._save_policies()
             self._saved = self._env_steps
@@ -294,14 +289,9 @@ class _Training:
                 log.end(result, self._env_steps)
 
 
-def _without_environments(state: TrainState) -> dict[str, Any]:
-    """Returns the contents of a checkpoint without environment states."""
-    return {**_learned(state), "key": state.key, "updates": state.updates}
-
-
 def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) -> None:
     """Raises a NonFiniteError naming the first metrics and parameters that an update made NaN or infinite."""
-    wrong = [name for name in _FINITE_METRICS if not math.isfinite(row[name])] + nonfinite(_learned(state))
+    wrong = [name for name in _FINITE_METRICS if not math.isfinite(row[name])] + nonfinite(learned(state))
     if wrong:
         kept = latest(run_dir)
         raise NonFiniteError(
@@ -310,25 +300,9 @@ def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) ->
         )
 
 
-def _learned(state: TrainState) -> dict[str, Any]:
-    """Returns the learned state: parameters, optimiser and statistics, without environment states."""
-    return {
-        "params": state.params,
-        "optimizer": state.optimizer,
-        "obs_normalizer": state.obs_normalizer,
-        "value_normalizer": state.value_normalizer,
-        "learning_rate": state.learning_rate,
-    }
-
-
 def load_run_config(run_dir: str | Path) -> TrainConfig:
     """Reads the settings of a run folder; raises an InputError that names the file."""
     return load_config(Path(run_dir) / CONFIG_FILE)
-
-
-def initial_key(config: TrainConfig) -> jax.Array:
-    """Returns the initial random key (raw uint32) of a training run."""
-    return jax.random.PRNGKey(config.seed)
 
 
 def _row(
@@ -345,48 +319,3 @@ def _row(
     }
     row.update({name: float(np.asarray(value)) for name, value in sorted(metrics.items())})
     return row
-
-
-def _check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
-    """Raises an InputError naming the first setting in which the run to resume differs."""
-    old = dict(_leaves(before))
-    for name, value in _leaves(to_mapping(config)):
-        if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
-            raise InputError(
-                f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
-                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE} "
-                f"(--config {path / CONFIG_FILE})"
-            )
-
-
-def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the dotted names and values of nested settings."""
-    for name, value in mapping.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
-
-
-def _first_state(
-    env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
-) -> tuple[TrainState, float]:
-    """Returns the initial or restored state and the seconds already spent; `shared` from `shared_leaves`."""
-    if checkpoint is None:
-        return jax.jit(learner.init)(initial_key(config)), 0.0
-    metadata = read_metadata(checkpoint, kind="checkpoint")
-    if metadata.get("task") != env.name:
-        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
-    _check_same(checkpoint.parent.parent, metadata.get("config", {}), config)
-    whole = metadata.get("environments", True)
-    template = jax.eval_shape(learner.init, initial_key(config))
-    saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else _without_environments(template)
-    tree = load_checkpoint(checkpoint, saved).tree
-    if wrong := nonfinite(_learned(tree) if whole else {name: tree[name] for name in _learned(template)}):
-        raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
-    if not whole:
-        fresh = jax.jit(learner.init)(jax.random.fold_in(tree["key"], tree["updates"]))
-        tree = dataclasses.replace(fresh, **tree)
-    elif any(jax.tree.leaves(shared)):
-        tree = with_shared(tree, shared, jax.jit(learner.init)(initial_key(config)))
-    return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))
