@@ -1,4 +1,4 @@
-"""Files and folders: atomic writes, write checks, locks."""
+"""Files and folders: atomic writes, errors that name the file, write checks, locks."""
 
 from __future__ import annotations
 
@@ -9,22 +9,49 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from mqe_jax import interrupts
 from mqe_jax.errors import InputError, InUseError
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary name in the same folder, with the same suffix, which is renamed to `path` at the end.
+
+    The temporary file is removed if this fails, or a signal ends the process. An OSError names `path`.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    interrupts.temporaries.add(temporary)
+    try:
+        with naming(path):
+            yield temporary
+            os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        interrupts.temporaries.discard(temporary)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Adds the file's name to an OSError, such as a full disk, which a write does not name."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Writes a file atomically: under a temporary name in the same folder, flushed to disk, then renamed."""
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def append(path: Path, content: bytes) -> None:
+    """Appends to a file, which it creates where there is none; an OSError names it."""
+    with naming(path), path.open("ab") as file:
+        file.write(content)
 
 
 def check_folder(folder: Path, field: str = "run_dir") -> None:

@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.files import write_atomically
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 
 HISTORY = 30
@@ -299,10 +300,8 @@ def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[
         for kind, array in arrays.items()
     }
     file = pathlib.Path(path)
-    temporary = file.with_name(file.name + ".tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(save(flat, {"about": json.dumps(dict(metadata or {}))}))
-        os.replace(temporary, file)
+        write_atomically(file, save(flat, {"about": json.dumps(dict(metadata or {}))}))
     except OSError as error:
         raise InputError(f"walk policy: cannot write {file}: {error.strerror}") from None

@@ -1,6 +1,8 @@
 """The command line: output, streams, and error messages for invalid input."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -343,6 +345,15 @@ def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(commands.runner, "train_seeds", stop)
     assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 1
     assert capfd.readouterr().err.splitlines()[-1] == "mqe: run: update 3 made loss/value NaN or infinite"
+
+
+def test_a_file_that_cannot_be_written_ends_with_2(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+    def stop(*arguments: Any, **named: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/metrics.csv")
+
+    monkeypatch.setattr(commands.runner, "train_seeds", stop)
+    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 2
+    assert capfd.readouterr().err == "mqe: run/metrics.csv: No space left on device\n"
 
 
 def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:

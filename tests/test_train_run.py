@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import csv
 import dataclasses
+import resource
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,12 +24,15 @@ from safetensors.numpy import save_file
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import build, override
 from mqe_jax.train import checkpoint as checkpoints
+from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest, list_checkpoints, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.policy import load_policy, save_policy
+from mqe_jax.train.monitor import Monitor, read_evaluations
+from mqe_jax.train.policy import Policy, load_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
+from mqe_jax.viz.curves import draw_curve
 
 KEY = jax.random.PRNGKey(0)
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -169,6 +174,89 @@ def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path
     assert [path.name for path in list_checkpoints(tmp_path)] == ["step_000000000000.safetensors"]
     train(PROBE, settings(), tmp_path, resume=True)
     assert len(rows(tmp_path)) == 5
+
+
+def test_an_interrupt_saves_the_last_complete_update(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+    """A KeyboardInterrupt in a program or notebook that calls `train`, also in a callback, where JAX wraps it."""
+    wrapped = jax.errors.JaxRuntimeError("INTERNAL: CpuCallback error calling callback: KeyboardInterrupt: ")
+    errors: dict[float, BaseException] = {1: wrapped, 3: KeyboardInterrupt()}
+
+    def interrupt(state: TrainState, row: dict[str, float]) -> None:
+        if error := errors.pop(row["updates"], None):
+            raise error
+
+    for saved in ("step_000000000016.safetensors", "step_000000000048.safetensors"):
+        with pytest.raises(KeyboardInterrupt):
+            train(PROBE, settings(), tmp_path, resume=True, on_update=interrupt)
+        assert list_checkpoints(tmp_path)[-1].name == saved
+    assert_same(train(PROBE, settings(), tmp_path, resume=True), straight[1])
+
+
+def test_an_interrupted_evaluation_is_made_when_the_run_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = settings(evaluation={"every": 2, "episodes": 4})
+
+    def interrupt(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Monitor, "evaluate", interrupt)
+        train(PROBE, config, tmp_path, eval_env=PROBE)
+    assert list_checkpoints(tmp_path)[-1].name == "step_000000000032.safetensors"
+    train(PROBE, config, tmp_path, resume=True, eval_env=PROBE)
+    assert [evaluation["env_steps"] for evaluation in read_evaluations(tmp_path)["evaluations"]] == [32, 64, 80]
+
+
+@contextlib.contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Writes beyond `size` bytes of any file fail, as on a full disk, with EFBIG in place of ENOSPC."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_writer_that_fails_ends_the_training_and_names_its_file(
+    straight: tuple[Path, TrainState], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every time the lock is released, nothing half-written stays, and the run resumes exactly."""
+    pytest.importorskip("tensorboardX", reason="needs the extra log")
+    limits = contextlib.ExitStack()
+
+    def fill(state: TrainState, row: dict[str, float]) -> None:
+        if writer == "events.out" and row["updates"] == 3:
+            (events,) = (tmp_path / "tensorboard").iterdir()
+            limits.enter_context(largest_file(events.stat().st_size))  # metrics.csv is smaller
+        elif writer == "metrics.csv":
+            limits.enter_context(largest_file(1))
+        elif writer == "step_000000000064" and row["updates"] == 4:
+            limits.enter_context(largest_file(1000))
+
+    def save(run_dir: Path, policy: Policy) -> None:
+        if writer == "policy.safetensors" and policy.metadata["env_steps"] == 80:
+            limits.enter_context(largest_file(1000))
+        save_policy(run_dir, policy)
+
+    monkeypatch.setattr(runner, "save_policy", save)
+    for writer in ("events.out", "metrics.csv", "step_000000000064", "policy.safetensors"):
+        with limits, pytest.raises(OSError, match="File too large") as failed:
+            train(PROBE, settings(), tmp_path, resume=True, on_update=fill)
+        assert failed.value.filename.startswith(str(tmp_path)) and writer in failed.value.filename
+        assert not list(tmp_path.rglob(".*"))
+    monkeypatch.undo()
+    assert_same(train(PROBE, settings(), tmp_path, resume=True), straight[1])
+    assert [int(row["env_steps"]) for row in rows(tmp_path)] == [16, 32, 48, 64, 80]
+    assert load_policy(tmp_path).metadata["env_steps"] == 80
+
+
+def test_a_curve_that_cannot_be_written_is_named(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+    with largest_file(1000), pytest.raises(OSError, match="File too large") as failed:
+        draw_curve([straight[0]], tmp_path / "curve.png", "probe")
+    assert failed.value.filename == str(tmp_path / "curve.png")
+    assert list(tmp_path.iterdir()) == []
 
 
 def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:

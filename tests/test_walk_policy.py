@@ -8,17 +8,19 @@ import itertools
 import pathlib
 import pickle
 import zipfile
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import control, robots, walk_policy
+from mqe_jax import control, interrupts, robots, walk_policy
 from mqe_jax.errors import InputError
+from mqe_jax.files import append
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import Scene
+from mqe_jax.train import checkpoint
 from mqe_jax.walk import convert, training
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
@@ -265,6 +267,51 @@ def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pa
     assert float(found.learning_rate) == pytest.approx(3e-4)
     with pytest.raises(InputError, match=r"trained on go1; resume it with --robot go1, not go2"):
         training.restore(tmp_path, fresh, robots.get("go2"))
+
+
+class Observed(NamedTuple):
+    obs: jax.Array
+
+
+class WalkStub:
+    """An environment that `train_walk` only resets; `make_iteration` is replaced."""
+
+    robot, privileged_size = GO1, 3
+
+    def reset(self, key: jax.Array, *others: Any) -> Any:
+        return Observed(jnp.zeros(70))
+
+
+def test_training_is_saved_before_a_signal_ends_it_and_resumes_without_doubled_rows(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop_at = 25
+
+    def make_iteration(*arguments: Any) -> Any:
+        def iterate(state: Any, env_state: Any, history: Any, scale: Any) -> Any:
+            return dataclasses.replace(state, iteration=state.iteration + 1), env_state, history, {"kl": scale}
+
+        return iterate
+
+    def block(metrics: Any) -> None:
+        nonlocal stop_at
+        stop_at -= 1
+        if stop_at == 0:
+            interrupts._acts[-1]()  # as the thread does that a signal wakes up, and then ends the process
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "make_iteration", make_iteration)
+    monkeypatch.setattr(jax, "block_until_ready", block)
+    env: Any = WalkStub()
+    config, policy = training.WalkConfig(num_envs=2, iterations=40), walk_policy.load_params(GO1)
+    with pytest.raises(KeyboardInterrupt):
+        training.train_walk(env, config, tmp_path, policy=policy)
+    names = [path.name for path in checkpoint.list_checkpoints(tmp_path)]
+    assert names == ["step_000000000000.safetensors", "step_000000000024.safetensors"]
+    append(tmp_path / "metrics.csv", b"30,1.0,0.5\n40,1")  # as a killed run leaves it
+    training.train_walk(env, config, tmp_path, resume=True, policy=policy)
+    table = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table] == ["iteration", "10", "20", "30", "40"]
 
 
 def test_command_actions_are_the_papers() -> None:

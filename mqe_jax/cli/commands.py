@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mqe_jax import interrupts
 from mqe_jax.cli import bench as benchmark
 from mqe_jax.cli.arguments import Bench, Eval, Render, Replay, Tasks, Train
 from mqe_jax.cli.flags import given
@@ -130,13 +131,12 @@ def train(arguments: Train) -> None:
     recorder = _recorder(vector_env.env, arguments.dump_diverged)
     if arguments.resume and not any(map(latest, folders)):
         echo(f"mqe: {run_dir} has no checkpoint to resume from; starting a new run")
-    try:
-        runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
-    except KeyboardInterrupt:
-        echo(f"mqe: stopped; resume with the same command and --resume; the run is in {run_dir}")
-        raise
-    finally:
-        _echo_recorded(recorder)
+    hint = f"resume with the same command and --resume; the run is in {run_dir}"
+    with interrupts.before_exit(lambda: hint):
+        try:
+            runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
+        finally:
+            _echo_recorded(recorder)
     curves.draw_curve(folders, run_dir / "curve.png", arguments.task)
     echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Demo
 from mqe_jax.cli.commands import draw
 from mqe_jax.cli.output import echo
@@ -21,6 +22,7 @@ from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import policy, runner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
 from mqe_jax.viz.clips import check_output
 
@@ -38,17 +40,14 @@ def demo(arguments: Demo) -> None:
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
     untrained = make_learner(vector_env, config)
-    state = jax.jit(untrained.init)(runner.initial_key(config))
+    state = jax.jit(untrained.init)(initial_key(config))
     before = policy.policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
     del state
     echo("mqe demo: evaluating the untrained policy")
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
-    try:
+    with interrupts.before_exit(lambda: "the same command resumes from here"):
         runner.train(training_env, config, run_dir, resume=True)
-    except KeyboardInterrupt:
-        echo("mqe: stopped; the same command resumes from here")
-        raise
     after = policy.load_policy(run_dir)
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())

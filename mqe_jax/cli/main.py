@@ -2,17 +2,70 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import mqe_jax
-from mqe_jax.cli.arguments import FIRST_STEPS, Command, parse
-from mqe_jax.cli.output import print_json, standard_output
-from mqe_jax.errors import InputError, NonFiniteError
+from mqe_jax import interrupts
+from mqe_jax.errors import InputError, NonFiniteError, one_line
+
+if TYPE_CHECKING:
+    from mqe_jax.cli.arguments import Command
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs `mqe` and returns the exit code.
+
+    0; 1 for a training run that became non-finite and 2 for bad input (InputError) or a file that cannot be read or
+    written (OSError), with one line on standard error. Any other exception is a defect and keeps its traceback.
+
+    As a program (`arguments` is None), SIGINT (Ctrl-C) ends the process with 130 and SIGTERM with 143, with one line on
+    standard error, at any time from here on: a training after saving, everything else at once.
+    """
+    if arguments is None:
+        interrupts.install()
+    try:
+        code, message = _attempt(sys.argv[1:] if arguments is None else arguments)
+    finally:
+        interrupts.settle()
+    if message:
+        with contextlib.suppress(OSError):  # standard error may be a file on a full disk
+            print(f"mqe: {message}", file=sys.stderr, flush=True)
+    return code
+
+
+def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
+    """Runs a command; returns the exit code, and the message for standard error or an empty string."""
+    # Imported after `interrupts.install`.
+    import mqe_jax
+    from mqe_jax.cli.arguments import FIRST_STEPS, parse
+
+    if not arguments:
+        print(FIRST_STEPS)
+        return 0, ""
+    if list(arguments) == ["--version"]:
+        print(f"mqe {mqe_jax.__version__}")
+        return 0, ""
+    try:
+        _run(parse(arguments))
+    except KeyboardInterrupt:  # where `main` was called with arguments, from Python
+        return interrupts.exit_code(signal.SIGINT), "interrupted"
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0, ""
+    except (InputError, OSError) as error:
+        return 2, one_line(error)
+    except NonFiniteError as error:
+        return 1, str(error)
+    return 0, ""
 
 
 def _run(command: Command) -> None:
+    from mqe_jax.cli.output import print_json, standard_output
+
     action = getattr(command, "action", command)
     as_json = bool(getattr(action, "json", False))
     if not 0 <= (seed := getattr(action, "seed", 0)) < 2**32:
@@ -21,37 +74,3 @@ def _run(command: Command) -> None:
         result = command.run()
         if as_json and result is not None:
             print_json(result, out)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs `mqe` and returns the exit code.
-
-    0; 1 for a training run that became non-finite and 2 for bad input (InputError, OSError), with one line on standard
-    error; 130 for Ctrl-C. Any other exception is a defect and keeps its traceback.
-    """
-    as_program = arguments is None
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if not arguments:
-        print(FIRST_STEPS)
-        return 0
-    if list(arguments) == ["--version"]:
-        print(f"mqe {mqe_jax.__version__}")
-        return 0
-    try:
-        _run(parse(arguments))
-    except KeyboardInterrupt:
-        print("mqe: interrupted", file=sys.stderr, flush=True)
-        if as_program:
-            sys.stdout.flush()
-            os._exit(130)  # sys.exit would wait for computations that JAX is still running
-        return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 0
-    except (InputError, OSError) as error:
-        print(f"mqe: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except NonFiniteError as error:
-        print(f"mqe: {error}", file=sys.stderr)
-        return 1
-    return 0

@@ -8,6 +8,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Report, Sweep
 from mqe_jax.cli.output import echo
 from mqe_jax.cli.setup import environments, train_config
@@ -37,15 +38,12 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
             _print(result)
         return result
     sweeps.prepare(settings, folder)
-    try:
+    cells = "".join(f" --cells {shlex.quote(cell)}" for cell in arguments.cells)
+    with interrupts.before_exit(lambda: f"resume with: mqe sweep {arguments.file} --folder {folder}{cells}"):
         others = sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
-    except KeyboardInterrupt:
-        cells = "".join(f" --cells {shlex.quote(cell)}" for cell in arguments.cells)
-        echo(f"mqe: stopped; resume with: mqe sweep {arguments.file} --folder {folder}{cells}")
-        raise
     if others:
-        cells = ", ".join(job.cell.path.as_posix() for job in others)
-        echo(f"mqe: skipped, in use by other processes: {cells}")
+        skipped = ", ".join(job.cell.path.as_posix() for job in others)
+        echo(f"mqe: skipped, in use by other processes: {skipped}")
     files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
     if files:
         echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from mqe_jax import interrupts
 from mqe_jax.cli.arguments import WalkConvert, WalkEval, WalkTrain
 from mqe_jax.cli.output import echo, print_table
 from mqe_jax.errors import InputError
@@ -49,7 +50,8 @@ def walk_train(arguments: WalkTrain) -> None:
         numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
         echo(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
 
-    with locked(arguments.run_dir):
+    hint = f"resume with the same command and --resume; the run is in {arguments.run_dir}"
+    with locked(arguments.run_dir), interrupts.before_exit(lambda: hint):
         walk.train_walk(
             env,
             config,

@@ -14,7 +14,6 @@ that frame, commands and joint targets are in the robots' frame.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.export.actor import add_actor
 from mqe_jax.export.graph import OPSET, Graph
 from mqe_jax.export.walk import add_commands, add_joint_targets, add_walk
+from mqe_jax.files import write_atomically
 from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import Policy
 
@@ -67,15 +67,11 @@ def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
     """Writes a model atomically; InputError if the file cannot be written."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(model.SerializeToString())
-        os.replace(temporary, path)
+        write_atomically(path, model.SerializeToString())
     except OSError as error:
         raise InputError(f"onnx: cannot write {path} ({error.strerror})") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:

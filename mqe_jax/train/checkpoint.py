@@ -193,7 +193,7 @@ def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping
     save_tree(path, tree, {**metadata, "step": step}, kind="checkpoint")
     for old in list_checkpoints(run_dir)[:-keep]:
         old.unlink(missing_ok=True)
-    for partial in folder.glob(".step_*.tmp"):
+    for partial in folder.glob(".step_*.tmp*"):
         partial.unlink(missing_ok=True)
     return path
 

@@ -8,19 +8,21 @@ import importlib.util
 import io
 import math
 import os
+import socket
+import struct
 import sys
 import time
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self, TextIO
+from typing import Any, Protocol, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.files import append, naming, write_atomically
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
@@ -39,40 +41,29 @@ class MetricsLog(Protocol):
 
 
 class CsvLog:
-    """Rows of `metrics.csv`, one per update; a resumed run drops rows after `env_steps`."""
+    """Rows of `metrics.csv`, one per update; a resumed run drops rows after `step`, a number in the column `key`."""
 
-    def __init__(self, run_dir: Path, env_steps: int) -> None:
-        self._path = run_dir / CSV_FILE
-        self._columns, rows = _read_rows(self._path, env_steps) if env_steps else ([], [])
-        self._file: TextIO | None = None
+    def __init__(self, run_dir: Path, step: int, key: str = "env_steps") -> None:
+        self._path, self._key = run_dir / CSV_FILE, key
+        self._columns, rows = _read_rows(self._path, key, step) if step else ([], [])
         if self._columns:
             self._rewrite(rows)
         else:
             self._path.unlink(missing_ok=True)
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Appends one row and flushes it; a new name adds a column."""
+        """Appends one row; a new name adds a column."""
         new = [name for name in row if name not in self._columns]
-        if new and self._columns:
-            _, rows = _read_rows(self._path, None)
+        if new:
+            _, rows = _read_rows(self._path, self._key, None)
             self._columns += new
             self._rewrite(rows)
-        elif new:
-            self._columns = new
-            self._rewrite([])
-        if self._file is None:
-            self._file = self._path.open("a", encoding="utf-8", newline="")
-        csv.writer(self._file, lineterminator="\n").writerow([_text(row.get(name, math.nan)) for name in self._columns])
-        self._file.flush()
+        append(self._path, (",".join(_text(row.get(name, math.nan)) for name in self._columns) + "\n").encode())
 
     def close(self) -> None:
-        """Closes the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        """Does nothing: every row is on disk."""
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
-        self.close()
         text = io.StringIO()
         writer = csv.DictWriter(text, self._columns, restval="nan", lineterminator="\n")
         writer.writeheader()
@@ -84,8 +75,8 @@ def _text(value: float) -> str:
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.8g}"
 
 
-def _read_rows(path: Path, env_steps: int | None) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns columns and complete rows up to `env_steps`; a partial last row is dropped."""
+def _read_rows(path: Path, key: str, last: int | None) -> tuple[list[str], list[dict[str, str]]]:
+    """Returns columns and complete rows up to `last` in the column `key`; a partial last row is dropped."""
     if not path.is_file():
         return [], []
     with path.open(encoding="utf-8", newline="") as file:
@@ -94,40 +85,58 @@ def _read_rows(path: Path, env_steps: int | None) -> tuple[list[str], list[dict[
         rows = []
         for row in reader:
             try:
-                step = int(row["env_steps"])
+                step = int(row[key])
             except (KeyError, TypeError, ValueError):
                 continue
             whole = None not in row and None not in row.values()
-            if whole and (env_steps is None or step <= env_steps):
+            if whole and (last is None or step <= last):
                 rows.append(row)
     return columns, rows
 
 
 class TensorBoardLog:
-    """TensorBoard events where tensorboardX is installed, otherwise nothing."""
+    """TensorBoard events where tensorboardX is installed, otherwise nothing.
+
+    Written without tensorboardX's writer, whose thread dies where the disk is full, after which the training would wait
+    for it for ever.
+    """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
         try:
-            module = importlib.import_module("tensorboardX")
+            self._proto: Any = importlib.import_module("tensorboardX.proto.event_pb2")
+            self._checksum = importlib.import_module("tensorboardX.record_writer").masked_crc32c
         except ImportError:
-            self._writer: Any = None
-        else:
-            purge = {"purge_step": env_steps + 1} if env_steps else {}
-            self._writer = module.SummaryWriter(str(run_dir / "tensorboard"), **purge)
+            self._proto = None
+            return
+        folder = run_dir / "tensorboard"
+        with naming(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._path = folder / f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}"
+        self._append(file_version="brain.Event:2")
+        if env_steps:  # readers drop later events of earlier files
+            start = self._proto.SessionLog(status=self._proto.SessionLog.START)
+            self._append(step=env_steps + 1, session_log=start)
 
     def write(self, row: Mapping[str, float]) -> None:
         """Adds every finite number of the row at its `env_steps`."""
-        if self._writer is None:
+        if self._proto is None:
             return
-        step = int(row["env_steps"])
-        for name, value in row.items():
-            if name != "env_steps" and math.isfinite(value):
-                self._writer.add_scalar(name, value, step)
+        values = [
+            {"tag": name, "simple_value": value}
+            for name, value in row.items()
+            if name != "env_steps" and math.isfinite(value)
+        ]
+        self._append(step=int(row["env_steps"]), summary={"value": values})
 
     def close(self) -> None:
-        """Flushes and closes the file."""
-        if self._writer is not None:
-            self._writer.close()
+        """Does nothing: every row is on disk."""
+
+    def _append(self, **fields: Any) -> None:
+        """Appends an event as TensorFlow's records are: length, its checksum, data, their checksum."""
+        data = self._proto.Event(wall_time=time.time(), **fields).SerializeToString()
+        length = struct.pack("<Q", len(data))
+        checksums = [struct.pack("<I", self._checksum(part)) for part in (length, data)]
+        append(self._path, length + checksums[0] + data + checksums[1])
 
 
 class WandbLog:
@@ -135,7 +144,8 @@ class WandbLog:
 
     `wandb sync` uploads it later. A resumed training run keeps its run id. The file is written by wandb's own process,
     for whose last rows `close` does not wait: they follow at the latest when the program ends. `wandb.teardown()` waits
-    for them, but ends all runs of the program, so it is left to the caller.
+    for them, but ends all runs of the program, so it is left to the caller. That process loses rows on a full disk and
+    does not report it; metrics.csv, on the same disk, does.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import fail, to_mapping
@@ -22,10 +23,8 @@ from mqe_jax.train.checkpoint import (
     checkpoint_step,
     latest,
     list_checkpoints,
-    load_checkpoint,
     nonfinite,
     prepare_folder,
-    read_metadata,
     save_checkpoint,
 )
 from mqe_jax.train.config import TrainConfig, load_config
@@ -33,15 +32,13 @@ from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
-from mqe_jax.train.seeds import shared_leaves, stack, take, with_shared, without_shared
-from mqe_jax.train.types import PyTree, Recorder, VectorEnv, join_traces
-
-CONFIG_FILE = "config.yaml"
+from mqe_jax.train.seeds import shared_leaves, stack, take, without_shared
+from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
+from mqe_jax.train.types import Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
 _FINITE_METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
-_MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 
 
 def train(
@@ -138,7 +135,7 @@ class _Training:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
         self._config = configs[0]
         self._shared = shared = shared_leaves(learner.init)
-        first = [_first_state(env, learner, c, path, shared) for c, path in zip(configs, checkpoints, strict=True)]
+        first = [first_state(env, learner, c, path, shared) for c, path in zip(configs, checkpoints, strict=True)]
         states = [state for state, _ in first]
         self._single = len(configs) == 1
         self._state = states[0] if self._single else stack(states, shared)
@@ -150,42 +147,57 @@ class _Training:
         if self._config.evaluation.every is not None and eval_env is not None:
             self._monitor = Monitor(eval_env, self._config)
         self._evaluations: list[EvaluationLog] = []
+        self._logs = contextlib.ExitStack()
+        self._writing = threading.RLock()  # held while files are written and the state is exchanged
 
     def run(self, on_update: OnUpdate | None) -> list[TrainState]:
         """Runs the remaining updates and returns the last states."""
         config = self._config
+        if self._saved == self._env_steps:
+            self._save_policies()  # a run that ended between checkpoint and policy has an older one
         self._save()  # so that a run killed before its first regular checkpoint can be resumed too
         for own, folder in zip(self._configs, self._folders, strict=True):
             write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
         total_steps = config.num_updates * config.steps_per_update
-        with contextlib.ExitStack() as logs:
+        with self._logs as logs:
             makers = (CsvLog, *(LOGGERS[name] for name in config.loggers))
             files: list[list[MetricsLog]] = [[] for _ in self._folders]
             for folder, own_logs in zip(self._folders, files, strict=True):
                 for make_log in makers:
                     own_logs.append(make_log(folder, self._env_steps))
                     logs.callback(own_logs[-1].close)
+            progress_log = logs.enter_context(ProgressLog(config.task or self._env.name, self._env_steps, total_steps))
+            logs.enter_context(interrupts.before_exit(self._end))
             try:
-                with ProgressLog(config.task or self._env.name, self._env_steps, total_steps) as progress_log:
-                    while self._env_steps < total_steps:
-                        rows = self._step(files)
-                        progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
-                        if on_update is not None:
-                            for i, row in enumerate(rows):
-                                on_update(self._seed(i), row)
-                        updates = int(rows[0]["updates"])
-                        evaluates = self._monitor is not None and updates % (config.evaluation.every or 1) == 0
-                        if evaluates or self._env_steps >= total_steps:
-                            self._evaluate()
-                        if evaluates or updates % config.checkpoint.every == 0:
-                            self._save()
+                self._evaluate_if_due()  # left out by a run that ended during this evaluation
+                while self._env_steps < total_steps:
+                    rows = self._step(files)
+                    progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                    if on_update is not None:
+                        for i, row in enumerate(rows):
+                            on_update(self._seed(i), row)
+                    if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
+                        self._save()
                 self._save()
                 self._measure_best()
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+                if isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" not in str(error):
+                    raise
                 self._save()
-                raise
+                raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
         return [self._seed(i) for i in range(len(self._configs))]
+
+    def _end(self) -> None:
+        """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
+
+        The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
+        """
+        self._writing.acquire()  # for ever, so that the main thread writes nothing more
+        try:
+            self._save()
+        finally:
+            self._logs.close()
 
     def _seed(self, i: int, state: TrainState | None = None) -> TrainState:
         """Returns one seed's state from the current states, or from `state` if given."""
@@ -208,11 +220,12 @@ class _Training:
             row["fps"] *= len(self._folders)
             _check_finite(state, row, folder)
             rows.append(row)
-        for logs, row in zip(files, rows, strict=True):
-            for log in logs:
-                log.write(row)
-        # Assigned after logging, so that an interrupted run saves no update that is not logged.
-        self._state, self._env_steps = after, int(rows[0]["env_steps"])
+        with self._writing:
+            for logs, row in zip(files, rows, strict=True):
+                for log in logs:
+                    log.write(row)
+            # Assigned after logging, so that an interrupted run saves no update that is not logged.
+            self._state, self._env_steps = after, int(rows[0]["env_steps"])
         return rows
 
     def _policies(self) -> list[Policy]:
@@ -224,21 +237,34 @@ class _Training:
 
     def _save(self) -> None:
         """Writes checkpoint and policy of every seed, once per update."""
-        if self._saved == self._env_steps:
-            return
-        seconds = time.perf_counter() - self._start_time
-        kept = self._config.checkpoint.kept if self._single else max(self._config.checkpoint.kept, 2)
-        for i, (config, folder, policy) in enumerate(zip(self._configs, self._folders, self._policies(), strict=True)):
-            metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-            metadata["environments"] = config.checkpoint.environments
-            state = self._seed(i)
-            whole = config.checkpoint.environments
-            tree = without_shared(state, self._shared) if whole else _without_environments(state)
-            save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+        with self._writing:
+            if self._saved == self._env_steps:
+                return
+            seconds = time.perf_counter() - self._start_time
+            kept = self._config.checkpoint.kept if self._single else max(self._config.checkpoint.kept, 2)
+            for i, (config, folder) in enumerate(zip(self._configs, self._folders, strict=True)):
+                metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
+                metadata["environments"] = config.checkpoint.environments
+                state = self._seed(i)
+                whole = config.checkpoint.environments
+                tree = without_shared(state, self._shared) if whole else without_environments(state)
+                save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+            self._save_policies()
+            self._saved = self._env_steps
+            for log in self._evaluations:
+                log.prune()
+
+    def _save_policies(self) -> None:
+        for folder, policy in zip(self._folders, self._policies(), strict=True):
             save_policy(folder, policy)
-        self._saved = self._env_steps
-        for log in self._evaluations:
-            log.prune()
+
+    def _evaluate_if_due(self) -> bool:
+        """Evaluates after every `evaluation.every` updates and after the last one; returns whether it was due."""
+        updates, last = self._env_steps // self._config.steps_per_update, self._config.num_updates
+        due = self._monitor is not None and updates > 0 and updates % (self._config.evaluation.every or 1) == 0
+        if due or updates >= last:
+            self._evaluate()
+        return due
 
     def _evaluate(self) -> None:
         """Evaluates every seed's policy, once per update."""
@@ -247,8 +273,9 @@ class _Training:
         policies = self._policies()
         steps = [self._env_steps] * len(policies)
         results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
-        for log, result, policy in zip(self._evaluations, results, policies, strict=True):
-            log.add(result, policy)
+        with self._writing:
+            for log, result, policy in zip(self._evaluations, results, policies, strict=True):
+                log.add(result, policy)
 
     def _measure_best(self) -> None:
         """Measures the absolute metric of every seed's best policy, once."""
@@ -257,18 +284,14 @@ class _Training:
         self._evaluate()
         policies, steps = zip(*(log.best_policy() for log in self._evaluations), strict=True)
         results = self._monitor.evaluate(policies, steps, ABSOLUTE_FACTOR * self._config.evaluation.episodes)
-        for log, result in zip(self._evaluations, results, strict=True):
-            log.end(result, self._env_steps)
-
-
-def _without_environments(state: TrainState) -> dict[str, Any]:
-    """Returns the contents of a checkpoint without environment states."""
-    return {**_learned(state), "key": state.key, "updates": state.updates}
+        with self._writing:
+            for log, result in zip(self._evaluations, results, strict=True):
+                log.end(result, self._env_steps)
 
 
 def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) -> None:
     """Raises a NonFiniteError naming the first metrics and parameters that an update made NaN or infinite."""
-    wrong = [name for name in _FINITE_METRICS if not math.isfinite(row[name])] + nonfinite(_learned(state))
+    wrong = [name for name in _FINITE_METRICS if not math.isfinite(row[name])] + nonfinite(learned(state))
     if wrong:
         kept = latest(run_dir)
         raise NonFiniteError(
@@ -277,25 +300,9 @@ def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) ->
         )
 
 
-def _learned(state: TrainState) -> dict[str, Any]:
-    """Returns the learned state: parameters, optimiser and statistics, without environment states."""
-    return {
-        "params": state.params,
-        "optimizer": state.optimizer,
-        "obs_normalizer": state.obs_normalizer,
-        "value_normalizer": state.value_normalizer,
-        "learning_rate": state.learning_rate,
-    }
-
-
 def load_run_config(run_dir: str | Path) -> TrainConfig:
     """Reads the settings of a run folder; raises an InputError that names the file."""
     return load_config(Path(run_dir) / CONFIG_FILE)
-
-
-def initial_key(config: TrainConfig) -> jax.Array:
-    """Returns the initial random key (raw uint32) of a training run."""
-    return jax.random.PRNGKey(config.seed)
 
 
 def _row(
@@ -312,48 +319,3 @@ def _row(
     }
     row.update({name: float(np.asarray(value)) for name, value in sorted(metrics.items())})
     return row
-
-
-def _check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
-    """Raises an InputError naming the first setting in which the run to resume differs."""
-    old = dict(_leaves(before))
-    for name, value in _leaves(to_mapping(config)):
-        if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
-            raise InputError(
-                f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
-                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE} "
-                f"(--config {path / CONFIG_FILE})"
-            )
-
-
-def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the dotted names and values of nested settings."""
-    for name, value in mapping.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
-
-
-def _first_state(
-    env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
-) -> tuple[TrainState, float]:
-    """Returns the initial or restored state and the seconds already spent; `shared` from `shared_leaves`."""
-    if checkpoint is None:
-        return jax.jit(learner.init)(initial_key(config)), 0.0
-    metadata = read_metadata(checkpoint, kind="checkpoint")
-    if metadata.get("task") != env.name:
-        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
-    _check_same(checkpoint.parent.parent, metadata.get("config", {}), config)
-    whole = metadata.get("environments", True)
-    template = jax.eval_shape(learner.init, initial_key(config))
-    saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else _without_environments(template)
-    tree = load_checkpoint(checkpoint, saved).tree
-    if wrong := nonfinite(_learned(tree) if whole else {name: tree[name] for name in _learned(template)}):
-        raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
-    if not whole:
-        fresh = jax.jit(learner.init)(jax.random.fold_in(tree["key"], tree["updates"]))
-        tree = dataclasses.replace(fresh, **tree)
-    elif any(jax.tree.leaves(shared)):
-        tree = with_shared(tree, shared, jax.jit(learner.init)(initial_key(config)))
-    return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))

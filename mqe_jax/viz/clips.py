@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -13,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from mqe_jax.errors import InputError
+from mqe_jax.files import replacing
+from mqe_jax.interrupts import child
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
@@ -48,8 +49,7 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     path = check_output(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
-    try:
+    with replacing(path) as temporary:
         if suffix == ".mp4":
             _write_mp4(temporary, frames, fps)
         elif suffix == ".gif":
@@ -61,9 +61,6 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
 
             *_, frame = frames
             Image.fromarray(frame).save(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
@@ -75,16 +72,13 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
     encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with child(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stderr is not None
         try:
             for frame in itertools.chain([first], frames):
                 process.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
         except BrokenPipeError:
             pass  # reported below from ffmpeg's own message
-        except BaseException:
-            process.kill()
-            raise
         process.stdin.close()
         message = process.stderr.read().decode(errors="replace")
     if process.returncode:

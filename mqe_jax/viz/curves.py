@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from mqe_jax.errors import InputError
+from mqe_jax.files import replacing
 from mqe_jax.study import paper
 
 _INK, _RUN, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
@@ -80,9 +80,5 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
         right.spines[["top", "left"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="best")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
+    with replacing(path) as temporary:
         figure.savefig(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

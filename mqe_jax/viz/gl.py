@@ -1,15 +1,18 @@
 """Offscreen rendering by `mujoco.Renderer` (EGL, then OSMesa)."""
 
+import contextlib
 import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from mqe_jax.interrupts import child
 from mqe_jax.viz.cameras import Camera
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose
 from mqe_jax.viz.recording import Episode
@@ -36,14 +39,11 @@ def gl_backend() -> str | None:
         if name not in ("egl", "osmesa", "glfw"):
             return None
         environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": name}
-        try:
-            found = subprocess.run(
-                [sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=60
-            ).returncode
-        except (OSError, subprocess.TimeoutExpired):
-            found = 1
-        if found == 0:
-            return name
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            with child([sys.executable, "-c", _PROBE], env=environment, **quiet) as process:
+                if process.wait(60) == 0:
+                    return name
     return None
 
 

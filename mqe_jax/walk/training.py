@@ -7,8 +7,8 @@ receives its output without gradient.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,11 +17,12 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import walk_policy
+from mqe_jax import interrupts, walk_policy
 from mqe_jax.errors import InputError
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.train import checkpoint, nn
 from mqe_jax.train.advantage import gae
+from mqe_jax.train.logs import CsvLog
 from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
 from mqe_jax.train.optim import AdamState, adam
 from mqe_jax.walk.symmetry import symmetry_loss
@@ -361,33 +362,36 @@ def train_walk(
     history = jnp.zeros((config.num_envs, HISTORY, OBSERVATION_SIZE)).at[:, -1].set(state.obs)
     iterate = jax.jit(make_iteration(env, config), donate_argnums=(2,))
     first = int(train_state.iteration)
-    table = run_dir / "metrics.csv"
-    fresh = first == 0 or not table.exists()
-    with table.open("w" if fresh else "a", newline="") as file:
-        writer: Any = None
+    if first == 0:
+        save(run_dir, train_state, env.robot, config)  # a run killed before its first regular one can be resumed
+    log = CsvLog(run_dir, first, "iteration")
+    writing = threading.Lock()  # held while files are written and the state is exchanged
+
+    def end() -> None:
+        writing.acquire()
+        save(run_dir, train_state, env.robot, config)
+
+    with interrupts.before_exit(end):
         for iteration in range(first + 1, config.iterations + 1):
             done = (iteration - 1) / config.iterations
             if max_seconds is not None:
                 done = max(done, min((time.monotonic() - start) / max_seconds, 1.0))
             scale = min(1.0, (1.0 - done) / config.anneal) if config.anneal > 0 else 1.0
-            train_state, state, history, metrics = iterate(train_state, state, history, jnp.float32(scale))
+            after, state, history, metrics = iterate(train_state, state, history, jnp.float32(scale))
             jax.block_until_ready(metrics)  # so that `max_seconds` measures finished work
             last = iteration == config.iterations or (
                 max_seconds is not None and time.monotonic() - start > max_seconds
             )
-            if iteration % 10 == 0 or last:
-                row = {name: float(value) for name, value in sorted(jax.device_get(metrics).items())}
-                row = {"iteration": iteration, "seconds": round(time.monotonic() - start, 1), **row}
-                if writer is None:
-                    writer = csv.DictWriter(file, row)
-                    if fresh:
-                        writer.writeheader()
-                writer.writerow(row)
-                file.flush()
-                if report is not None:
-                    report(iteration, row)
-            if iteration % save_every == 0 or last:
-                save(run_dir, train_state, env.robot, config)
+            with writing:
+                train_state = after
+                if iteration % 10 == 0 or last:
+                    row = {name: float(value) for name, value in sorted(jax.device_get(metrics).items())}
+                    row = {"iteration": iteration, "seconds": round(time.monotonic() - start, 1), **row}
+                    log.write(row)
+                    if report is not None:
+                        report(iteration, row)
+                if iteration % save_every == 0 or last:
+                    save(run_dir, train_state, env.robot, config)
             if last:
                 break
     return train_state.params["policy"]

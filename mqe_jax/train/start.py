@@ -1,0 +1,88 @@
+"""The state from which a training run starts: sampled, or restored from a checkpoint of the same settings."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.errors import InputError
+from mqe_jax.settings import to_mapping
+from mqe_jax.train.checkpoint import load_checkpoint, nonfinite, read_metadata
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import Learner, TrainState
+from mqe_jax.train.seeds import with_shared, without_shared
+from mqe_jax.train.types import PyTree, VectorEnv
+
+CONFIG_FILE = "config.yaml"
+_MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
+
+
+def initial_key(config: TrainConfig) -> jax.Array:
+    """Returns the initial random key (raw uint32) of a training run."""
+    return jax.random.PRNGKey(config.seed)
+
+
+def first_state(
+    env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
+) -> tuple[TrainState, float]:
+    """Returns the initial or restored state and the seconds already spent; `shared` from `shared_leaves`."""
+    if checkpoint is None:
+        return jax.jit(learner.init)(initial_key(config)), 0.0
+    metadata = read_metadata(checkpoint, kind="checkpoint")
+    if metadata.get("task") != env.name:
+        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
+    _check_same(checkpoint.parent.parent, metadata.get("config", {}), config)
+    whole = metadata.get("environments", True)
+    template = jax.eval_shape(learner.init, initial_key(config))
+    saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
+    tree = load_checkpoint(checkpoint, saved).tree
+    if wrong := nonfinite(learned(tree) if whole else {name: tree[name] for name in learned(template)}):
+        raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
+    if not whole:
+        fresh = jax.jit(learner.init)(jax.random.fold_in(tree["key"], tree["updates"]))
+        tree = dataclasses.replace(fresh, **tree)
+    elif any(jax.tree.leaves(shared)):
+        tree = with_shared(tree, shared, jax.jit(learner.init)(initial_key(config)))
+    return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))
+
+
+def without_environments(state: TrainState) -> dict[str, Any]:
+    """Returns the contents of a checkpoint without environment states."""
+    return {**learned(state), "key": state.key, "updates": state.updates}
+
+
+def learned(state: TrainState) -> dict[str, Any]:
+    """Returns the learned state: parameters, optimiser and statistics, without environment states."""
+    return {
+        "params": state.params,
+        "optimizer": state.optimizer,
+        "obs_normalizer": state.obs_normalizer,
+        "value_normalizer": state.value_normalizer,
+        "learning_rate": state.learning_rate,
+    }
+
+
+def _check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
+    """Raises an InputError naming the first setting in which the run to resume differs."""
+    old = dict(_leaves(before))
+    for name, value in _leaves(to_mapping(config)):
+        if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
+            raise InputError(
+                f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
+                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE} "
+                f"(--config {path / CONFIG_FILE})"
+            )
+
+
+def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the dotted names and values of nested settings."""
+    for name, value in mapping.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

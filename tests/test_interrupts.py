@@ -1,0 +1,230 @@
+"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; a training is saved and resumes exactly."""
+
+from __future__ import annotations
+
+import csv
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import fake_program
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from mqe_jax import cli
+from mqe_jax.cli import setup
+from mqe_jax.train.checkpoint import list_checkpoints
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
+ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
+SIGNALS = pytest.mark.parametrize("number", list(ENDS), ids=lambda number: number.name)
+FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-steps", str(300 * 16)]
+FAKE += ["--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "4", "--checkpoint.every", "100000"]
+PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_program.py"))]
+GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
+GATE += ["--num-envs", "4", "--rollout-steps", "8", "--ppo.minibatches", "2", "--checkpoint.every", "100000"]
+GATE += ["--total-steps", str(100 * 32)]
+
+
+def start(command: list[str]) -> subprocess.Popen[str]:
+    # A shell starts background jobs with SIGINT ignored, which children inherit; C signals are reset by this.
+    return subprocess.Popen(
+        ["env", "--default-signal=INT", *command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 300) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def handles(process: subprocess.Popen[str], number: int) -> bool:
+    """Whether the process has installed a handler of its own for SIGTERM, which Python has not."""
+    caught = Path(f"/proc/{process.pid}/status").read_text().split("SigCgt:")[1].split()[0]
+    return bool(int(caught, 16) >> (number - 1) & 1)
+
+
+def end(process: subprocess.Popen[str], number: signal.Signals, seconds: float = 10) -> list[str]:
+    """Sends a signal; returns the lines on standard error but for the progress."""
+    process.send_signal(number)
+    try:
+        _, said = process.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        pytest.fail(f"{number.name} was swallowed: {process.communicate()[1]}")
+    code, line = ENDS[number]
+    lines = [text for text in said.splitlines() if " steps/s, " not in text and "a new run" not in text]
+    assert process.returncode == code, said
+    assert len(lines) == 1 and lines[0].startswith(line), said
+    return lines
+
+
+def rows(run_dir: Path) -> list[dict[str, str]]:
+    with (run_dir / "metrics.csv").open() as file:
+        return [{k: v for k, v in row.items() if k not in ("seconds", "fps")} for row in csv.DictReader(file)]
+
+
+def updates(run_dir: Path) -> int:
+    return len(rows(run_dir)) if (run_dir / "metrics.csv").is_file() else 0
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """Same metrics but for the times, same policy, same last checkpoint."""
+    assert rows(one) == rows(other)
+    for files in (
+        [run / "policy.safetensors" for run in (one, other)],
+        [list_checkpoints(r)[-1] for r in (one, other)],
+    ):
+        expected, found = map(load_file, files)
+        assert expected.keys() == found.keys()
+        for name, value in expected.items():
+            np.testing.assert_array_equal(value, found[name], err_msg=name)
+    assert not [path for path in other.rglob(".*")]
+
+
+@SIGNALS
+def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Path) -> None:
+    """As soon as it has handlers, in its first imports, and leaves nothing behind."""
+    process = start([*GATE, "--run-dir", str(tmp_path / "run")])
+    wait_for(lambda: handles(process, signal.SIGTERM), process)
+    assert end(process, number, seconds=5) == [ENDS[number][1]]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped between its regular checkpoints, it equals an uninterrupted one bit for bit."""
+    monkeypatch.setattr(setup, "make_env", fake_program.make_env)
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])
+    wait_for(lambda: updates(stopped) >= 3, process)
+    (line,) = end(process, signal.SIGTERM)
+    assert line == f"mqe: terminated; resume with the same command and --resume; the run is in {stopped}"
+    saved = int(list_checkpoints(stopped)[-1].stem.removeprefix("step_")) // 16
+    assert updates(stopped) - 1 <= saved <= updates(stopped) < 300, "the last complete update is not saved"
+    assert cli.main([*FAKE, "--run-dir", str(stopped), "--resume"]) == 0
+    assert cli.main([*FAKE, "--run-dir", str(whole)]) == 0
+    assert_same_run(whole, stopped)
+
+
+PREFIX = """
+import hashlib, sys, time
+from pathlib import Path
+from mqe_jax import files, interrupts
+interrupts.install()
+folder = Path(sys.argv[1])
+"""
+
+
+def run(body: str, folder: Path, ready: Path) -> subprocess.Popen[str]:
+    process = start([sys.executable, "-c", PREFIX + body, str(folder)])
+    wait_for(ready.exists, process)
+    return process
+
+
+@SIGNALS
+def test_a_long_computation_in_c_delays_nothing(number: signal.Signals, tmp_path: Path) -> None:
+    """Python's own handlers would wait for its end; it stands for a compilation or an update."""
+    body = "(folder / 'ready').touch(); hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"
+    assert end(run(body, tmp_path, tmp_path / "ready"), number, seconds=5) == [ENDS[number][1]]
+
+
+def test_children_and_unfinished_files_go(tmp_path: Path) -> None:
+    body = """
+with interrupts.child(["sleep", "1000"]) as child, files.replacing(folder / "clip.mp4") as temporary:
+    temporary.write_text("half")
+    (folder / "ready").write_text(str(child.pid))
+    time.sleep(1000)
+"""
+    process = run(body, tmp_path, tmp_path / "ready")
+    wait_for(lambda: (tmp_path / "ready").read_text() != "", process)
+    end(process, signal.SIGTERM)
+    assert [path.name for path in tmp_path.iterdir()] == ["ready"]
+    child = Path(f"/proc/{(tmp_path / 'ready').read_text()}/stat")
+    assert not child.exists() or child.read_text().split()[2] == "Z"
+
+
+def test_a_signal_sent_twice_at_once_counts_once(tmp_path: Path) -> None:
+    """As `timeout` and schedulers do; the second one does not break off the saving."""
+    body = """
+def save():
+    (folder / "saving").touch()
+    time.sleep(0.3)
+    (folder / "saved").touch()
+    return "saved"
+with interrupts.before_exit(save):
+    (folder / "ready").touch()
+    time.sleep(1000)
+"""
+    process = run(body, tmp_path, tmp_path / "ready")
+    process.send_signal(signal.SIGTERM)
+    wait_for((tmp_path / "saving").exists, process)
+    assert end(process, signal.SIGTERM) == ["mqe: terminated; saved"]
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_second_signal_does_not_wait_for_the_saving(tmp_path: Path) -> None:
+    body = """
+with interrupts.before_exit(lambda: time.sleep(1000)):
+    (folder / "ready").touch()
+    time.sleep(1000)
+"""
+    process = run(body, tmp_path, tmp_path / "ready")
+    process.send_signal(signal.SIGTERM)
+    time.sleep(1.1)
+    assert end(process, signal.SIGINT, seconds=5) == ["mqe: interrupted"]
+
+
+def test_a_saving_that_fails_is_reported(tmp_path: Path) -> None:
+    body = """
+def save():
+    raise OSError(28, "No space left on device", "run/checkpoint")
+with interrupts.before_exit(save):
+    (folder / "ready").touch()
+    time.sleep(1000)
+"""
+    process = run(body, tmp_path, tmp_path / "ready")
+    assert end(process, signal.SIGTERM) == ["mqe: terminated; run/checkpoint: No space left on device"]
+
+
+def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:
+    """Below `nohup` and in the background of a shell."""
+    body = "import signal; print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+    command = ["env", "--ignore-signal=INT", sys.executable, "-c", PREFIX + body, str(tmp_path)]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True\n"
+
+
+@pytest.mark.soak
+@SIGNALS
+def test_signals_at_random_moments(number: signal.Signals, tmp_path: Path) -> None:
+    """20 signals, a third before the first update; each run is resumed and equals an uninterrupted one."""
+    whole, moments = tmp_path / "whole", random.Random(int(number))
+    began = time.monotonic()
+    process = start([*GATE, "--run-dir", str(whole)])
+    wait_for(lambda: updates(whole) > 0, process)
+    starting, began = time.monotonic() - began, time.monotonic()
+    assert process.wait() == 0
+    training = time.monotonic() - began
+    for i in range(20):
+        run_dir = tmp_path / f"run{i}"
+        command = [*GATE, "--run-dir", str(run_dir), "--resume"]
+        process = start(command)
+        wait_for(lambda process=process: handles(process, signal.SIGTERM), process)
+        if i % 3:
+            wait_for(lambda run_dir=run_dir: updates(run_dir) > 0, process)
+        moment = time.monotonic() + moments.uniform(0.0, training / 2 if i % 3 else starting)
+        while time.monotonic() < moment and updates(run_dir) < (90 if i % 3 else 1):
+            time.sleep(0.01)
+        done, began = updates(run_dir), time.monotonic()
+        lines = end(process, number)
+        saved = [int(path.stem.removeprefix("step_")) // 32 for path in list_checkpoints(run_dir)]
+        print(f"{number.name}: {done} updates, {time.monotonic() - began:.2f} s to end, {saved}, {lines}")
+        assert subprocess.run(command, capture_output=True).returncode == 0
+        assert_same_run(whole, run_dir)
