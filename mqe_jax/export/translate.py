@@ -1,0 +1,110 @@
+"""Translates a JAX function to an ONNX graph: its jaxpr, equation by equation, over a symbolic batch axis.
+
+Equations that do not depend on the inputs are evaluated at once, those without effect on the outputs omitted, calls
+inlined and scans unrolled. `operations.RULES` translates the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+from jax import export
+from jax.extend.core import Jaxpr, JaxprEqn, Literal
+
+from mqe_jax.errors import InputError
+from mqe_jax.export.graph import BATCH, Graph, Value, constant, is_static
+from mqe_jax.export.operations import RULES, item, stacked
+
+Function = Callable[[Mapping[str, Any]], Mapping[str, jax.Array]]
+"""A function of arrays by name (N, ...) that returns arrays by name."""
+
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2")
+
+
+def translate(
+    function: Function, inputs: Mapping[str, Sequence[int]], name: str, properties: Mapping[str, str] | None = None
+) -> onnx.ModelProto:
+    """Returns the graph of a function of float32 arrays.
+
+    Args:
+        function: traceable by JAX; arrays that it closes over become constants.
+        inputs: shapes of its inputs by name, without the leading batch axis N.
+        name: of the graph.
+        properties: metadata of the model.
+
+    Raises:
+        InputError: for an operation without a translation; the message names it.
+    """
+    (batch,) = export.symbolic_shape(BATCH)
+    specs = {key: jax.ShapeDtypeStruct((batch, *shape), jnp.float32) for key, shape in inputs.items()}
+    closed, outputs = jax.make_jaxpr(function, return_shape=True)(specs)
+    graph = Graph(name)
+    given = {key: graph.input(key, spec.shape) for key, spec in specs.items()}
+    results = _run(graph, closed.jaxpr, map(constant, closed.consts), jax.tree.leaves(given))
+    for key, value in jax.tree.unflatten(jax.tree.structure(outputs), results).items():
+        graph.output(key, value, outputs[key].shape, outputs[key].dtype)
+    return graph.model(properties or {})
+
+
+def _run(graph: Graph, jaxpr: Jaxpr, constants: Any, inputs: Sequence[Value]) -> list[Value]:
+    """Adds the nodes of a jaxpr; returns its outputs."""
+    known: dict[Any, Value] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *inputs), strict=True))
+
+    def read(variable: Any) -> Value:
+        if isinstance(variable, Literal):
+            return constant(variable.val, variable.aval.dtype)
+        return known[variable]
+
+    for equation in _needed(jaxpr):
+        outputs = _equation(graph, equation, [read(variable) for variable in equation.invars])
+        known.update(zip(equation.outvars, outputs, strict=True))
+    return [read(variable) for variable in jaxpr.outvars]
+
+
+def _needed(jaxpr: Jaxpr) -> list[JaxprEqn]:
+    """Returns the equations that the outputs depend on."""
+    needed, kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}, []
+    for equation in reversed(jaxpr.eqns):
+        if needed.intersection(equation.outvars):
+            kept.append(equation)
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
+    return kept[::-1]
+
+
+def _equation(graph: Graph, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+    name, params = equation.primitive.name, equation.params
+    if name in _CALLS:
+        inner = params["call_jaxpr"] if "call_jaxpr" in params else params["jaxpr"]
+        return _run(graph, getattr(inner, "jaxpr", inner), map(constant, getattr(inner, "consts", ())), inputs)
+    if name == "scan":
+        return _scan(graph, equation, inputs)
+    arrays = [x.array for x in inputs if x.array is not None]
+    if len(arrays) == len(inputs) and all(is_static(v.aval.shape) for v in (*equation.invars, *equation.outvars)):
+        full = [jnp.broadcast_to(x, v.aval.shape) for x, v in zip(arrays, equation.invars, strict=True)]
+        results = equation.primitive.bind(*full, **params)
+        return [constant(x) for x in (results if equation.primitive.multiple_results else [results])]
+    if name not in RULES:
+        raise InputError(f"onnx: the JAX operation {name!r} has no translation; allowed: {', '.join(sorted(RULES))}")
+    results = RULES[name](graph, equation, *inputs)
+    return [results] if isinstance(results, Value) else results
+
+
+def _scan(graph: Graph, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Adds the nodes of every step of a scan."""
+    params = equation.params
+    fixed, carries, length = params["num_consts"], params["num_carry"], params["length"]
+    carry, rows = inputs[fixed : fixed + carries], inputs[fixed + carries :]
+    shapes = [v.aval.shape for v in equation.invars[fixed + carries :]]
+    steps: list[list[Value]] = [[] for _ in range(length)]
+    for i in reversed(range(length)) if params["reverse"] else range(length):
+        row = [item(graph, x, shape, i) for x, shape in zip(rows, shapes, strict=True)]
+        body = params["jaxpr"]
+        results = _run(graph, body.jaxpr, map(constant, body.consts), [*inputs[:fixed], *carry, *row])
+        carry, steps[i] = results[:carries], results[carries:]
+    outputs = equation.outvars[carries:]
+    return [*carry, *(stacked(graph, x, v.aval.shape, 0) for x, v in zip(zip(*steps, strict=True), outputs))]
