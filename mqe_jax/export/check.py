@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -22,7 +20,7 @@ def record(policy: Policy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
     shapes = input_shapes(policy, env)
 
     @jax.jit
-    def advance(state: Any, memory: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+    def advance(state: Any, memory: dict[str, Any]) -> tuple[Any, Any, Any]:
         now = env.read(state.data)
         sensed = {"gravity": now.projected_gravity, "joint_position": now.joint_position}
         sensed |= {"joint_velocity": now.joint_velocity, "obs": state.obs}
@@ -56,7 +54,7 @@ def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
     found = dict(zip(names, session.run(names, inputs), strict=True))
-    differences = {name: np.abs(found[name] - expected[name]) for name in names}
+    differences = {name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names}
     if (gait := differences.get("next_walk_gait")) is not None:
         differences["next_walk_gait"] = np.minimum(gait, 1.0 - gait)
     return {name: float(x.max()) for name, x in differences.items()}

@@ -111,8 +111,12 @@ class Graph:
             return x
         if x.array is not None and is_static(shape):
             return constant(np.broadcast_to(x.array, shape))
-        sizes = [self._batch_size() if str(n) == BATCH else constant([int(n)], np.int64) for n in shape]
+        sizes = [self.batch_size() if str(n) == BATCH else constant([int(n)], np.int64) for n in shape]
         return self.op("Expand", x, self.op("Concat", *sizes, shape=(len(sizes),), axis=0), shape=shape)
+
+    def batch_size(self) -> Value:
+        """Returns N as an array (1,)."""
+        return self.op("Shape", Value((), self._inputs[0].name), shape=(1,), start=0, end=1)
 
     def model(self, properties: Mapping[str, str]) -> onnx.ModelProto:
         """Returns the checked model with its properties."""
@@ -122,10 +126,6 @@ class Graph:
         helper.set_model_props(model, dict(properties))
         onnx.checker.check_model(model, full_check=True)
         return model
-
-    def _batch_size(self) -> Value:
-        """N as an array (1,)."""
-        return self.op("Shape", Value((), self._inputs[0].name), shape=(1,), start=0, end=1)
 
     def _use(self, x: Value) -> str:
         """Returns a value's name; constants are added to the graph.
@@ -151,7 +151,9 @@ def broadcast(*shapes: Shape) -> Shape:
     """Returns the shape of arrays broadcast together, as in NumPy, with symbolic axes."""
     rank = max(map(len, shapes), default=0)
     padded = [(1,) * (rank - len(shape)) + tuple(shape) for shape in shapes]
-    return tuple(next((n for n in sizes if export.is_symbolic_dim(n) or n != 1), 1) for sizes in zip(*padded))
+    return tuple(
+        next((n for n in sizes if export.is_symbolic_dim(n) or n != 1), 1) for sizes in zip(*padded, strict=True)
+    )
 
 
 def _information(name: str, kind: int, shape: Shape) -> onnx.ValueInfoProto:

@@ -1,4 +1,4 @@
-"""A team's policy as one function, and as the ONNX graph of it: high-level policy and, in `command` control, walk policy.
+"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, walk policy.
 
 Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
 the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in

@@ -1,7 +1,7 @@
 """Translates a JAX function to an ONNX graph: its jaxpr, equation by equation, over a symbolic batch axis.
 
 Equations that do not depend on the inputs are evaluated at once, those without effect on the outputs omitted, calls
-inlined and scans unrolled. `operations.RULES` translates the others.
+inlined and scans unrolled. The rules of `operations` and `indexing` translate the others.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import onnx
 from jax import export
-from jax.extend.core import Jaxpr, JaxprEqn, Literal
+from jax.extend.core import Jaxpr, Literal
 
 from mqe_jax.errors import InputError
+from mqe_jax.export import indexing, operations
 from mqe_jax.export.graph import BATCH, Graph, Value, constant, is_static
-from mqe_jax.export.operations import RULES, item, stacked
 
 Function = Callable[[Mapping[str, Any]], Mapping[str, jax.Array]]
 """A function of arrays by name (N, ...) that returns arrays by name."""
+RULES = operations.RULES | indexing.RULES
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2")
 
@@ -56,9 +56,10 @@ def _run(graph: Graph, jaxpr: Jaxpr, constants: Any, inputs: Sequence[Value]) ->
     known: dict[Any, Value] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *inputs), strict=True))
 
     def read(variable: Any) -> Value:
-        if isinstance(variable, Literal):
-            return constant(variable.val, variable.aval.dtype)
-        return known[variable]
+        if not isinstance(variable, Literal):
+            return known[variable]
+        kind: Any = variable.aval
+        return constant(variable.val, kind.dtype)
 
     for equation in _needed(jaxpr):
         outputs = _equation(graph, equation, [read(variable) for variable in equation.invars])
@@ -66,7 +67,7 @@ def _run(graph: Graph, jaxpr: Jaxpr, constants: Any, inputs: Sequence[Value]) ->
     return [read(variable) for variable in jaxpr.outvars]
 
 
-def _needed(jaxpr: Jaxpr) -> list[JaxprEqn]:
+def _needed(jaxpr: Jaxpr) -> list[Any]:
     """Returns the equations that the outputs depend on."""
     needed, kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}, []
     for equation in reversed(jaxpr.eqns):
@@ -76,7 +77,7 @@ def _needed(jaxpr: Jaxpr) -> list[JaxprEqn]:
     return kept[::-1]
 
 
-def _equation(graph: Graph, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+def _equation(graph: Graph, equation: Any, inputs: list[Value]) -> Sequence[Value]:
     name, params = equation.primitive.name, equation.params
     if name in _CALLS:
         inner = params["call_jaxpr"] if "call_jaxpr" in params else params["jaxpr"]
@@ -84,7 +85,8 @@ def _equation(graph: Graph, equation: JaxprEqn, inputs: list[Value]) -> Sequence
     if name == "scan":
         return _scan(graph, equation, inputs)
     arrays = [x.array for x in inputs if x.array is not None]
-    if len(arrays) == len(inputs) and all(is_static(v.aval.shape) for v in (*equation.invars, *equation.outvars)):
+    static = all(is_static(v.aval.shape) for v in (*equation.invars, *equation.outvars))
+    if len(arrays) == len(inputs) and static and name != "dim_as_value":
         full = [jnp.broadcast_to(x, v.aval.shape) for x, v in zip(arrays, equation.invars, strict=True)]
         results = equation.primitive.bind(*full, **params)
         return [constant(x) for x in (results if equation.primitive.multiple_results else [results])]
@@ -94,17 +96,16 @@ def _equation(graph: Graph, equation: JaxprEqn, inputs: list[Value]) -> Sequence
     return [results] if isinstance(results, Value) else results
 
 
-def _scan(graph: Graph, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _scan(graph: Graph, equation: Any, inputs: list[Value]) -> list[Value]:
     """Adds the nodes of every step of a scan."""
     params = equation.params
     fixed, carries, length = params["num_consts"], params["num_carry"], params["length"]
     carry, rows = inputs[fixed : fixed + carries], inputs[fixed + carries :]
-    shapes = [v.aval.shape for v in equation.invars[fixed + carries :]]
     steps: list[list[Value]] = [[] for _ in range(length)]
     for i in reversed(range(length)) if params["reverse"] else range(length):
-        row = [item(graph, x, shape, i) for x, shape in zip(rows, shapes, strict=True)]
+        row = [operations.item(graph, x, i) for x in rows]
         body = params["jaxpr"]
         results = _run(graph, body.jaxpr, map(constant, body.consts), [*inputs[:fixed], *carry, *row])
         carry, steps[i] = results[:carries], results[carries:]
-    outputs = equation.outvars[carries:]
-    return [*carry, *(stacked(graph, x, v.aval.shape, 0) for x, v in zip(zip(*steps, strict=True), outputs))]
+    columns = zip(zip(*steps, strict=True), equation.outvars[carries:], strict=True)
+    return [*carry, *(operations.stacked(graph, x, variable.aval.shape, 0) for x, variable in columns)]
