@@ -45,13 +45,13 @@ def translate(
     closed, outputs = jax.make_jaxpr(function, return_shape=True)(specs)
     graph = Graph(name)
     given = {key: graph.input(key, spec.shape) for key, spec in specs.items()}
-    results = _run(graph, closed.jaxpr, map(constant, closed.consts), jax.tree.leaves(given))
+    results = _run(graph, *_inner(closed), jax.tree.leaves(given))
     for key, value in jax.tree.unflatten(jax.tree.structure(outputs), results).items():
         graph.output(key, value, outputs[key].shape, outputs[key].dtype)
     return graph.model(properties or {})
 
 
-def _run(graph: Graph, jaxpr: Jaxpr, constants: Any, inputs: Sequence[Value]) -> list[Value]:
+def _run(graph: Graph, jaxpr: Jaxpr, constants: Sequence[Value], inputs: Sequence[Value]) -> list[Value]:
     """Adds the nodes of a jaxpr; returns its outputs."""
     known: dict[Any, Value] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *inputs), strict=True))
 
@@ -80,8 +80,7 @@ def _needed(jaxpr: Jaxpr) -> list[Any]:
 def _equation(graph: Graph, equation: Any, inputs: list[Value]) -> Sequence[Value]:
     name, params = equation.primitive.name, equation.params
     if name in _CALLS:
-        inner = params["call_jaxpr"] if "call_jaxpr" in params else params["jaxpr"]
-        return _run(graph, getattr(inner, "jaxpr", inner), map(constant, getattr(inner, "consts", ())), inputs)
+        return _run(graph, *_inner(params["call_jaxpr"] if "call_jaxpr" in params else params["jaxpr"]), inputs)
     if name == "scan":
         return _scan(graph, equation, inputs)
     arrays = [x.array for x in inputs if x.array is not None]
@@ -98,14 +97,22 @@ def _equation(graph: Graph, equation: Any, inputs: list[Value]) -> Sequence[Valu
 
 def _scan(graph: Graph, equation: Any, inputs: list[Value]) -> list[Value]:
     """Adds the nodes of every step of a scan."""
-    params = equation.params
-    fixed, carries, length = params["num_consts"], params["num_carry"], params["length"]
-    carry, rows = inputs[fixed : fixed + carries], inputs[fixed + carries :]
+    length, body, consts = equation.params["length"], *_inner(equation.params["jaxpr"])
+    # Constants and carry have the same rank within the body, rows and outputs of a step one axis less.
+    rows = sum(inner.aval.ndim < outer.aval.ndim for inner, outer in zip(body.invars, equation.invars, strict=True))
+    carries = sum(
+        inner.aval.ndim == outer.aval.ndim for inner, outer in zip(body.outvars, equation.outvars, strict=True)
+    )
+    start = len(inputs) - rows
+    fixed, carry = inputs[: start - carries], inputs[start - carries : start]
     steps: list[list[Value]] = [[] for _ in range(length)]
-    for i in reversed(range(length)) if params["reverse"] else range(length):
-        row = [operations.item(graph, x, i) for x in rows]
-        body = params["jaxpr"]
-        results = _run(graph, body.jaxpr, map(constant, body.consts), [*inputs[:fixed], *carry, *row])
+    for i in reversed(range(length)) if equation.params["reverse"] else range(length):
+        results = _run(graph, body, consts, [*fixed, *carry, *(operations.item(graph, x, i) for x in inputs[start:])])
         carry, steps[i] = results[:carries], results[carries:]
     columns = zip(zip(*steps, strict=True), equation.outvars[carries:], strict=True)
     return [*carry, *(operations.stacked(graph, x, variable.aval.shape, 0) for x, variable in columns)]
+
+
+def _inner(jaxpr: Any) -> tuple[Any, list[Value]]:
+    """Returns the jaxpr of a call, closed or not, and its constants."""
+    return getattr(jaxpr, "jaxpr", jaxpr), [constant(x) for x in getattr(jaxpr, "consts", ())]
