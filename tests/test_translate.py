@@ -37,6 +37,11 @@ def agree(function: Any, inputs: dict[str, np.ndarray]) -> None:
         np.testing.assert_allclose(found[name], value, rtol=2e-6, atol=2e-6, err_msg=name)
 
 
+def each(functions: Any, *values: Any, prefix: str = "") -> dict[str, jax.Array]:
+    """Applies functions to the same values; results by their names."""
+    return {prefix + function.__name__: function(*values) for function in functions}
+
+
 def elementwise(given: dict[str, jax.Array]) -> dict[str, jax.Array]:
     x, y = given["x"], given["y"]
     unit, positive, whole = jnp.tanh(x), jnp.abs(x) + 0.1, jnp.floor(4.0 * x).astype(jnp.int32)
@@ -44,16 +49,15 @@ def elementwise(given: dict[str, jax.Array]) -> dict[str, jax.Array]:
     functions += (jnp.tan, jnp.tanh, jnp.arctan, jnp.arcsinh, jnp.expm1, jnp.square, jnp.round, jnp.isfinite)
     functions += (jax.nn.relu, jax.nn.elu, jax.nn.sigmoid, jax.nn.silu, jax.scipy.special.erf, jax.scipy.special.erfc)
     functions += (lax.stop_gradient, jnp.copy, jnp.array)
-    outputs = {f.__name__: f(x) for f in functions}
-    outputs |= {f.__name__: f(positive) for f in (jnp.log, jnp.log1p, jnp.sqrt, lax.rsqrt)}
-    outputs |= {f.__name__: f(0.9 * unit) for f in (jnp.arccos, jnp.arcsin, jnp.arctanh)}
     pairs = (jnp.add, jnp.subtract, jnp.multiply, jnp.divide, jnp.maximum, jnp.minimum, jnp.arctan2, lax.rem, jnp.mod)
     pairs += (jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
-    outputs |= {f.__name__: f(x, y) for f in pairs} | {f"int_{f.__name__}": f(whole, 3) for f in (*pairs[:3], lax.rem)}
-    bits = {f.__name__: f(x > 0, y > 0) for f in (jnp.logical_and, jnp.logical_or, jnp.logical_xor)}
     return {
-        **outputs,
-        **bits,
+        **each(functions, x),
+        **each((jnp.log, jnp.log1p, jnp.sqrt, lax.rsqrt), positive),
+        **each((jnp.arccos, jnp.arcsin, jnp.arctanh), 0.9 * unit),
+        **each(pairs, x, y),
+        **each((*pairs[:3], lax.rem), whole, 3, prefix="int_"),
+        **each((jnp.logical_and, jnp.logical_or, jnp.logical_xor), x > 0, y > 0),
         "logical_not": ~(x > 0),
         "arccosh": jnp.arccosh(1.0 + positive),
         "power": positive**y,
@@ -111,7 +115,7 @@ def reductions(given: dict[str, jax.Array]) -> dict[str, jax.Array]:
     x, z = given["x"], given["z"]
     heads = jnp.stack([jnp.asarray(WEIGHT), 2.0 * WEIGHT, 3.0 * WEIGHT])
     return {
-        **{f.__name__: f(z, axis=1) for f in (jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.argmax, jnp.argmin, jnp.mean)},
+        **each((jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.argmax, jnp.argmin, jnp.mean), z, 1),
         "mean_over_batch": x - jnp.mean(x, axis=0),
         "any": jnp.any(z > 0.5, axis=(1, 2)),
         "all": jnp.all(z > -0.5, axis=1),
