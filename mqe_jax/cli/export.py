@@ -46,5 +46,5 @@ def export(arguments: Export) -> dict[str, Any]:
     if not arguments.json:
         for kind, values in sizes.items():
             print_table({f"{kind[:-1]} {name}": " x ".join(map(str, shape)) for name, shape in values.items()})
-        print_table({f"largest error against JAX, {STEPS} steps": f"{error:.1e}"})
+        print_table({"largest error against JAX": f"{error:.1e}, of {STEPS} steps"})
     return result

@@ -24,6 +24,7 @@ Function = Callable[[Mapping[str, Any]], Mapping[str, jax.Array]]
 RULES = operations.RULES | indexing.RULES
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2")
+_NEVER_EVALUATED = ("broadcast_in_dim", "dim_as_value")  # their rules do without repeated constants and without N
 
 
 def translate(
@@ -85,7 +86,7 @@ def _equation(graph: Graph, equation: Any, inputs: list[Value]) -> Sequence[Valu
         return _scan(graph, equation, inputs)
     arrays = [x.array for x in inputs if x.array is not None]
     static = all(is_static(v.aval.shape) for v in (*equation.invars, *equation.outvars))
-    if len(arrays) == len(inputs) and static and name != "dim_as_value":
+    if len(arrays) == len(inputs) and static and name not in _NEVER_EVALUATED:
         full = [jnp.broadcast_to(x, v.aval.shape) for x, v in zip(arrays, equation.invars, strict=True)]
         results = equation.primitive.bind(*full, **params)
         return [constant(x) for x in (results if equation.primitive.multiple_results else [results])]
