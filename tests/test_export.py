@@ -1,7 +1,9 @@
 """Exported policies: equal outputs in onnxruntime and in JAX, and refused exports."""
 
+import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -11,11 +13,15 @@ import pytest
 
 from mqe_jax import cli, load_policy, make
 from mqe_jax.errors import InputError
+from mqe_jax.robots.go1 import GO1
 from mqe_jax.settings import build
+from mqe_jax.train import networks, nn
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.loss import log_prob
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import Policy
+from mqe_jax.train.types import NetworkMemory
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -31,7 +37,7 @@ WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action
 
 def new_policy(env: Any, control: str = "command", **network: Any) -> Policy:
     """A policy with random weights, statistics and action layer, large enough to saturate some actions."""
-    if network.get("name") != "mat":
+    if "name" not in network:
         network["critic_input"] = "observations"
     settings = {"task": env.name, "env": {"control": control}, "action_scale": 0.5, "network": network}
     config = build(TrainConfig, settings)
@@ -41,6 +47,17 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> Policy:
     params = jax.tree.map(lambda x: x + 0.1, net.policy_params(jax.jit(net.init)(keys[0])))
     mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
     return Policy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), dims, config, {})
+
+
+def error_on_random_inputs(policy: Policy, env: Any) -> float:
+    """The largest error of the graph, for random observations and recurrent states of five environments at once."""
+    random, shapes = np.random.default_rng(0), input_shapes(policy, env)
+    inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
+    step = functools.partial(policy_step, policy, env)
+    expected = jax.device_get(jax.jit(step)(inputs))
+    found = errors(translate.translate(step, shapes, "test"), inputs, expected)
+    assert found.keys() == expected.keys()
+    return max(found.values())
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
@@ -96,21 +113,50 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
         ("go1revolvingdoor", "command", {"recurrent": True, "share_policy": False, "action_mean": "tanh"}),
         ("go1revolvingdoor", "position", {"recurrent": False, "activation": "elu", "hidden_sizes": [32, 16]}),
         ("go1gate", "torque", {"recurrent": True, "activation": "tanh", "gru_size": 24, "layer_norm": True}),
-        ("go1football-2vs2", "command", {"name": "mat", "heads": 2, "blocks": 2}),
     ],
 )
 def test_networks_memories_controls_and_mirrored_teams_agree(task: str, control: str, network: dict[str, Any]) -> None:
-    """On random observations and recurrent states, five environments at once."""
     params = {"position_scale": 2.0} if control == "position" else {}
     env = make(task, impl="c", control=control, num_envs=1, **params)
-    policy = new_policy(env, control, **network)
-    random = np.random.default_rng(0)
-    inputs = {
-        name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in input_shapes(policy, env).items()
-    }
-    expected = jax.device_get(jax.jit(lambda inputs: policy_step(policy, env, inputs))(inputs))
-    found = errors(to_onnx(policy, env), inputs, expected)
-    assert found.keys() == expected.keys() and max(found.values()) < 2e-5, found
+    assert error_on_random_inputs(new_policy(env, control, **network), env) < 2e-5
+
+
+def stub_env(teams: tuple[tuple[int, ...], ...]) -> Any:
+    """What `policy_step` reads of a task in `torque` control."""
+    sizes = {"num_agents": sum(map(len, teams)), "observation_size": 7, "action_size": 12, "teams": teams}
+    return SimpleNamespace(name="none", control="torque", robot=GO1, unmirror_action=lambda action: action, **sizes)
+
+
+def test_agents_of_mat_act_one_after_another_in_each_team() -> None:
+    env = stub_env(((0, 2), (1, 3)))
+    assert error_on_random_inputs(new_policy(env, "torque", name="mat", heads=2, blocks=2), env) < 2e-5
+
+
+def test_a_registered_network_is_exported_with_all_its_recurrent_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(networks, "NETWORKS", dict(networks.NETWORKS))
+
+    @networks.register_network("averaging")
+    class Averaging(networks.NetworkSettings):
+        def build(self, dims: EnvDims) -> networks.Network:
+            def act(params: Any, memory: Any, obs: jax.Array, key: Any) -> Any:
+                slow, fast = 0.9 * memory["slow"] + 0.1 * obs, 0.5 * memory["fast"] + 0.5 * obs
+                mean = nn.dense(params, fast - slow)
+                return mean, log_prob(mean, mean, params["bias"]), {"slow": slow, "fast": fast}
+
+            def initial_memory(num_envs: int) -> NetworkMemory:
+                zeros = jnp.zeros((num_envs, dims.agents, dims.observation))
+                return NetworkMemory({"slow": zeros, "fast": zeros}, ())
+
+            def init(key: jax.Array) -> Any:
+                return nn.dense_init(key, dims.observation, dims.action)
+
+            unused: Any = None
+            return networks.Network(init, lambda params: params, initial_memory, act, unused, unused)
+
+    env = stub_env(((0, 1),))
+    policy = new_policy(env, "torque", name="averaging")
+    assert sorted(input_shapes(policy, env)) == ["memory_0", "memory_1", "obs"]
+    assert error_on_random_inputs(policy, env) < 2e-5
 
 
 @pytest.mark.soak

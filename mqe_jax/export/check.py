@@ -56,5 +56,5 @@ def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str
     found = dict(zip(names, session.run(names, inputs), strict=True))
     differences = {name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names}
     if (gait := differences.get("next_walk_gait")) is not None:
-        differences["next_walk_gait"] = np.minimum(gait, 1.0 - gait)
+        differences["next_walk_gait"] = np.minimum(gait, np.abs(1.0 - gait))
     return {name: float(x.max()) for name, x in differences.items()}
