@@ -289,12 +289,14 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     return nested_params(flat, str(file))
 
 
-def save_params(params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None) -> None:
-    """Writes weights as float16 (3.6 MB) and metadata to a safetensors file, atomically."""
+def save_params(
+    params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None, *, half: bool = False
+) -> None:
+    """Writes weights and metadata to a safetensors file, atomically; with `half`, rounded to float16 (3.6 MB)."""
     from safetensors.numpy import save
 
     flat = {
-        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16)
+        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16 if half else np.float32)
         for part, layers in params.items()
         for layer, arrays in layers.items()
         for kind, array in arrays.items()

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import control, interrupts, robots, walk_policy
+from mqe_jax import cli, control, interrupts, robots, walk_policy
 from mqe_jax.errors import InputError
 from mqe_jax.files import append
 from mqe_jax.robots.go1 import GO1
@@ -140,14 +140,22 @@ def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.P
     np.testing.assert_allclose(found, action, atol=2e-5)
 
 
-def test_weights_are_stored_as_float16_and_loaded_as_float32(tmp_path: pathlib.Path) -> None:
-    params = walk_policy.init_params(jax.random.PRNGKey(0))
+@pytest.mark.parametrize("half", [False, True])
+def test_converted_weights_are_rounded_to_float16_only_on_request(tmp_path: pathlib.Path, half: bool) -> None:
+    layers = {"adaptation": random_layers(ADAPTATION_SIZES, 0), "body": random_layers(BODY_SIZES, 1)}
+    for part, values in layers.items():
+        write_torchscript(tmp_path / f"{part}.jit", values)
     file = tmp_path / "walk.safetensors"
-    walk_policy.save_params(params, file)
-    assert file.stat().st_size < 3.7e6
+    parts = [str(tmp_path / f"{part}.jit") for part in layers]
+    assert cli.main(["walk", "convert", *parts, "-o", str(file), *(["--float16"] if half else [])]) == 0
+    assert (file.stat().st_size < 3.7e6) is half
     found = walk_policy.load_params(GO1, file)
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-7), found, params)
+    for part, values in layers.items():
+        for name, value in values.items():
+            layer, kind = name.split(".")
+            stored = value.astype(np.float16) if half else value
+            np.testing.assert_array_equal(found[part][layer][kind], stored)
 
 
 def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:

@@ -255,7 +255,7 @@ class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
-    """Run folder: weights, metrics.csv, checkpoints."""
+    """Run folder: weights (rounded to float16), metrics.csv, checkpoints."""
     resume: bool = False
     """Resume from the newest checkpoint in the run folder."""
     num_envs: int = 8192
@@ -313,6 +313,8 @@ class WalkConvert:
     """Policy body, such as body_latest.jit."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """Weights to write (.safetensors)."""
+    float16: bool = False
+    """Round the weights to float16, half the size; they then act slightly differently. Default: float32."""
     robot: Robot = "go1"
 
     def run(self) -> dict[str, Any] | None:

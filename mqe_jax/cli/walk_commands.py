@@ -98,5 +98,6 @@ def walk_convert(arguments: WalkConvert) -> None:
         if not path.is_file():
             raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
     params = convert.convert(arguments.adaptation, arguments.body)
-    walk_policy.save_params(params, arguments.output, {"robot": robots.get(arguments.robot).name})
+    about = {"robot": robots.get(arguments.robot).name}
+    walk_policy.save_params(params, arguments.output, about, half=arguments.float16)
     echo(f"mqe: wrote {arguments.output}")

@@ -1,4 +1,4 @@
-"""A team's policy as one ONNX graph: the high-level policy and, in `command` control, the walk policy.
+"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, walk policy.
 
 Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
 the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in
@@ -9,60 +9,97 @@ that frame, commands and joint targets are in the robots' frame.
 | `command` | `commands` (N, A, 15), `joint_target` (N, A, 12), rad |
 | `position` | `joint_target` (N, A, 12), rad |
 | `torque` | `torque` (N, A, 12), N m |
+
+Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk frame, `joint_position`
+and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: `walk_history` (N, A, 30, 70), `walk_action` and
+`walk_previous_action` (N, A, 12), `walk_gait` (N, A, 1), and those of the network: `memory` if it is one array.
 """
 
 from __future__ import annotations
 
+import functools
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
+import jax
 import onnx
 
 import mqe_jax
 from mqe_jax import walk_policy
+from mqe_jax.control import commands_from_action
 from mqe_jax.errors import InputError
-from mqe_jax.export.actor import add_actor
-from mqe_jax.export.graph import OPSET, Graph
-from mqe_jax.export.walk import add_commands, add_joint_targets, add_walk
+from mqe_jax.export.graph import OPSET
+from mqe_jax.export.translate import translate
 from mqe_jax.files import write_atomically
 from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import Policy
 
 
 def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
-    """Returns the graph of a policy on its task.
-
-    Args:
-        policy: with the network `actor_critic`.
-        env: the policy's task, which defines control mode, robot and walk policy.
+    """Returns the graph of a policy on its task, which defines control mode, robot and walk policy.
 
     Raises:
-        InputError: for another network, or a task whose sizes differ from the policy's.
+        InputError: for a task whose sizes differ from the policy's, or a network with an operation that has no
+            translation.
     """
     sizes = (env.num_agents, env.observation_size, env.action_size)
     trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
     if sizes != trained:
         raise InputError(f"policy: trained for (agents, observation, action) {trained}, but {env.name} has {sizes}")
-    graph = Graph(env.name.replace("-", "_"))
-    agents, robot = env.num_agents, env.robot
-    action = add_actor(graph, policy)
-    graph.output("action", action, (agents, env.action_size))
-    own = _unmirrored(graph, action, env)
+    step = functools.partial(policy_step, policy, env)
+    return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
+
+
+def input_shapes(policy: Policy, env: Any) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
+    robots = {"obs": (env.observation_size,)}
     if env.control == "command":
-        commands = add_commands(graph, own, tuple(env.params.commands), env.controller.default_commands)
-        graph.output("commands", commands, (agents, len(walk_policy.COMMANDS)))
-        target = add_walk(graph, robot, env.controller.walk_params, commands, agents)
-        graph.output("joint_target", target, (agents, NUM_JOINTS))
-    elif env.control == "position":
-        target = add_joint_targets(graph, robot, own, env.params.position_scale)
-        graph.output("joint_target", target, (agents, NUM_JOINTS))
-    else:
-        limit = graph.constant(robot.torque_limit)
-        graph.output("torque", graph.op("Mul", own, limit), (agents, NUM_JOINTS))
-    return graph.model(_properties(policy, env))
+        robots |= {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
+        robots |= {"walk_history": (walk_policy.HISTORY, walk_policy.OBSERVATION_SIZE), "walk_gait": (1,)}
+        robots |= {"walk_action": (NUM_JOINTS,), "walk_previous_action": (NUM_JOINTS,)}
+    shapes = {name: (env.num_agents, *shape) for name, shape in robots.items()}
+    return shapes | {name: x.shape for name, x in _network_memory(policy.initial_memory()).items()}
+
+
+def policy_step(policy: Policy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns the outputs of one step by name, the function that the graph evaluates."""
+    names = _network_memory(policy.initial_memory())
+    memory = jax.tree.unflatten(jax.tree.structure(policy.initial_memory()), [inputs[name] for name in names])
+    action, memory = policy.act(inputs["obs"], memory, deterministic=True)
+    own = jax.vmap(env.unmirror_action)(action)
+    outputs = {"action": action} | {f"next_{name}": x for name, x in _network_memory(memory).items()}
+    if env.control == "torque":
+        return outputs | {"torque": own * env.robot.torque_limit}
+    if env.control == "position":
+        return outputs | {"joint_target": walk_policy.joint_targets(env.robot, own, env.params.position_scale)}
+    return outputs | _walk(env, own, inputs)
+
+
+def _network_memory(memory: Any) -> dict[str, Any]:
+    """Returns the arrays of a network's recurrent state by name."""
+    leaves = jax.tree.leaves(memory)
+    return {"memory" if len(leaves) == 1 else f"memory_{i}": leaf for i, leaf in enumerate(leaves)}
+
+
+def _walk(env: Any, action: jax.Array, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    default = env.controller.default_commands
+    commands = jax.vmap(lambda a: commands_from_action(a, env.params.commands, default))(action)
+    memory = walk_policy.WalkMemory(
+        inputs["walk_history"], inputs["walk_action"], inputs["walk_previous_action"], inputs["walk_gait"][..., 0]
+    )
+    walk = jax.vmap(jax.vmap(functools.partial(walk_policy.walk, env.robot, env.controller.walk_params)))
+    sensed = (inputs["gravity"], inputs["joint_position"], inputs["joint_velocity"])
+    target, memory = walk(memory, commands, *sensed)
+    return {
+        "commands": commands,
+        "joint_target": target,
+        "next_walk_history": memory.history,
+        "next_walk_action": memory.action,
+        "next_walk_previous_action": memory.previous_action,
+        "next_walk_gait": memory.gait[..., None],
+    }
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
@@ -81,16 +118,6 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
         return {v.name: [d.dim_param or d.dim_value for d in v.type.tensor_type.shape.dim] for v in values}
 
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
-
-
-def _unmirrored(graph: Graph, action: str, env: Any) -> str:
-    """Applies the task's linear map from the agents' frames to the robots' (N, A, D)."""
-    size = env.action_size
-    basis = [env.unmirror_action(jnp.tile(row, (env.num_agents, 1))) for row in jnp.eye(size)]
-    matrices = np.stack([np.asarray(rows) for rows in basis], axis=1)  # (A, D, D), rows by basis vector
-    if np.array_equal(matrices, np.tile(np.eye(size), (env.num_agents, 1, 1))):
-        return action
-    return graph.affine(action, matrices, np.zeros(size, np.float32))
 
 
 def _properties(policy: Policy, env: Any) -> dict[str, str]:

@@ -26,7 +26,7 @@ from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import Robot
 
 BAND = 0.15
-SLOW, FAST = .7, .8  # shares of a leg's lowest speed limit at which its armature begins and is complete
+SLOW, FAST = 0.85, 1.0  # shares of a leg's lowest speed limit at which its armature begins and is complete
 REACH = 1.25  # share of its speed limit that a joint may reach within a physics step without armature
 GAIN = 4.0
 CLAMP = 1.09

@@ -296,10 +296,10 @@ def _from_checkpoint(saved: dict[str, Any]) -> WalkTrainState:
 
 
 def save(run_dir: Path, train_state: WalkTrainState, robot: Robot, config: WalkConfig) -> Path:
-    """Writes a checkpoint and walk.safetensors into a run folder; returns the checkpoint's path."""
+    """Writes a checkpoint and walk.safetensors (float16) into a run folder; returns the checkpoint's path."""
     iteration = int(train_state.iteration)
     about = {"robot": robot.name, "config": dataclasses.asdict(config), "iteration": iteration}
-    walk_policy.save_params(train_state.params["policy"], run_dir / "walk.safetensors", about)
+    walk_policy.save_params(train_state.params["policy"], run_dir / "walk.safetensors", about, half=True)
     return checkpoint.save_checkpoint(run_dir, _to_checkpoint(train_state), iteration, about, keep=2)
 
 
