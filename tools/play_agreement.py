@@ -57,9 +57,16 @@ def replay(env: Any, xml: str, rollout: Rollout) -> list[tuple[np.ndarray, np.nd
     data.qpos[:], data.qvel[:] = rollout["qpos"], rollout["qvel"]
     data.mocap_pos[:] = env.compiled.wall_positions(np.asarray(rollout["anchors"]))
     states = []
+    motors = env.compiled.motors
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
     for targets in rollout["targets"]:
-        data.ctrl[env.index.actuator] = targets
-        mujoco.mj_step(model, data, env.physics.num_substeps)
+        for _ in range(env.physics.num_substeps):
+            joints = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
+            data.ctrl[:], armature = motors.limit(np, np.ravel(targets), *joints, gain, bias)
+            model.dof_armature[motors.joint_qvel] = armature
+            mujoco.mj_step(model, data)
+            joints = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
+            data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel] = motors.clamp(np, *joints)
         states.append((data.qpos.copy(), data.qvel.copy()))
     return states
 

@@ -1,5 +1,6 @@
 // Episodes of a task in MuJoCo, driven by a policy exported by `mqe export` to ONNX.
 import { observe, outcome } from './gate.js';
+import { Motors } from './motors.js';
 import { readRobots, turn } from './robots.js';
 
 /** A generator of numbers in [0, 1): 32-bit xorshift, started by an integer. */
@@ -42,6 +43,7 @@ export class Physics {
     this.settings = settings;
     this.model = mujoco.MjModel.from_xml_string(xml);
     this.data = new mujoco.MjData(this.model);
+    this.motors = new Motors(settings);
   }
 
   /** Starts from a state; joint targets are neutral until the first step. */
@@ -57,10 +59,11 @@ export class Physics {
 
   /** One environment step under joint targets (R x 12), rad; PD control runs inside MuJoCo. */
   step(targets) {
-    this.settings.robots.forEach((robot, number) =>
-      robot.actuator.forEach((row, i) => (this.data.ctrl[row] = targets[12 * number + i])),
-    );
-    for (let i = 0; i < this.settings.substeps; i++) this.mujoco.mj_step(this.model, this.data);
+    for (let i = 0; i < this.settings.substeps; i++) {
+      this.motors.limit(this.model, this.data, Array.from(targets));
+      this.mujoco.mj_step(this.model, this.data);
+      this.motors.clamp(this.data);
+    }
   }
 }
 

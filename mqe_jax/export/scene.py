@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mqe_jax.robots import motors
 from mqe_jax.scene import build_spec
 from mqe_jax.settings import to_mapping
 
@@ -35,6 +36,7 @@ def scene_settings(env: Any) -> dict[str, Any]:
     | `spawn` | nominal spawn poses x, y, z, yaw (R, 4) |
     | `anchors` | `mean` and `spread` (half-width) of the uniformly sampled anchors (G, 2) |
     | `walls` | `anchor` and `offset` from it (3,) of each mocap body |
+    | `motors` | of all joints, constants and inputs of `mqe_jax.robots.motors`, which MJCF cannot hold |
     | `params` | the task's parameters |
     """
     index, compiled, robot = env.index, env.compiled, env.robot
@@ -60,7 +62,26 @@ def scene_settings(env: Any) -> dict[str, Any]:
         "spawn": [[float(x), float(y), height, float(yaw)] for x, y, yaw in env.spawn_poses()],
         "anchors": {"mean": compiled.anchor_mean.tolist(), "spread": compiled.anchor_spread.tolist()},
         "walls": [{"anchor": anchor, "offset": _plain(offset)} for anchor, offset in walls],
+        "motors": _motors(env),
         "params": to_mapping(env.params),
+    }
+
+
+def _motors(env: Any) -> dict[str, Any]:
+    model, table = env.compiled.model, env.compiled.motors
+    arrays = ("speed", "torque", "stall", "response")
+    return {
+        **{name: getattr(table, name).tolist() for name in arrays},
+        "actuator_gain": model.actuator_gainprm[:, 0].tolist(),
+        "bias": model.actuator_biasprm[:, :3].tolist(),
+        "armature": model.dof_armature[table.joint_qvel].tolist(),
+        "timestep": table.timestep,
+        "band": motors.BAND,
+        "slow": motors.SLOW,
+        "fast": motors.FAST,
+        "reach": motors.REACH,
+        "gain": motors.GAIN,
+        "clamped": motors.CLAMP,
     }
 
 

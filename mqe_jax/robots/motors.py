@@ -4,10 +4,10 @@ A motor gives at most its controller's limit L and at most the torque of a DC mo
 its speed v: S is its stall torque, V its speed limit. Above V it brakes, with L at (1 + `BAND`) V. These bounds are
 evaluated at the start of every physics step.
 
-Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So a leg near its speed
-limits also gets an armature (rotor inertia) for this physics step: the implicit form of the braking above V. It is zero
-while the leg's joints are slower than `SLOW` times its lowest speed limit and none can reach its own limit within the
-step; a robot that walks has none. What contacts still accelerate beyond `CLAMP` V is set to `CLAMP` V.
+Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So a leg that is fast, or
+that its torques can carry far beyond V within the step, also gets an armature (rotor inertia) for this physics step: the
+implicit form of the braking above V. A robot that walks has none. What torques, joint limits and contacts still
+accelerate beyond `CLAMP` V is set to `CLAMP` V, as PhysX does with a joint's velocity limit.
 
 The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
 """
@@ -25,11 +25,11 @@ from mqe_jax.robots.build import build_robot
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import Robot
 
-BAND = 0.15
+BAND = 0.15  # share of the speed limit above it at which the motor brakes with its full torque
 SLOW, FAST = 0.85, 1.0  # shares of a leg's lowest speed limit at which its armature begins and is complete
-REACH = 1.25  # share of its speed limit that a joint may reach within a physics step without armature
-GAIN = 4.0
-CLAMP = 1.09
+REACH = 1.25  # share of its speed limit that a joint's torques may carry it to within a physics step without armature
+GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
+CLAMP = 1.09  # greatest share of the speed limit after a physics step
 
 
 @functools.cache
