@@ -5,8 +5,8 @@ its speed v: S is its stall torque, V its speed limit. Above V it brakes, with L
 evaluated at the start of every physics step.
 
 Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So a leg that is fast, or
-that its torques can carry far beyond V within the step, also gets an armature (rotor inertia) for this physics step: the
-implicit form of the braking above V. A robot that walks has none. What torques, joint limits and contacts still
+whose torques can carry it far beyond V within the step, also gets an armature (rotor inertia) for this physics step:
+the implicit form of the braking above V. A robot that walks has none. What torques, joint limits and contacts still
 accelerate beyond `CLAMP` V is set to `CLAMP` V, as PhysX does with a joint's velocity limit.
 
 The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
