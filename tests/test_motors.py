@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mqe_jax import make, robots
-from mqe_jax.robots.motors import CLAMP, Motors, leg_response
+from mqe_jax.errors import InputError
+from mqe_jax.robots.motors import BAND, CLAMP, Motors, leg_response
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 from tests.driving import MODES, drive
@@ -42,7 +43,7 @@ def test_torque_falls_to_zero_at_the_speed_limit_and_brakes_above(name: str) -> 
         np.testing.assert_allclose(given(motors, -100.0, -share * speed)[0], -expected, rtol=1e-5, atol=1e-4)
         # Against its speed a motor gives what the controller allows.
         np.testing.assert_allclose(given(motors, -100.0, share * speed)[0], -limit, rtol=1e-5)
-    np.testing.assert_allclose(given(motors, 0.0, 1.1 * speed)[0], -0.5 * limit, rtol=1e-4)
+    np.testing.assert_allclose(given(motors, 0.0, (1.0 + BAND / 2) * speed)[0], -0.5 * limit, rtol=1e-4)
     np.testing.assert_allclose(given(motors, 100.0, 1.5 * speed)[0], -limit, rtol=1e-4)
 
 
@@ -123,3 +124,18 @@ def test_joint_mechanics_are_in_the_model() -> None:
     np.testing.assert_allclose(model.dof_frictionloss[joints], env.robot.friction_loss)
     plain: Any = make("go1plane", impl="c", num_agents=1)
     assert not plain.compiled.model.dof_armature.any() and not plain.compiled.model.dof_frictionloss.any()
+
+
+def test_randomised_joint_mechanics_reach_the_physics() -> None:
+    """Joints under 1 N m move less with their full inertia, damping and friction than with a tenth of it."""
+    moved = {}
+    for factor in (0.1, 1.0):
+        params = {"joint_mechanics": True, "randomization": {"joint_mechanics": (factor, factor + 1e-3)}}
+        env: Any = make("go1plane", impl="c", control="torque", num_agents=1, num_envs=1, **params)
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        joints = env.index.joint_qpos[0]
+        after = jax.jit(env.step)(state, jnp.full((1, 12), 0.05))
+        moved[factor] = float(jnp.abs(after.data.qpos[joints] - state.data.qpos[joints]).sum())
+    assert 0.0 < moved[1.0] < 0.7 * moved[0.1]
+    with pytest.raises(InputError, match="joint_mechanics"):
+        make("go1plane", impl="c", randomization={"joint_mechanics": (0.5, 2.0)})

@@ -28,6 +28,8 @@ class Randomization:
     """Shift of the trunk's centre of mass along each axis, m."""
     motor_strength: Range | None = None
     """Factor on all torques."""
+    joint_mechanics: Range | None = None
+    """Factor on rotor inertia, damping and dry friction of the joints; needs the task parameter `joint_mechanics`."""
     action_lag: NonNegativeInt = 0
     """Maximum delay of the actuator targets, environment steps; one sample per environment."""
     push: NonNegative = 0.0
@@ -38,7 +40,7 @@ class Randomization:
     """Standard deviation of the noise on observations, except on one-hot blocks."""
 
     def __post_init__(self) -> None:
-        for name in ("friction", "motor_strength"):
+        for name in ("friction", "motor_strength", "joint_mechanics"):
             span = getattr(self, name)
             if span is not None and span[0] <= 0:
                 fail(name, span, "two numbers greater than 0 (lowest, highest), or none")
@@ -57,6 +59,8 @@ class RandomizedParams:
     """Shift of the trunk's centre of mass (R, 3), m."""
     motor_strength: jax.Array
     """Factor on all torques (R,)."""
+    joint_mechanics: jax.Array
+    """Factor on rotor inertia, damping and dry friction of the joints (R,); not in the privileged observation."""
     action_lag: jax.Array
     """Delay of the actuator targets, environment steps () int32."""
 
@@ -65,7 +69,7 @@ class Randomizer:
     """Samples randomised physics parameters and applies them to the model.
 
     Raises:
-        InputError: if the lowest payload makes a trunk's mass zero or negative.
+        InputError: if the lowest payload makes a trunk's mass zero or negative, or for `joint_mechanics` without any.
     """
 
     def __init__(self, random: Randomization, model: mujoco.MjModel, index: RobotIndex, friction: float) -> None:
@@ -73,6 +77,8 @@ class Randomizer:
         mass = float(model.body_mass[index.trunk_body].min())
         if random.payload is not None and random.payload[0] <= -mass:
             fail("randomization.payload", random.payload, f"greater than -{mass:.3g} kg, the mass of the trunk")
+        if random.joint_mechanics is not None and not model.dof_armature[index.joint_qvel].any():
+            fail("randomization.joint_mechanics", random.joint_mechanics, "none, unless joint_mechanics is true")
 
     def sample(self, key: jax.Array) -> RandomizedParams:
         """Returns the parameters of one environment."""
@@ -89,6 +95,7 @@ class Randomizer:
             payload=uniform(keys[1], random.payload, (robots,), 0.0),
             center_of_mass=uniform(keys[2], random.center_of_mass, (robots, 3), 0.0),
             motor_strength=uniform(keys[3], random.motor_strength, (robots,), 1.0),
+            joint_mechanics=uniform(jax.random.fold_in(key, 5), random.joint_mechanics, (robots,), 1.0),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
         )
 
@@ -111,6 +118,10 @@ class Randomizer:
             strength = jnp.ones(model.nu).at[index.actuator].set(params.motor_strength[:, None])[:, None]
             fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
             fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
+        if random.joint_mechanics is not None:
+            factor = jnp.ones(model.nv).at[index.joint_qvel].set(params.joint_mechanics[:, None])
+            for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
+                fields[name] = as_float(getattr(model, name)) * factor
         return fields
 
     def push(self, data: mjx.Data, key: jax.Array, dt: float) -> mjx.Data:
