@@ -32,10 +32,9 @@ _GEOM_TYPES = {
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 MARGIN = 0.003  # m
-# Joint limits: as stiff as the physics step allows; they begin `JOINT_MARGIN` before the limit, which a joint at its
-# motor's speed limit passes by up to 0.25 rad within a physics step.
-JOINT_SOLIMP = (0.98, 0.99, 0.001, 0.5, 2.0)
-JOINT_MARGIN = 0.08  # rad
+# Joint limits have the same time constant and begin `JOINT_MARGIN` before the limit, which a joint at its motor's speed
+# limit passes by up to 0.25 rad within a physics step. A stiffer `solimp` needs more solver iterations.
+JOINT_MARGIN = 0.12  # rad
 
 
 def _add_inertial(body: Any, link: Link) -> None:
@@ -132,7 +131,6 @@ def build_robot(
                 range=limits,
                 margin=JOINT_MARGIN,
                 solref_limit=SOLREF,
-                solimp_limit=JOINT_SOLIMP,
             )
             if joint_mechanics:
                 hinge.armature = robot.rotor_inertia[index]
