@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.robots.motors import Motors
+from mqe_jax.robots.motors import CLAMP, Motors
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -28,6 +28,7 @@ class CEngine:
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._make = Batch
         self._batches: dict[tuple[int, tuple[str, ...]], Any] = {}
+        self._rows: dict[int, Motors | None] = {}
         self._lock = threading.Lock()
         m = model
         self._sizes = (m.nq, m.nv, m.nv, m.nsensordata)
@@ -71,6 +72,7 @@ class CEngine:
             batch = self._batches.get((count, names))
             if batch is None:
                 batch = self._batches[count, names] = self._make(self._model, nsim=count)
+                self._rows[count] = None if self._motors is None else self._motors.repeated(count)
             for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
                 batch.bind(name)[:] = next(flat)
             if self._model.nmocap:
@@ -81,28 +83,36 @@ class CEngine:
             for name in names:
                 batch.expand(name)[:] = next(flat)
             sensordata = batch.bind("sensordata")
-            if self._motors is None:
+            motors = self._rows[count]
+            if motors is None:
                 batch.step(nstep=substeps)
             else:
-                self._drive(batch, self._motors, substeps, names)
+                self._drive(batch, motors, substeps, names)
             parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
             row = np.concatenate(parts, axis=1).astype(np.float32)
         return row.reshape(*lead, -1)
 
     def _drive(self, batch: Any, motors: Motors, substeps: int, names: tuple[str, ...]) -> None:
-        """Steps a batch, with the motors' limits in every physics step."""
+        """Steps a batch, with the motors' limits in every physics step; `motors` has a row per environment."""
         model = self._model
         gain = batch.expand("actuator_gainprm") if "actuator_gainprm" in names else model.actuator_gainprm
         bias = batch.expand("actuator_biasprm") if "actuator_biasprm" in names else model.actuator_biasprm
+        gain, bias = gain[..., 0].astype(np.float32), _columns(bias[..., :3])
         qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-        asked, armature = ctrl.copy(), batch.expand("dof_armature")
-        base = (
-            armature[:, motors.joint_qvel].copy() if "dof_armature" in names else model.dof_armature[motors.joint_qvel]
-        )
+        asked, armature = ctrl.astype(np.float32), batch.expand("dof_armature")
+        angles, speeds = motors.joint_qpos, motors.joint_qvel
+        base = armature[:, speeds].copy() if "dof_armature" in names else model.dof_armature[speeds]
+        greatest = CLAMP * float(motors.speed.min())
         for _ in range(substeps):
-            joints = qpos[:, motors.joint_qpos], qvel[:, motors.joint_qvel]
-            ctrl[:], added = motors.limit(np, asked, *joints, gain[..., 0], bias[..., :3])
-            armature[:, motors.joint_qvel] = base + added
+            joints = qpos[:, angles].astype(np.float32), qvel[:, speeds].astype(np.float32)
+            ctrl[:], added = motors.limit(np, asked, *joints, gain, bias)
+            armature[:, speeds] = base + added if added.any() else base
             batch.step(nstep=1)
-            joints = motors.clamp(np, qpos[:, motors.joint_qpos], qvel[:, motors.joint_qvel])
-            qpos[:, motors.joint_qpos], qvel[:, motors.joint_qvel] = joints
+            velocity = qvel[:, speeds]
+            if max(velocity.max(), -velocity.min()) > greatest and np.any(np.abs(velocity) > CLAMP * motors.speed):
+                qpos[:, angles], qvel[:, speeds] = motors.clamp(np, qpos[:, angles], velocity)
+
+
+def _columns(bias: np.ndarray) -> np.ndarray:
+    """Returns coefficients (..., J, 3) in single precision, each column contiguous."""
+    return np.moveaxis(np.ascontiguousarray(np.moveaxis(bias, -1, 0), np.float32), 0, -1)

@@ -92,26 +92,57 @@ class Motors:
             control under which the actuators' forces are the motors' torques (..., J), equal to `ctrl` where the motors
             can give what is asked, and armature (..., J), kg m^2.
         """
-        speed, torque = self.speed, self.torque
+        pace = xp.abs(velocity)
+        below = self.speed - pace
+        most = xp.minimum(xp.minimum(self._line * below, self._brake * below), self.torque)  # in the direction of v
+        most = xp.maximum(most, -self.torque)
+        sign = xp.where(velocity < 0, np.float32(-1.0), np.float32(1.0))
         force = gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity
-        asked = xp.clip(force, -torque, torque)
-        line, brake = self.stall / speed, torque / (BAND * speed)
-        over, under = speed - velocity, -speed - velocity  # both have the sign of the torque that is allowed
-        upper = xp.clip(xp.where(over > 0, line, brake) * over, -torque, torque)
-        lower = xp.clip(xp.where(under < 0, line, brake) * under, -torque, torque)
-        given = xp.clip(asked, lower, upper)
-        ctrl = xp.where(given == asked, ctrl, ctrl + (given - force) / gain)
+        given = sign * xp.minimum(xp.maximum(sign * force, -self.torque), most)
+        ctrl = ctrl + (given - force) / xp.where(gain == 0, 1, gain)
+        return ctrl, self._armature(xp, pace, xp.abs(given))
 
-        legs = (*velocity.shape[:-1], -1, len(self.response))
-        pace, effort = xp.abs(velocity).reshape(legs), xp.abs(given).reshape(legs)
-        limits = speed.reshape(-1, len(self.response))
-        kick = sum(effort[..., i : i + 1] * self.response[i] for i in range(len(self.response)))
-        near = (pace / limits.min(axis=1, keepdims=True) - SLOW) / (FAST - SLOW)
-        near = xp.clip(xp.maximum(xp.maximum(near[..., 0], near[..., 1]), near[..., 2]), 0.0, 1.0)[..., None]
-        full = (self.timestep * brake).reshape(limits.shape)
-        reach = (pace + self.timestep * kick) / limits
-        needed = xp.where(reach > REACH, xp.clip(GAIN * (reach - 1.0) / np.diag(self.response), 0.0, full), 0.0)
-        return ctrl, xp.maximum(near * full, needed).reshape(velocity.shape)
+    def _armature(self, xp: Any, pace: Any, effort: Any) -> Any:
+        """Returns the armature (..., J), kg m^2, at speeds of magnitude `pace` and torques of magnitude `effort`."""
+        size = len(self.response)
+        fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
+        near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
+        kick = (effort.reshape(-1, size) @ (self.timestep * self.response)).reshape(pace.shape)
+        reach = (pace + kick) / self.speed
+        if xp is np and near.max() <= 0.0 and reach.max() <= REACH:
+            return np.zeros_like(pace)
+        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH)
+        return xp.maximum(xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1) * self._full, needed)
+
+    @functools.cached_property
+    def _line(self) -> np.ndarray:
+        """Slope of the torque line (..., J), N m s; smaller than `_brake`."""
+        return self.stall / self.speed
+
+    @functools.cached_property
+    def _brake(self) -> np.ndarray:
+        """Slope of the braking torque (..., J), N m s."""
+        return self.torque / (BAND * self.speed)
+
+    @functools.cached_property
+    def _full(self) -> np.ndarray:
+        """Complete armature (..., J), kg m^2."""
+        return self.timestep * self._brake
+
+    @functools.cached_property
+    def _needed(self) -> np.ndarray:
+        """Armature per share of the speed limit beyond it (..., J), kg m^2."""
+        return np.tile(GAIN / np.diag(self.response), self._leg_speed.shape)
+
+    @functools.cached_property
+    def _leg_speed(self) -> np.ndarray:
+        """Lowest speed limit of each leg (..., J / 3), rad/s."""
+        return self.speed.reshape(*self.speed.shape[:-1], -1, len(self.response)).min(axis=-1)
+
+    def repeated(self, count: int) -> Motors:
+        """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""
+        rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
+        return dataclasses.replace(self, **rows)
 
     def clamp(self, xp: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
         """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `CLAMP` V."""
