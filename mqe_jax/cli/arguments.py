@@ -255,27 +255,24 @@ class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
-    """Run folder: weights (rounded to float16), metrics.csv, checkpoints."""
+    """Run folder: walk.safetensors (rounded to float16), metrics.csv, checkpoints."""
     resume: bool = False
-    """Resume from the newest checkpoint in the run folder."""
+    """Continue from the newest checkpoint in the run folder, with environments reset."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to start from; may be those of another robot. Default: from scratch."""
     num_envs: int = 8192
     """Number of parallel environments."""
-    iterations: int = 1200
-    """PPO updates of 24 steps."""
-    max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Time limit, s; training stops there after saving a checkpoint."""
-    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Weights to fine-tune; may be those of another robot. Default: from scratch."""
-    initial_std: float = 1.0
-    """Initial standard deviation of the actions."""
-    curriculum: int = 400
-    """Curriculum length: iterations over which slopes, forces and pushes are ramped to their maxima."""
-    critic_warmup: int = 0
-    """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
-    symmetry: float = 0.5
-    """Coefficient of the loss of left-right symmetry; 0: none."""
-    anneal: float = 0.25
-    """Final fraction of training over which learning rate and entropy bonus are annealed linearly to zero."""
+    total_steps: int = 280_000_000
+    """Environment steps in all."""
+    set: Annotated[
+        list[str],
+        Repeated,
+        tyro.conf.arg(
+            name="set",
+            metavar="KEY=VALUE",
+            help="Setting of the training, such as network.symmetry_coef=1 (see docs/training.md); may be repeated.",
+        ),
+    ] = field(default_factory=list)
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1
