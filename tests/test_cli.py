@@ -403,7 +403,7 @@ class Missing:
         if name.split(".")[0] == "warp":
             raise ModuleNotFoundError("No module named 'warp'")
 sys.meta_path.insert(0, Missing())
-from mqe_jax.physics import load_mjx
+from mqe_jax.engines.private import load_mjx
 print(load_mjx().__name__)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -17,9 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import engines, robots, walk_policy
 from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
-from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
@@ -57,7 +56,7 @@ class WalkEnv:
             solver_iterations=self.task.solver_iterations,
         )
         self.compiled = compile_scene(scene)
-        self.physics = Physics(
+        self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
             impl=impl,
@@ -164,7 +163,7 @@ class WalkEnv:
         data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
 
         ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.motor_offset)
-        data = self.physics.step(
+        data, _ = self.physics.step(
             data,
             ctrl,
             fields=self._randomizer.fields(state.random),
