@@ -28,7 +28,7 @@ GATE_TERMS = {"reward/approach": "Distance to Target Reward", "reward/success": 
 """Terms of the paper's appendix figure of Narrow Gate (MAPPO), by column; it ends at `GATE_STEPS`."""
 GATE_STEPS = 20_000_000
 SHAPED = (TUNED, "no-curriculum", "plain-network", "plain-curriculum", "shaped", "shaped-tuned", "unshaped")
-"""Variants whose training rewards may include shaping; ablations of the tuned settings are among them."""
+"""The tuned settings and changes of them; their training rewards may include shaping."""
 MIN_SEEDS = 3
 """Seeds that a verdict requires: the interval of a single seed is a point."""
 
@@ -38,6 +38,10 @@ Rows = list[dict[str, Any]]
 class Study:
     """Published runs with the paper's values: cells, and a row of numbers for each."""
 
+    reference: Reference
+    """The paper's values."""
+    measurements: Mapping[str, Any]
+    """Measurements beside the runs, by name."""
     cells: Cells
     """All runs by cell, in the paper's order."""
     drawn: Cells
@@ -48,10 +52,8 @@ class Study:
     """Columns of `final_table` and `paper`, `ours` (see `verdict`) for each cell."""
 
     def __init__(self, runs: Sequence[Run], folder: Path) -> None:
-        self.reference: Reference = load_reference(folder / "reference.yaml")
-        """The paper's values."""
-        self.fresh: Mapping[str, Any] = json.loads((folder.parent / "measurements.json").read_text(encoding="utf-8"))
-        """Measurements beside the runs, by name."""
+        self.reference = load_reference(folder / "reference.yaml")
+        self.measurements = json.loads((folder.parent / "measurements.json").read_text(encoding="utf-8"))
         self.cells = group(runs, self.reference)
         self.drawn = {cell: own for cell, own in self.cells.items() if cell.variant in self.reference.values}
         self.others = {cell: own for cell, own in self.cells.items() if cell not in self.drawn}
@@ -202,28 +204,21 @@ def _aggregates(study: Study) -> str:
     return "\n\n".join(markdown(table) for table in aggregate_tables(study.drawn).values())
 
 
-_OTHERS = {"task": "task", "variant": "variant", "algorithm": "algorithm", "seeds": "seeds"}
-_OTHERS |= {"absolute": "best checkpoint", "paper": "paper's best", "exceeds": "lower end above"}
-_OTHERS |= {"success": "success rate"}
-
-
-def _others(study: Study) -> Rows:
-    rows = [row for row in study.rows if row["variant"] not in study.reference.values]
-    return [{**row, "exceeds": "yes" if row["ours"] == "above" else "no" if row["ours"] else ""} for row in rows]
+_TUNED = {"task": "task", "variant": "variant", "algorithm": "algorithm", "seeds": "seeds"}
+_TUNED |= {"absolute": "best checkpoint", "paper": "paper's best", "exceeds": "lower end above"}
+_TUNED |= {"success": "success rate", "fresh": "success rate, 512 fresh episodes"}
 
 
 def _tuned(study: Study) -> str:
-    """Returns the table of the tuned settings, with the success rates of each seed over fresh episodes."""
-    tasks = study.fresh["paper/fresh_episodes"]["tasks"]
-    rows = [row for row in _others(study) if row["variant"] == TUNED]
+    """Returns the table of the tuned settings and of changes of them; with success rates over fresh episodes."""
+    fresh = study.measurements["paper/fresh_episodes"]["tasks"]
+    rows = [{**row, "fresh": ""} for row in study.rows if row["variant"] in SHAPED]
     for row in rows:
-        seeds = [f"{100 * seed['success_rate']:.1f}" for _, seed in sorted(tasks[row["task"]].items())]
-        row["fresh"] = ", ".join(seeds) + "%"
-    return _table(rows, {**_OTHERS, "fresh": "success rate, 512 fresh episodes"})
-
-
-def _ablations(study: Study) -> str:
-    return _table([row for row in _others(study) if row["variant"] != TUNED], _OTHERS)
+        row["exceeds"] = "yes" if row["ours"] == "above" else "no" if row["ours"] else ""
+        if row["variant"] == TUNED:
+            seeds = [f"{100 * seed['success_rate']:.1f}" for _, seed in sorted(fresh[row["task"]].items())]
+            row["fresh"] = ", ".join(seeds) + "%"
+    return _table(rows, _TUNED)
 
 
 SECTIONS: Mapping[str, Callable[[Study], str]] = {
@@ -232,6 +227,5 @@ SECTIONS: Mapping[str, Callable[[Study], str]] = {
     "aggregates": _aggregates,
     SCRATCH: _of(SCRATCH),
     TUNED: _tuned,
-    "ablations": _ablations,
 }
 """Generated sections of the page by name."""
