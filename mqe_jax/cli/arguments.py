@@ -225,11 +225,13 @@ class Sweep:
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""
     json: Json = False
+    part: str | None = None
+    """Name of one sweep in a file that maps names to sweeps."""
     folder: Path | None = None
-    """Folder of the sweep. Default: runs/NAME of the file."""
+    """Folder of the sweep. Default: runs/PART, or runs/NAME of the file."""
     cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
-    """Train these cells only: TASK/ALGORITHM, followed by +SETTING for settings other than hierarchical; may be a
-    pattern such as '*/mat', and may be repeated."""
+    """Train these cells only: TASK/ALGORITHM, followed by +VARIANT in a sweep with variants; may be a pattern such as
+    '*/mat', and may be repeated."""
     dry_run: bool = False
     """Print the remaining training runs and their estimated time, without training."""
     impl: Impl = "auto"
@@ -240,10 +242,12 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Report:
-    """Write figures and tables of a sweep from its raw data, with the paper's values."""
+    """Write figures and tables of a sweep from its finished runs, with reference values."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder of the sweep, with its raw data in raw/; the report goes into report/."""
+    """Folder of the sweep, with its runs in runs/; the report goes into report/."""
+    reference: Path | None = None
+    """YAML file of reference values, such as the paper's in results/paper/reference.yaml."""
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:

@@ -68,9 +68,11 @@ def _overrides(arguments: Train | Eval | Render | View | Bench) -> dict[str, Any
 
 
 def _run_config(target: str) -> Any:
-    """Returns the settings in a run folder."""
+    """Returns the settings in a run folder or a policy file."""
+    if target.endswith(".safetensors"):
+        return load_policy(target).config
     if not Path(target).is_dir():
-        raise InputError(f"run: no folder {target!r}; allowed: a run folder, or a task's id")
+        raise InputError(f"run: no folder {target!r}; allowed: a run folder, a policy file, or a task's id")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
         raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder")
     config = runner.load_run_config(target)
