@@ -37,7 +37,7 @@ from mqe_jax.study.records import (
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
-from mqe_jax.train.policy import Policy, load_policy, save_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import load_run_config
 
 ROOT = Path(__file__).parents[1]
@@ -62,7 +62,7 @@ def run_of(seed: int, score: float, cell: Cell = CELL) -> Record:
     return Record(cell, seed, curve, {"evaluations": evaluations, "absolute": {"env_steps": 100_000, **point}}, 14285.7)
 
 
-def policy_of(seed: int, **network: Any) -> Policy:
+def policy_of(seed: int, **network: Any) -> TrainedPolicy:
     """A random policy of the paper's MAPPO or MAT with observation statistics."""
     config = override(TrainConfig(task=CELL.task, seed=seed), {"normalization": {"observations": True}, **network})
     built = config.network.build(DIMS)
@@ -71,7 +71,7 @@ def policy_of(seed: int, **network: Any) -> Policy:
     keys = jax.random.split(jax.random.PRNGKey(seed), len(leaves))
     moved = [x + 0.05 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
     statistics = running_init(DIMS.observation)._replace(samples=jnp.float32(4e7), mean=jnp.full(16, 0.123))
-    return Policy(
+    return TrainedPolicy(
         jax.tree.unflatten(structure, moved), statistics, DIMS, config, {"task": CELL.task, "env_steps": 100_000}
     )
 
@@ -103,7 +103,7 @@ def test_the_best_seeds_policy_is_published_once(tmp_path: Path, below: str) -> 
     assert publish_sweep.publish([sweep], target) == []
     folder = target / "policies" / CELL.path
     assert {path.name for path in folder.iterdir()} == {"policy.safetensors", "config.yaml"}
-    assert load_run_config(folder).seed == 1 and load_policy(folder).config.seed == 1
+    assert load_run_config(folder).seed == 1 and read_policy(folder).config.seed == 1
     assert len(read_records(target)) == 3
     before = tree(target)
     assert publish_sweep.publish([sweep], target) == [] and publish_sweep.publish([], target) == []
@@ -136,7 +136,7 @@ def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path, name: str) -> 
     policy = policy_of(0, **network)
     full, half = save_policy(tmp_path, policy, "full"), save_policy(tmp_path, policy, "half", half=True)
     assert half.stat().st_size < 0.62 * full.stat().st_size
-    loaded = load_policy(half)
+    loaded = read_policy(half)
     assert {x.dtype for x in jax.tree.leaves(loaded.params)} == {jnp.dtype("float32")}
     assert loaded.normalizer.samples == 4e7  # beyond float16's range
     obs = jax.random.normal(jax.random.PRNGKey(1), (64, 2, 16))
@@ -149,7 +149,7 @@ def test_weights_beyond_float16_are_refused(tmp_path: Path) -> None:
     policy = policy_of(0)
     huge = jax.tree.map(lambda x: 1e6 * jnp.ones_like(x), policy.params)
     with pytest.raises(NonFiniteError, match="holds NaN or infinite"):
-        save_policy(tmp_path, Policy(huge, policy.normalizer, DIMS, policy.config, {}), half=True)
+        save_policy(tmp_path, TrainedPolicy(huge, policy.normalizer, DIMS, policy.config, {}), half=True)
 
 
 def test_raw_data_keep_the_main_numbers(tmp_path: Path) -> None:
@@ -286,7 +286,7 @@ def test_published_policies_have_the_settings_of_their_part(tmp_path: Path) -> N
     for folder in folders:
         algorithm, _, setting = folder.name.partition("+")
         cell = Cell(folder.parent.name, algorithm, setting or paper.HIERARCHICAL)
-        policy = load_policy(folder)
+        policy = read_policy(folder)
         assert policy.config == load_run_config(folder) == configs[cell, policy.config.seed]
         metric = runs[cell, policy.config.seed].evaluation["absolute"]
         assert metric["env_steps"] == policy.metadata["env_steps"]

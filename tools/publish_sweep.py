@@ -27,7 +27,7 @@ from mqe_jax.files import write_atomically
 from mqe_jax.settings import to_mapping
 from mqe_jax.study.estimates import REWARD, absolute, group
 from mqe_jax.study.records import Cell, Record, read_records, write_record
-from mqe_jax.train.policy import POLICY_FILE, Policy, load_policy, save_policy
+from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import CONFIG_FILE, load_run_config
 
 POLICIES = ("*/mappo", "*/jrpo", "*/mat", "*+tuned")
@@ -94,7 +94,7 @@ def _publish_policy(record: Record, sweeps: Sequence[Path], folder: Path) -> boo
         ):
             if policy_file.is_file() and config_file.is_file():
                 folder.mkdir(parents=True, exist_ok=True)
-                policy = load_policy(policy_file)
+                policy = read_policy(policy_file)
                 if not _is_published(policy, folder / POLICY_FILE):
                     save_policy(folder, policy, half=True)
                 _write(folder / CONFIG_FILE, config_file.read_bytes())
@@ -102,10 +102,10 @@ def _publish_policy(record: Record, sweeps: Sequence[Path], folder: Path) -> boo
     return False
 
 
-def _is_published(policy: Policy, path: Path) -> bool:
+def _is_published(policy: TrainedPolicy, path: Path) -> bool:
     """Returns whether a file holds a policy, up to the rounding of its parameters to float16."""
     try:
-        old = load_policy(path)
+        old = read_policy(path)
     except InputError:
         return False
     rounded = jax.tree.map(lambda x: x.astype(jnp.float16).astype(x.dtype), policy.params)
