@@ -26,7 +26,8 @@ from mqe_jax.cli.options import (
     DumpDiverged,
     Impl,
     Json,
-    PlannerName,
+    OpponentName,
+    PolicyName,
     Repeated,
     Robot,
     Seed,
@@ -108,11 +109,8 @@ class Eval:
     robot: TaskRobot = None
     seed: Seed = 0
     deterministic: Deterministic = False
-    planner: PlannerName = None
-    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
-    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder of the policy. Default: the given run."""
+    policy: PolicyName = None
+    opponent: OpponentName = None
     set: Set = field(default_factory=list)
     dump_diverged: DumpDiverged = None
 
@@ -129,11 +127,8 @@ class Render:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .webp, .gif or .png."""
     json: Json = False
-    planner: PlannerName = None
-    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
-    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder of the policy. Default: the given run."""
+    policy: PolicyName = None
+    opponent: OpponentName = None
     best_of: int = 1
     """Number of episodes, of which the best is rendered (by success, then reward)."""
     seconds: float = 20.0

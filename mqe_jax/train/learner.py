@@ -31,7 +31,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, PyTree, Teams, Transition, VectorEnv, replace_fields, teams_of
+from mqe_jax.train.types import Batch, Params, Teams, TraceStep, Transition, VectorEnv, replace_fields, teams_of
 
 Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -81,10 +81,10 @@ def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     )
 
 
-def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], PyTree] | None = None) -> Learner:
+def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None = None) -> Learner:
     """Returns the learner of an environment.
 
-    With `snapshot` (see `Recorder`), the metrics of an update also hold `trace`, a `Trace` of the rollout.
+    With `trace_step` (`Recorder.trace`), the metrics of an update also hold `trace`, a `Trace` of the rollout.
 
     Raises:
         InputError: if the settings do not fit the environment.
@@ -138,7 +138,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], 
             config.rollout_steps,
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
-            snapshot=snapshot,
+            trace_step=trace_step,
         )
         batch, value_normalizer, batch_metrics = _prepare(network, config, dims.teams, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
@@ -168,6 +168,10 @@ def make_learner(env: VectorEnv, config: TrainConfig, snapshot: Callable[[Any], 
 
 def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
+    if len(teams_of(env)) > 1:
+        raise InputError(
+            f"env: {env.name} has {len(teams_of(env))} teams; give one: versus(env, opponents) or Mirror(env)"
+        )
     if env.num_envs != config.num_envs:
         fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
