@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from mqe_jax.cli.flags import given
 
 from mqe_jax.cli.arguments import Sweep, Train, parse
-from mqe_jax.cli.flags import given
 from mqe_jax.cli.setup import parse_overrides, train_config
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import override, to_mapping

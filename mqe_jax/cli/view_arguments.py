@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Control, Deterministic, Impl, Json, PlannerName, Seed, Set, TaskRobot, implementation
+from mqe_jax.cli.options import Control, Deterministic, Impl, Json, PlannerName, Seed, Set, TaskRobot
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,9 @@ class View:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("view").view(self)
+        from mqe_jax.cli import view
+
+        return view.view(self)
 
 
 @dataclass(frozen=True)
@@ -50,4 +52,6 @@ class Export:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("export").export(self)
+        from mqe_jax.cli import export
+
+        return export.export(self)
