@@ -75,9 +75,8 @@ def parse_train(arguments: Sequence[str]) -> Train:
         InputError: for a file, an algorithm or a network that is not allowed.
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
-    known = {"add_help": False, "return_unknown_args": True}
-    source, others = tyro.cli(Source, args=list(arguments), **known)
-    network, others = tyro.cli(Network, args=others, **known)
+    source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
+    network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
     task = next((word for word in others if word in tasks()), "")
     settings = base_config(task, source.config, source.algorithm)
     if network.name is not None and network.name != settings.network.name:
