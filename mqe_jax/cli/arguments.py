@@ -5,13 +5,6 @@ Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import functools
-import importlib
-import io
-import operator
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +26,6 @@ from mqe_jax.cli.options import (
     Seed,
     Set,
     TaskRobot,
-    implementation,
 )
 from mqe_jax.cli.view_arguments import Export, View
 from mqe_jax.errors import InputError, nearest
@@ -50,7 +42,6 @@ First steps:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "view", "export", "replay", "bench", "demo", "walk", "sweep", "report")
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
@@ -61,36 +52,9 @@ class Tasks:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().tasks(self)
+        from mqe_jax.cli import commands
 
-
-@dataclass(frozen=True)
-class Train:
-    """Train a policy on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
-
-    task: tyro.conf.Positional[str]
-    """Id of the task, such as go1gate (see `mqe tasks`)."""
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
-    settings of --algorithm if given, else the task's tuned settings, else the paper's MAPPO."""
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
-    run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Run folder. Default: runs/TASK."""
-    resume: bool = False
-    """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
-    num_seeds: int = 1
-    """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
-    --run-dir."""
-    impl: Impl = "auto"
-    control: Control = None
-    robot: TaskRobot = None
-    set: Set = field(default_factory=list)
-    dump_diverged: DumpDiverged = None
-    settings: Annotated[Any, tyro.conf.Suppress] = None
-
-    def run(self) -> dict[str, Any] | None:
-        return implementation().train(self)
+        return commands.tasks(self)
 
 
 @dataclass(frozen=True)
@@ -115,7 +79,9 @@ class Eval:
     dump_diverged: DumpDiverged = None
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().evaluate(self)
+        from mqe_jax.cli import commands
+
+        return commands.evaluate(self)
 
 
 @dataclass(frozen=True)
@@ -153,7 +119,9 @@ class Render:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().render(self)
+        from mqe_jax.cli import commands
+
+        return commands.render(self)
 
 
 @dataclass(frozen=True)
@@ -169,7 +137,9 @@ class Replay:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().replay(self)
+        from mqe_jax.cli import commands
+
+        return commands.replay(self)
 
 
 @dataclass(frozen=True)
@@ -194,7 +164,9 @@ class Bench:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().bench(self)
+        from mqe_jax.cli import commands
+
+        return commands.bench(self)
 
 
 @dataclass(frozen=True)
@@ -210,7 +182,9 @@ class Demo:
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("demo").demo(self)
+        from mqe_jax.cli import demo
+
+        return demo.demo(self)
 
 
 @dataclass(frozen=True)
@@ -232,7 +206,9 @@ class Sweep:
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("study_commands").sweep(self)
+        from mqe_jax.cli import study_commands
+
+        return study_commands.sweep(self)
 
 
 @dataclass(frozen=True)
@@ -246,7 +222,9 @@ class Report:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("study_commands").report(self)
+        from mqe_jax.cli import study_commands
+
+        return study_commands.report(self)
 
 
 @dataclass(frozen=True)
@@ -277,7 +255,9 @@ class WalkTrain:
     seed: Seed = 1
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("walk_commands").walk_train(self)
+        from mqe_jax.cli import walk_commands
+
+        return walk_commands.walk_train(self)
 
 
 @dataclass(frozen=True)
@@ -296,7 +276,9 @@ class WalkEval:
     seed: Seed = 0
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("walk_commands").walk_eval(self)
+        from mqe_jax.cli import walk_commands
+
+        return walk_commands.walk_eval(self)
 
 
 @dataclass(frozen=True)
@@ -314,7 +296,9 @@ class WalkConvert:
     robot: Robot = "go1"
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("walk_commands").walk_convert(self)
+        from mqe_jax.cli import walk_commands
+
+        return walk_commands.walk_convert(self)
 
 
 @dataclass(frozen=True)
@@ -331,61 +315,46 @@ class Walk:
         return self.action.run()
 
 
-def _parser(wanted: Sequence[str]) -> Any:
-    """Returns the union of all subcommands; training flags are included only for the `train` subcommand."""
-    train: Any = Train
-    if "train" in wanted[:1]:
-        flags = importlib.import_module("mqe_jax.cli.flags").train_flags()
-        settings = ("settings", Annotated[flags, tyro.conf.arg(name="")], field(default=flags()))
-        train = dataclasses.make_dataclass("Train", [settings], bases=(Train,), frozen=True)
-        train.__doc__ = Train.__doc__
-    subcommand = tyro.conf.subcommand
-    records: list[Any] = [
-        Annotated[Tasks, subcommand("tasks")],
-        Annotated[train, subcommand("train", description=Train.__doc__)],
-        Annotated[Eval, subcommand("eval")],
-        Annotated[Render, subcommand("render")],
-        Annotated[View, subcommand("view")],
-        Annotated[Export, subcommand("export")],
-        Annotated[Replay, subcommand("replay")],
-        Annotated[Bench, subcommand("bench")],
-        Annotated[Demo, subcommand("demo")],
-        Annotated[Walk, subcommand("walk")],
-        Annotated[Sweep, subcommand("sweep")],
-        Annotated[Report, subcommand("report")],
-    ]
-    return functools.reduce(operator.or_, records)
+COMMANDS: dict[str, Any] = {
+    "tasks": Tasks,
+    "train": None,
+    "eval": Eval,
+    "render": Render,
+    "view": View,
+    "export": Export,
+    "replay": Replay,
+    "bench": Bench,
+    "demo": Demo,
+    "walk": Walk,
+    "sweep": Sweep,
+    "report": Report,
+}
+"""Arguments by command; those of `train` are in `mqe_jax.cli.train_arguments`, which imports the trainer's settings."""
+TRAIN = "Train a policy on a task, into a run folder."
+
+
+def overview() -> str:
+    """Returns the text of `mqe --help`."""
+    about = {name: TRAIN if kind is None else kind.__doc__.splitlines()[0] for name, kind in COMMANDS.items()}
+    lines = "\n".join(f"  {name:8} {line}" for name, line in about.items())
+    return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """Parses the command line; help exits with 0, an invalid argument raises a one-line InputError."""
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        hint = nearest(arguments[0], COMMANDS)
-        raise InputError(f"unknown command {arguments[0]!r}{hint}; allowed: {', '.join(COMMANDS)}")
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            return tyro.cli(
-                _parser(arguments),
-                prog="mqe",
-                description="Multi-agent quadruped tasks in JAX on MuJoCo MJX.",
-                args=list(arguments),
-                config=MARKERS,
-            )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise InputError(one_line(errors.getvalue())) from None
+    """Parses the command line, whose first word is the command.
 
+    Raises:
+        InputError: for an unknown command.
+        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
+    """
+    name, rest = arguments[0], list(arguments[1:])
+    if name in ("-h", "--help"):
+        print(overview())
+        raise SystemExit(0)
+    if name not in COMMANDS:
+        raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
+    if name == "train":
+        from mqe_jax.cli.train_arguments import parse_train
 
-def one_line(box: str) -> str:
-    """Returns tyro's boxed message as one line without the frame."""
-    lines = [re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()]
-    kept = []
-    for line in lines:
-        if line.startswith("╭"):
-            continue
-        if line.startswith(("╰", "──", "━━")) or set(line) == {"─"}:
-            break
-        kept.append(line)
-    return " ".join(" ".join(kept).split()) or "the arguments cannot be read; see mqe --help"
+        return parse_train(rest)
+    return tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=MARKERS)

@@ -11,7 +11,7 @@ from typing import Any
 from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Report, Sweep
 from mqe_jax.cli.output import echo
-from mqe_jax.cli.setup import environments, train_config
+from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.study import report as reports
@@ -30,7 +30,7 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
 
     def config_of(task: str, algorithm: str) -> TrainConfig:
         name = settings.config and settings.config.replace("{task}", task)
-        return train_config(task, name, algorithm=algorithm)
+        return for_task(base_config(task, name, algorithm), task)
 
     jobs = sweeps.plan(settings, folder, config_of, arguments.cells)
     result = _estimate(folder, jobs)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
+import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.errors import InputError
@@ -146,11 +147,11 @@ class EvaluationSettings:
 class TrainConfig:
     """Settings of a training run; the defaults are the paper's MAPPO (arXiv 2403.16015, through OpenRL)."""
 
-    task: str | None = None
+    task: Annotated[str | None, tyro.conf.Suppress] = None
     """Id of the task."""
-    env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    env: Annotated[Mapping[str, Any], tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
     """Overrides of the task's parameters, passed to the environment unchanged."""
-    train_env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    train_env: Annotated[Mapping[str, Any], tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
     """Further overrides during training only, not in evaluation."""
     seed: Seed = 0
     """Random seed."""
