@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
-    from mqe_jax.train.policy import load_policy
+    from mqe_jax.opponents import versus
+    from mqe_jax.policies import load_policy
 
 __version__ = "0.1.0"
-__all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks"]
+__all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks", "versus"]
 
 
 def __getattr__(name: str) -> Any:
     # Heavy imports (JAX, MuJoCo) are deferred to keep `mqe --help` fast.
     if name not in __all__:
         raise AttributeError(f"module 'mqe_jax' has no attribute {name!r}")
-    home = "mqe_jax.train.policy" if name == "load_policy" else "mqe_jax.envs"
-    return getattr(importlib.import_module(home), name)
+    home = {"load_policy": "policies", "versus": "opponents"}.get(name, "envs")
+    return getattr(importlib.import_module(f"mqe_jax.{home}"), name)

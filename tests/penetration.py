@@ -26,10 +26,10 @@ import mujoco
 import numpy as np
 
 from mqe_jax import robots
-from mqe_jax.cli.players import against, planner
 from mqe_jax.collision import robot_bits
 from mqe_jax.envs import PLANNERS, TASKS, make
 from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.robots.robot import JOINTS, LEGS
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import build_terrain
@@ -113,9 +113,8 @@ def play(env: Any, opponent: str | None, episodes: int, seed: int) -> Played:
     """Runs episodes of the scripted policy; each environment contributes its first ones, as in an evaluation."""
     count = min(episodes, 64)
     quota = episodes // count + (np.arange(count) < episodes % count)
-    act = planner("scripted", env)
-    if opponent == "idle":
-        act = against(act, planner("idle", env), env)
+    scripted = load_policy("scripted", env)
+    policy = all_agents(env, scripted, None if opponent is None else load_policy(opponent, env))
 
     def one(state: Any, action: jax.Array) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
         state = env.step(state, action)
@@ -124,7 +123,7 @@ def play(env: Any, opponent: str | None, episodes: int, seed: int) -> Played:
     @jax.jit
     def run(state: Any, key: jax.Array) -> Any:
         def step(state: Any, key: jax.Array) -> Any:
-            return jax.vmap(one)(state, act(state.obs, (), key)[0])
+            return jax.vmap(one)(state, policy.act(state.obs, policy.initial_memory(count), key)[0])
 
         return jax.lax.scan(step, state, jax.random.split(key, 100))
 

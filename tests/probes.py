@@ -195,8 +195,8 @@ class Traces:
     def __init__(self) -> None:
         self.all: list[Trace] = []
 
-    def snapshot(self, env_state: Any) -> Any:
-        return env_state.hidden
+    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace:
+        return Trace(before.hidden, action, after.metrics["diverged"])
 
     def add(self, trace: Trace) -> None:
         self.all.append(trace)

@@ -16,13 +16,12 @@ from fake_env import FakeEnv, FakeVectorEnv
 import mqe_jax
 from mqe_jax import cli
 from mqe_jax.cli import arguments, commands, setup, view
-from mqe_jax.cli.players import Player
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError, NonFiniteError
+from mqe_jax.policies import load_policy
 from mqe_jax.train import checkpoint
 from mqe_jax.train.nn import mlp_init
-from mqe_jax.train.policy import load_policy
 from mqe_jax.viz import recording
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
@@ -106,14 +105,14 @@ def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest
 
 
 def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", "fake", "--json", "--planner", "forward", "--episodes", "2"]) == 0
+    assert cli.main(["eval", "fake", "--json", "--policy", "forward", "--episodes", "2"]) == 0
     result = json.loads(capfd.readouterr().out)
     assert result["success_rate"] == 1.0
     assert result["average_step_reward"] == pytest.approx(0.05)
 
 
 def test_dropped_contacts_are_counted_and_warned_of(capfd: pytest.CaptureFixture[str]) -> None:
-    command = ["eval", "fake", "--json", "--episodes", "2", "--planner"]
+    command = ["eval", "fake", "--json", "--episodes", "2", "--policy"]
     assert cli.main([*command, "forward"]) == 0  # two steps of each episode beyond x = 1.21 m
     out, err = capfd.readouterr()
     assert json.loads(out)["overflow"] == 4
@@ -128,7 +127,7 @@ def test_a_divergence_is_recorded_and_replayed(
 ) -> None:
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.19)  # in the tenth step of 0.02 s
     monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
-    task = ["go1gate", "--impl", "c", "--control", "position", "--planner", "random", "--json"]
+    task = ["go1gate", "--impl", "c", "--control", "position", "--policy", "random", "--json"]
     folder = ["--dump-diverged", str(tmp_path / "dump")]
     assert cli.main(["eval", *task, "--episodes", "2", "--num-envs", "2", *folder]) == 0
     out, err = capfd.readouterr()
@@ -239,30 +238,28 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
     command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run's sampled actions unless --deterministic is given; a task's scripted policy, forward without one."""
-    played: list[tuple[Any, bool]] = []
+    played: list[tuple[str, bool]] = []
 
-    def act(self: Player, env: Any, deterministic: bool) -> None:
-        played.append((self.policy, deterministic))
+    def load(source: str, env: Any, *, deterministic: bool) -> None:
+        played.append((source, deterministic))
         raise InputError("stop")
 
-    monkeypatch.setattr(Player, "act", act)
+    monkeypatch.setattr(commands, "load_policy", load)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)  # for the viewer's packages
     flags = {"render": ["-o", "clip.png"], "view": ["--port", "49876"]}.get(command, [])
     for target in (str(run_folder), "go1gate", "fake"):
         for more in ([], ["--deterministic"]):
             assert cli.main([command, target, *flags, *more]) == 2
     assert [deterministic for _, deterministic in played] == [False, True] * 3
-    assert not isinstance(played[0][0], str)
-    assert [policy for policy, _ in played[2::2]] == ["scripted", "forward"]
+    assert [policy for policy, _ in played[::2]] == [str(run_folder), "scripted", "forward"]
 
 
 def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
     env = FakeEnv()
-    player = Player("fake", {}, load_policy(run_folder))
     obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs
     for deterministic in (False, True):
-        act = player.act(env, deterministic)
-        one, two = (act(obs, player.memory(2), jax.random.PRNGKey(key))[0] for key in (1, 2))
+        policy = load_policy(run_folder, env, deterministic=deterministic)
+        one, two = (policy.act(obs, policy.initial_memory(2), jax.random.PRNGKey(key))[0] for key in (1, 2))
         assert bool((one == two).all()) is deterministic
 
 
@@ -283,11 +280,14 @@ BAD = {
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
     "environments": (["bench", "go1gate", "--num-envs", "0"], ["num_envs", "0"]),
     "episodes": (["eval", "fake", "--episodes", "0"], ["episodes", "0", "at least 1"]),
-    "planner": (["eval", "fake", "--planner", "randm"], ["'randm'", "random"]),
-    "no scripted planner": (["eval", "fake", "--planner", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
-    "joints of a planner": (["eval", "go1gate", "--control", "position"], ["'position'", "--planner random or idle"]),
-    "commands of a planner": (
-        ["eval", "go1gate", "--planner", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
+    "policy": (["eval", "fake", "--policy", "randm"], ["policy: unknown 'randm'", "random", "a run folder"]),
+    "policy's file": (["eval", "fake", "--policy", "runs/none"], ["runs/none", "no such file"]),
+    "opponent": (["eval", "go1tug", "--opponent", "randm"], ["opponent: unknown 'randm'", "random", "a run folder"]),
+    "opponent of no match": (["eval", "fake", "--opponent", "idle"], ["opponent: fake is not a competitive task"]),
+    "no scripted policy": (["eval", "fake", "--policy", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
+    "joints of scripted": (["eval", "go1gate", "--control", "position"], ["'position'", "--policy random or idle"]),
+    "commands of scripted": (
+        ["eval", "go1gate", "--policy", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
         ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],
     ),
     "robots": (["eval", "go1tug", "--set", "num_agents=3"], ["num_agents: 3", "go1tug requires 2 robots"]),
@@ -322,6 +322,13 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd:
     assert err.startswith("mqe: ") and err.count("\n") == 1, err
     assert all(word in err for word in said), err
     assert list(tmp_path.iterdir()) == []  # nothing half-written
+
+
+def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for flag in ("--policy", "--opponent"):
+        assert cli.main(["eval", "go1tug", flag, str(run_folder)]) == 2
+        err = capfd.readouterr().err
+        assert err.startswith(f"mqe: {flag[2:]}: ") and "was trained on fake, not on go1tug" in err
 
 
 def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -403,7 +410,7 @@ class Missing:
         if name.split(".")[0] == "warp":
             raise ModuleNotFoundError("No module named 'warp'")
 sys.meta_path.insert(0, Missing())
-from mqe_jax.physics import load_mjx
+from mqe_jax.engines.private import load_mjx
 print(load_mjx().__name__)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

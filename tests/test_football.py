@@ -368,7 +368,7 @@ def test_wrong_numbers_of_robots_are_named() -> None:
 
 
 def test_the_planner_dribbles_to_the_goal() -> None:
-    """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --planner scripted` measures many."""
+    """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --policy scripted` measures many."""
     env = make("go1football-1vs1", impl="c", num_envs=4)
     plan = jax.vmap(scripted_policy(env))
 

@@ -214,7 +214,7 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
 
 @pytest.mark.parametrize(("task", "share"), [("go1gate", 0.9), ("go1sheep-hard", 0.6)])
 def test_the_planner_wins(task: str, share: float) -> None:
-    """Through the walk policy, over a few episodes; `mqe eval TASK --planner scripted` measures many."""
+    """Through the walk policy, over a few episodes; `mqe eval TASK --policy scripted` measures many."""
     from mqe_jax.train.evaluate import evaluate
 
     batch = VectorEnv(make(task, impl="c", num_envs=16), 16)

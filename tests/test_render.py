@@ -11,8 +11,8 @@ import pytest
 from fake_env import FakeEnv
 from PIL import Image, ImageSequence
 
-from mqe_jax.cli.players import planner
 from mqe_jax.errors import InputError
+from mqe_jax.policies import load_policy
 from mqe_jax.viz import cameras, clips, geometry, gl, recording, render
 from tests.states import made, placed
 
@@ -24,7 +24,7 @@ def env() -> FakeEnv:
 
 @pytest.fixture(scope="module")
 def episode(env: FakeEnv) -> recording.Episode:
-    act = planner("forward", env)
+    act = load_policy("forward", env).act
     return recording.record(env, act, (), jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
 
 

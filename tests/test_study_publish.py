@@ -21,7 +21,7 @@ from mqe_jax.study.runs import REWARD, Cell, Run, table
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
-from mqe_jax.train.policy import Policy, load_policy, save_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -33,7 +33,7 @@ CELL = Cell("go1gate", "mappo", "tuned")
 DIMS = EnvDims(agents=2, observation=16, privileged=93, action=3, teams=((0, 1),), values=2)
 
 
-def policy_of(seed: int, **network: Any) -> Policy:
+def policy_of(seed: int, **network: Any) -> TrainedPolicy:
     """A random policy of the paper's MAPPO or MAT with observation statistics, after 100,000 steps."""
     settings = {"normalization": {"observations": True}, "evaluation": {"every": 1}, "total_steps": 100_000}
     config = override(TrainConfig(task=CELL.task, seed=seed), {**settings, **network})
@@ -45,7 +45,7 @@ def policy_of(seed: int, **network: Any) -> Policy:
     statistics = running_init(DIMS.observation)._replace(samples=jnp.float32(4e7), mean=jnp.full(16, 0.123))
     steps = config.num_updates * config.steps_per_update
     metadata = {"task": CELL.task, "env_steps": steps}
-    return Policy(jax.tree.unflatten(structure, moved), statistics, DIMS, config, metadata)
+    return TrainedPolicy(jax.tree.unflatten(structure, moved), statistics, DIMS, config, metadata)
 
 
 def make_sweep(folder: Path, scores: dict[int, float]) -> Path:
@@ -76,7 +76,7 @@ def test_runs_and_the_best_seeds_policy_are_published(tmp_path: Path) -> None:
     target = tmp_path / "published"
     assert publish.publish([make_sweep(tmp_path / "first", {0: 1.0, 1: 3.23456789})], target, ["*+tuned"]) == []
     file = target / "policies" / "go1gate" / "mappo+tuned.safetensors"
-    assert load_policy(file).config.seed == 1
+    assert read_policy(file).config.seed == 1
     run = publish.read_tables(target)[1]
     assert (run.cell, run.seed) == (CELL, 1) and list(run.curve) == ["env_steps", REWARD, "reward/goal"]
     (point,) = run.evaluations
@@ -86,8 +86,8 @@ def test_runs_and_the_best_seeds_policy_are_published(tmp_path: Path) -> None:
     assert publish.publish([], target, ["*"]) == [] and tree(target) == before
     later = make_sweep(tmp_path / "later", {3: 4.0})
     assert publish.publish([later], target, ["*/mat"]) == []
-    assert load_policy(file).config.seed == 1
-    assert publish.publish([later], target, ["*"]) == [] and load_policy(file).config.seed == 3
+    assert read_policy(file).config.seed == 1
+    assert publish.publish([later], target, ["*"]) == [] and read_policy(file).config.seed == 3
     assert [run.seed for run in publish.read_tables(target)] == [0, 1, 3]
     worse = make_sweep(tmp_path / "worse", {4: 0.5})
     assert publish.publish([worse], target, ["*"]) == ["go1gate/mappo+tuned/seed3"]
@@ -129,7 +129,7 @@ def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path, name: str) -> 
     policy = policy_of(0, **network)
     full, half = save_policy(tmp_path, policy, "full"), save_policy(tmp_path, policy, "half", half=True)
     assert half.stat().st_size < 0.62 * full.stat().st_size
-    loaded = load_policy(half)
+    loaded = read_policy(half)
     assert {x.dtype for x in jax.tree.leaves(loaded.params)} == {jnp.dtype("float32")}
     assert loaded.normalizer.samples == 4e7  # beyond float16's range
     obs = jax.random.normal(jax.random.PRNGKey(1), (64, 2, 16))
@@ -142,7 +142,7 @@ def test_weights_beyond_float16_are_refused(tmp_path: Path) -> None:
     policy = policy_of(0)
     huge = jax.tree.map(lambda x: 1e6 * jnp.ones_like(x), policy.params)
     with pytest.raises(NonFiniteError, match="holds NaN or infinite"):
-        save_policy(tmp_path, Policy(huge, policy.normalizer, DIMS, policy.config, {}), half=True)
+        save_policy(tmp_path, TrainedPolicy(huge, policy.normalizer, DIMS, policy.config, {}), half=True)
 
 
 def test_measurements_are_kept_by_name(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_every_published_run_belongs_to_a_sweep() -> None:
 
 @pytest.mark.parametrize("file", sorted(RESULTS.glob("policies/*/*.safetensors")), ids=lambda file: file.stem)
 def test_published_policies_are_the_best_of_their_cells(file: Path) -> None:
-    policy = load_policy(file)
+    policy = read_policy(file)
     cell = Cell.at(file.with_suffix(""))
     runs: list[Run] = [run for run in publish.read_tables(RESULTS) if run.cell == cell]
     best = max(runs, key=lambda run: (run.absolute or {})["sampled"][REWARD])

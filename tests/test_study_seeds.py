@@ -17,7 +17,7 @@ from mqe_jax.settings import build, override
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
-from mqe_jax.train.policy import load_policy
+from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 
 PROBE = Probe(probes.show_hidden, probes.pay_near_hidden, num_envs=4)
@@ -69,7 +69,7 @@ def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path) -> None:
     assert int(states[1].updates) == 4
     together = (folders[1] / "metrics.csv").read_text().splitlines()
     assert len(together) == len((tmp_path / "alone" / "metrics.csv").read_text().splitlines()) == 5
-    assert load_policy(folders[2]).metadata["env_steps"] == 64
+    assert read_policy(folders[2]).metadata["env_steps"] == 64
     longer = [override(config, {"total_steps": 80}) for config in configs]
     assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 5  # one seed resumes separately
 
@@ -116,7 +116,7 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
         best = max(record["evaluations"], key=lambda e: e["sampled"]["average_step_reward"])
         assert record["absolute"]["env_steps"] == best["env_steps"]
         (policy,) = (folder / "best").glob("*.safetensors")
-        assert load_policy(policy).metadata["env_steps"] == best["env_steps"]
+        assert read_policy(policy).metadata["env_steps"] == best["env_steps"]
         assert best["deterministic"]["average_step_reward"] != best["sampled"]["average_step_reward"]
 
 

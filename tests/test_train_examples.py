@@ -1,4 +1,4 @@
-"""The examples of a custom environment and a custom network, at a small size."""
+"""The examples of a custom environment, a custom network and self-play, at a small size."""
 
 from __future__ import annotations
 
@@ -35,3 +35,10 @@ def test_a_network_of_ones_own_is_trained() -> None:
     finally:
         NETWORKS.pop("mean_field")
     assert history[-1] < 0.6 * history[0]
+
+
+def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "self_play.py"))
+    results = example["main"](num_envs=4, updates=3, snapshot_every=2, episodes=4)
+    assert len(results) == 2
+    assert all(sum(result.match.values()) == pytest.approx(1.0) for result in results)

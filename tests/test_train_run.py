@@ -30,7 +30,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
-from mqe_jax.train.policy import Policy, load_policy, save_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
 from mqe_jax.viz.curves import draw_curve
 
@@ -235,7 +235,7 @@ def test_a_writer_that_fails_ends_the_training_and_names_its_file(
         elif writer == "step_000000000064" and row["updates"] == 4:
             limits.enter_context(largest_file(1000))
 
-    def save(run_dir: Path, policy: Policy) -> None:
+    def save(run_dir: Path, policy: TrainedPolicy) -> None:
         if writer == "policy.safetensors" and policy.metadata["env_steps"] == 80:
             limits.enter_context(largest_file(1000))
         save_policy(run_dir, policy)
@@ -249,7 +249,7 @@ def test_a_writer_that_fails_ends_the_training_and_names_its_file(
     monkeypatch.undo()
     assert_same(train(PROBE, settings(), tmp_path, resume=True), straight[1])
     assert [int(row["env_steps"]) for row in rows(tmp_path)] == [16, 32, 48, 64, 80]
-    assert load_policy(tmp_path).metadata["env_steps"] == 80
+    assert read_policy(tmp_path).metadata["env_steps"] == 80
 
 
 def test_a_curve_that_cannot_be_written_is_named(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path)
     assert len(logged) >= 1 and all(row["loss/value"] != "nan" for row in logged)
     newest = latest(tmp_path)
     assert newest is not None and int(newest.stem.removeprefix("step_")) <= int(logged[-1]["env_steps"])
-    load_policy(tmp_path)
+    read_policy(tmp_path)
 
 
 def spoil(path: Path, kind: str) -> None:
@@ -290,10 +290,10 @@ def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainStat
     spoil(newest, "checkpoint")
     spoil(run_dir / "policy.safetensors", "policy")
     with pytest.raises(InputError, match=r"policy.safetensors: .*weight holds NaN"):
-        load_policy(run_dir)
+        read_policy(run_dir)
     with pytest.raises(InputError, match=r"step_000000000080.safetensors: .*weight holds NaN"):
         train(PROBE, settings(), run_dir, resume=True)
-    policy = load_policy(straight[0])
+    policy = read_policy(straight[0])
     broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))
     with pytest.raises(NonFiniteError):
         save_policy(tmp_path, broken)
@@ -307,12 +307,13 @@ def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path: Path) -> Non
 
 def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState]) -> None:
     run_dir, _ = straight
-    policy = load_policy(run_dir)
+    policy = read_policy(run_dir)
     obs = np.zeros((3, 2, 3), np.float32)
     memory = policy.initial_memory(3)
     action, memory = policy.act(obs, memory, jax.random.PRNGKey(0))
     assert action.shape == (3, 2, 1) and float(jnp.abs(action).max()) <= 1.0
-    mean, _ = policy.act(obs, policy.initial_memory(3), deterministic=True)
+    quiet = dataclasses.replace(policy, deterministic=True)
+    mean, _ = quiet.act(obs, policy.initial_memory(3), jax.random.PRNGKey(0))
     single, single_memory = policy.act(obs[0], policy.initial_memory())
     np.testing.assert_allclose(mean[0], single, atol=1e-6)
     assert jax.tree.leaves(single_memory)[0].shape == (2, 4)
@@ -325,11 +326,11 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"policy.safetensors: no such file"):
-        load_policy(tmp_path)
+        read_policy(tmp_path)
     newest = latest(straight[0])
     assert newest is not None
     with pytest.raises(ValueError, match="holds a checkpoint; a policy is needed"):
-        load_policy(newest)
+        read_policy(newest)
 
 
 def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
@@ -340,7 +341,7 @@ def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
     # The environment gets unbounded samples, which it clips to what it allows.
     assert max(float(np.abs(trace.action).max()) for trace in training.all) > 1.0
     evaluate(
-        PROBE, load_policy(tmp_path).act, 4, KEY, memory=load_policy(tmp_path).initial_memory(4), recorder=evaluation
+        PROBE, read_policy(tmp_path).act, 4, KEY, memory=read_policy(tmp_path).initial_memory(4), recorder=evaluation
     )
     assert evaluation.all[0].snapshot.shape == (50, 4)
 

@@ -129,7 +129,7 @@ def test_cameras_follow_robots_and_the_ball() -> None:
         (["--port", "99999"], ("port", "99999", "65535")),
         (["--host", "192.0.2.1"], ("host", "192.0.2.1", "an address of this machine")),
         (["--host", "no such host"], ("host", "no such host", "an address of this machine")),
-        (["--planner", "scriptd"], ("planner", "scriptd", "scripted")),
+        (["--policy", "scriptd"], ("policy", "scriptd", "scripted")),
     ],
 )
 def test_bad_arguments_are_refused_in_a_line(arguments: list[str], words: tuple[str, ...], capsys: Any) -> None:

@@ -38,7 +38,7 @@ def viewer() -> Iterator[SimpleNamespace]:
     """A running `mqe view` of two idle robots."""
     pytest.importorskip("viser")
     port = free_port()
-    command = ["view", "go1gate", "--planner", "idle", "--port", str(port), "--set", "episode_length=600"]
+    command = ["view", "go1gate", "--policy", "idle", "--port", str(port), "--set", "episode_length=600"]
     command += ["--set", "end_on_collision=false"]
     # A shell starts background jobs with SIGINT ignored, which children inherit.
     program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from fake_env import FakeEnv, FakeVectorEnv
 
-from mqe_jax.cli.players import planner
+from mqe_jax.policies import load_policy
 from mqe_jax.view.session import Session
 
 CAMERA = {
@@ -43,7 +43,7 @@ class Driven(FakeEnv):
 
 
 def session(env: Any, num_envs: int = 2, name: str = "idle", **options: Any) -> Session:
-    return Session(env, FakeVectorEnv(env, num_envs), planner(name, env), (), **options)
+    return Session(env, FakeVectorEnv(env, num_envs), load_policy(name, env), **options)
 
 
 def free_port() -> int:

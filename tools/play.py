@@ -101,7 +101,7 @@ def export(run: Path, folder: Path) -> None:
     from mqe_jax.cli.setup import make_env
     from mqe_jax.export.policy import save_onnx, shapes, to_onnx
     from mqe_jax.export.scene import scene_settings, scene_xml
-    from mqe_jax.train.policy import load_policy
+    from mqe_jax.policies import load_policy
 
     policy = load_policy(run)
     task = policy.config.task

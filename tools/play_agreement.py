@@ -22,7 +22,7 @@ import numpy as np
 import play
 
 from mqe_jax.cli.setup import make_env
-from mqe_jax.train.policy import load_policy
+from mqe_jax.policies import load_policy
 
 CHECK = Path(__file__).with_name("play_check.mjs")
 STEPS = (1, 20)
@@ -42,7 +42,7 @@ def record(env: Any, policy: Any, count: int, steps: int) -> list[Rollout]:
         rollout: Rollout = {name: np.asarray(value, float).tolist() for name, value in start.items()}
         rollout |= {"targets": [], "states": []}
         for _ in range(steps):
-            action, _ = policy.act(state.obs, (), deterministic=True)
+            action, _ = policy.act(state.obs, ())
             state = step(state, action)
             rollout["targets"].append(np.asarray(state.data.ctrl, float)[env.index.actuator].tolist())
             rollout["states"].append((np.asarray(state.data.qpos, float), np.asarray(state.data.qvel, float)))

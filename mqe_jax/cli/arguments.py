@@ -26,7 +26,8 @@ from mqe_jax.cli.options import (
     DumpDiverged,
     Impl,
     Json,
-    PlannerName,
+    OpponentName,
+    PolicyName,
     Repeated,
     Robot,
     Seed,
@@ -108,11 +109,8 @@ class Eval:
     robot: TaskRobot = None
     seed: Seed = 0
     deterministic: Deterministic = False
-    planner: PlannerName = None
-    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
-    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder of the policy. Default: the given run."""
+    policy: PolicyName = None
+    opponent: OpponentName = None
     set: Set = field(default_factory=list)
     dump_diverged: DumpDiverged = None
 
@@ -129,11 +127,8 @@ class Render:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .webp, .gif or .png."""
     json: Json = False
-    planner: PlannerName = None
-    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
-    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder of the policy. Default: the given run."""
+    policy: PolicyName = None
+    opponent: OpponentName = None
     best_of: int = 1
     """Number of episodes, of which the best is rendered (by success, then reward)."""
     seconds: float = 20.0
@@ -259,27 +254,24 @@ class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
-    """Run folder: weights (rounded to float16), metrics.csv, checkpoints."""
+    """Run folder: walk.safetensors (rounded to float16), metrics.csv, checkpoints."""
     resume: bool = False
-    """Resume from the newest checkpoint in the run folder."""
+    """Continue from the newest checkpoint in the run folder, with environments reset."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to start from; may be those of another robot. Default: from scratch."""
     num_envs: int = 8192
     """Number of parallel environments."""
-    iterations: int = 1200
-    """PPO updates of 24 steps."""
-    max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Time limit, s; training stops there after saving a checkpoint."""
-    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Weights to fine-tune; may be those of another robot. Default: from scratch."""
-    initial_std: float = 1.0
-    """Initial standard deviation of the actions."""
-    curriculum: int = 400
-    """Curriculum length: iterations over which slopes, forces and pushes are ramped to their maxima."""
-    critic_warmup: int = 0
-    """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
-    symmetry: float = 0.5
-    """Coefficient of the loss of left-right symmetry; 0: none."""
-    anneal: float = 0.25
-    """Final fraction of training over which learning rate and entropy bonus are annealed linearly to zero."""
+    total_steps: int = 280_000_000
+    """Environment steps in all."""
+    set: Annotated[
+        list[str],
+        Repeated,
+        tyro.conf.arg(
+            name="set",
+            metavar="KEY=VALUE",
+            help="Setting of the training, such as network.symmetry_coef=1 (see docs/training.md); may be repeated.",
+        ),
+    ] = field(default_factory=list)
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1

@@ -14,18 +14,18 @@ from mqe_jax.cli import bench as benchmark
 from mqe_jax.cli.arguments import Bench, Eval, Render, Replay, Tasks, Train
 from mqe_jax.cli.flags import given
 from mqe_jax.cli.output import echo, print_table
-from mqe_jax.cli.players import PLANNER_NAMES, Player
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
 from mqe_jax.cli.view_arguments import View
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS
 from mqe_jax.envs import replay as recordings
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.errors import InputError
+from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.settings import fail, override
 from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest
-from mqe_jax.train.policy import load_policy
+from mqe_jax.train.policy import Policy
 from mqe_jax.viz import curves, recording
 from mqe_jax.viz import render as rendering
 from mqe_jax.viz.clips import check_output
@@ -36,29 +36,29 @@ def is_run(target: str) -> bool:
     return os.sep in target or Path(target).exists()
 
 
-def find_player(arguments: Eval | Render | View) -> Player:
-    """Returns the player selected by RUN|TASK, --policy and --planner.
+def task_and_policy(arguments: Eval | Render | View) -> tuple[str, dict[str, Any], str]:
+    """Returns the task of RUN|TASK, its parameters, and the policy's name or path.
 
-    A task without either has its scripted policy, or forward if it has none.
+    A run has its own policy, a task its scripted one, or forward if it has none.
     """
     target = arguments.target
-    if arguments.planner is not None and arguments.policy is not None:
-        raise InputError("planner: give --planner or --policy, not both")
-    for flag, name, allowed in (
-        ("planner", arguments.planner, PLANNER_NAMES),
-        ("opponent", arguments.opponent, (*PLANNER_NAMES, "self")),
-    ):
-        if name is not None and name not in allowed:
-            raise InputError(f"{flag}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}")
-    task, overrides, run = ALIASES.get(target, target), _overrides(arguments), arguments.policy
     if is_run(target):
         config = _run_config(target)
-        task, overrides = config.task, {**config.env, **overrides}
-        run = Path(target) if run is None and arguments.planner is None else run
-    if run is not None:
-        return Player(task, overrides, load_policy(run), arguments.opponent)
-    default = "scripted" if task in PLANNERS else "forward"
-    return Player(task, overrides, arguments.planner or default, arguments.opponent)
+        return config.task, {**config.env, **_overrides(arguments)}, arguments.policy or target
+    task = ALIASES.get(target, target)
+    return task, _overrides(arguments), arguments.policy or ("scripted" if task in PLANNERS else "forward")
+
+
+def team_policies(arguments: Eval | Render | View, policy: str, env: Any) -> Policy:
+    """Returns the policy of all agents: `policy`, and in a match that of --opponent."""
+    deterministic = arguments.deterministic
+    own, opponent = load_policy(policy, env, deterministic=deterministic), None
+    if arguments.opponent is not None:
+        try:
+            opponent = load_policy(arguments.opponent, env, deterministic=deterministic)
+        except InputError as error:
+            raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
+    return all_agents(env, own, opponent)
 
 
 def _overrides(arguments: Train | Eval | Render | View | Bench) -> dict[str, Any]:
@@ -147,16 +147,17 @@ def evaluate(arguments: Eval) -> dict[str, Any]:
     """Evaluates a policy; prints a table, or returns the object for `--json`."""
     if arguments.episodes < 1:
         fail("episodes", arguments.episodes, "at least 1")
-    player = find_player(arguments)
+    task, overrides, name = task_and_policy(arguments)
     num_envs = min(arguments.num_envs, arguments.episodes)
-    env, vector_env = make_env(player.task, arguments.impl, player.overrides, num_envs)
+    env, vector_env = make_env(task, arguments.impl, overrides, num_envs)
+    policy = team_policies(arguments, name, env)
     recorder = _recorder(env, arguments.dump_diverged)
     result = evaluation.evaluate(
         vector_env,
-        player.act(env, arguments.deterministic),
+        policy.act,
         arguments.episodes,
         jax.random.PRNGKey(arguments.seed),
-        memory=player.memory(num_envs),
+        memory=policy.initial_memory(num_envs),
         recorder=recorder,
     )
     _echo_recorded(recorder)
@@ -209,16 +210,15 @@ def render(arguments: Render) -> dict[str, Any]:
     if arguments.at is not None and not arguments.at >= 0:
         fail("at", arguments.at, "at least 0")
     check_output(arguments.output)
-    player = find_player(arguments)
-    env, _ = make_env(player.task, arguments.impl, player.overrides, arguments.best_of)
+    task, overrides, name = task_and_policy(arguments)
+    env, _ = make_env(task, arguments.impl, overrides, arguments.best_of)
     result = draw(
         env,
-        player,
+        team_policies(arguments, name, env),
         arguments.output,
         seed=arguments.seed,
         episodes=arguments.best_of,
         seconds=arguments.seconds,
-        deterministic=arguments.deterministic,
         size=None if arguments.width is None else (arguments.width, round(arguments.width * 9 / 32) * 2),
         fps=arguments.fps,
         view=arguments.view,
@@ -226,31 +226,30 @@ def render(arguments: Render) -> dict[str, Any]:
         at=arguments.at,
     )
     echo(f"mqe: wrote {arguments.output} ({result['renderer']})")
-    return {"task": player.task, **result}
+    return {"task": task, **result}
 
 
 def draw(
     env: Any,
-    player: Player,
+    policy: Policy,
     path: Path,
     *,
     seed: int,
     episodes: int = 1,
     seconds: float = 20.0,
-    deterministic: bool = False,
     size: tuple[int, int] | None = None,
     fps: float | None = None,
     view: str | None = None,
     speed: float = 1.0,
     at: float | None = None,
 ) -> dict[str, Any]:
-    """Runs `episodes` episodes and renders the best one.
+    """Runs `episodes` episodes of a policy of all agents and renders the best one.
 
     Returns the name of the renderer, the index of the rendered episode, and each episode's success, average step reward
     and length (s).
     """
-    act, memory = player.act(env, deterministic), player.memory(episodes)
-    recorded = recording.record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
+    memory = policy.initial_memory(episodes)
+    recorded = recording.record(env, policy.act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
     best = recording.best(recorded)
     renderer = rendering.render_episode(env, best, path, size=size, fps=fps, view=view, speed=speed, at=at)
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from collections.abc import Mapping
@@ -13,15 +14,15 @@ from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Demo
 from mqe_jax.cli.commands import draw
 from mqe_jax.cli.output import echo
-from mqe_jax.cli.players import Player
 from mqe_jax.cli.setup import make_env, train_config
 from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.train import evaluate as evaluation
-from mqe_jax.train import policy, runner
+from mqe_jax.train import runner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy
 from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
 from mqe_jax.viz.clips import check_output
@@ -41,14 +42,14 @@ def demo(arguments: Demo) -> None:
 
     untrained = make_learner(vector_env, config)
     state = jax.jit(untrained.init)(initial_key(config))
-    before = policy.policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
+    before = policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
     del state
     echo("mqe demo: evaluating the untrained policy")
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
     with interrupts.before_exit(lambda: "the same command resumes from here"):
         runner.train(training_env, config, run_dir, resume=True)
-    after = policy.load_policy(run_dir)
+    after = read_policy(run_dir)
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
     curves.draw_curve([run_dir], run_dir / "curve.png", DEMO_TASK, "Narrow Gate, trained on the CPU")
@@ -60,11 +61,10 @@ def demo(arguments: Demo) -> None:
     echo("mqe demo: rendering an episode")
     draw(
         env,
-        Player(DEMO_TASK, dict(config.env), after),
+        dataclasses.replace(after, deterministic=True),
         video,
         seed=config.seed + 1,
         episodes=16,
-        deterministic=True,
         size=(640, 360),
     )
     print(f"before training: {_summary(table['before'])}")
@@ -74,13 +74,10 @@ def demo(arguments: Demo) -> None:
     print(f"took {minutes:.1f} minutes; evaluate it again with: mqe eval {run_dir} --deterministic")
 
 
-def _measure(env: VectorEnv, policy: policy.Policy, episodes: int, config: TrainConfig) -> dict[str, Any]:
+def _measure(env: VectorEnv, policy: TrainedPolicy, episodes: int, config: TrainConfig) -> dict[str, Any]:
     """Evaluates a policy with its mean actions."""
-
-    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        return policy.act(obs, memory, key, deterministic=True)
-
     memory = policy.initial_memory(env.num_envs)
+    act = dataclasses.replace(policy, deterministic=True).act
     key = jax.random.PRNGKey(config.seed + 1000)
     return evaluation.evaluate(env, act, episodes, key, memory=memory).to_dict()
 

@@ -9,7 +9,7 @@ from mqe_jax.cli.output import echo, print_table
 from mqe_jax.cli.setup import make_env
 from mqe_jax.cli.view_arguments import Export
 from mqe_jax.errors import InputError
-from mqe_jax.train.policy import load_policy
+from mqe_jax.policies import load_policy
 
 STEPS = 100
 """Steps of the episodes on which the graph is compared with JAX."""

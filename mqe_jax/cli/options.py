@@ -50,13 +50,18 @@ Control = Annotated[
         "Default: command, or the run's mode.",
     ),
 ]
-PlannerName = Annotated[
+PolicyName = Annotated[
     str | None,
     tyro.conf.arg(
-        metavar="NAME",
-        help="Policy in place of a trained one: scripted (hand-written for the task), random, idle (zero commands), "
-        "forward (straight on at half speed). Default for a task: scripted if it has one, else forward.",
+        metavar="NAME|RUN|FILE",
+        help="Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half "
+        "speed), a run folder, or a policy file. Default: that of the given run; of a task: scripted if it has one, "
+        "else forward.",
     ),
+]
+OpponentName = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="NAME|RUN|FILE", help="Policy of team 1 in a match: what --policy accepts. Default: idle."),
 ]
 Deterministic = Annotated[
     bool,

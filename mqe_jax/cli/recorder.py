@@ -11,6 +11,7 @@ import numpy as np
 
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.files import check_folder
+from mqe_jax.opponents import TeamState
 from mqe_jax.train.types import Trace
 
 STEPS = 64
@@ -31,9 +32,11 @@ class DivergenceRecorder:
         self._env, self._folder = env, folder
         self._previous: Trace | None = None
 
-    def snapshot(self, env_state: Any) -> Any:
-        """Returns the fields on which a step depends, of all environments (N, ...)."""
-        return content(env_state)
+    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace:
+        """Returns the fields on which a step of all environments depends, and all agents' actions."""
+        if isinstance(after, TeamState):
+            before, action, after = before.match, after.action, after.match
+        return Trace(content(before), action, after.metrics["diverged"])
 
     def add(self, trace: Trace) -> None:
         """Writes a recording of each environment that diverged in a trace, with steps of the previous one if needed."""

@@ -11,9 +11,10 @@ import jax
 import yaml
 
 from mqe_jax.cli.output import echo
-from mqe_jax.envs import VectorEnv, make
+from mqe_jax.envs import PLANNERS, VectorEnv, make
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import override
+from mqe_jax.opponents import Mirror, versus
+from mqe_jax.settings import fail, override
 from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig, load_config
 
@@ -49,13 +50,28 @@ def make_env(
     return env, VectorEnv(env, num_envs, copies)
 
 
-def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[VectorEnv, VectorEnv | None]:
-    """Returns training and evaluation environments (None without evaluation) of seeds trained together."""
-    task = config.task or ""
-    _, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
-    if config.evaluation.every is None:
-        return env, None
-    return env, make_env(task, impl, config.env, config.evaluation.episodes, 2 * seeds)[1]
+def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
+    """Returns training and evaluation environments (None without evaluation) of seeds trained together.
+
+    In a match both teams of each of `num_envs` / 2 matches are environments of the policy; it is evaluated as team 0
+    against the scripted policy, or an idle team where that one does not fit.
+    """
+    task, episodes = config.task or "", config.evaluation.episodes
+    both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    eval_env = None
+    if config.evaluation.every is not None:
+        _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
+    if len(both.teams) < 2:
+        return env, eval_env
+    if config.num_envs % 2:
+        fail("num_envs", config.num_envs, "even: both teams of a match are environments")
+    mirror = Mirror(VectorEnv(both, config.num_envs // 2, seeds))
+    return mirror, None if eval_env is None else versus(eval_env, [_reference(eval_env.env)])
+
+
+def _reference(env: Any) -> str:
+    """Returns the name of the opponent against which policies are evaluated during training."""
+    return "scripted" if env.name in PLANNERS and env.control == "command" else "idle"
 
 
 def platform() -> str:

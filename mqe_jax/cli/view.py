@@ -6,7 +6,7 @@ import errno
 import importlib.util
 import socket
 
-from mqe_jax.cli.commands import find_player
+from mqe_jax.cli.commands import task_and_policy, team_policies
 from mqe_jax.cli.output import echo
 from mqe_jax.cli.setup import make_env
 from mqe_jax.cli.view_arguments import View
@@ -25,14 +25,14 @@ def view(arguments: View) -> None:
     if not 0 < arguments.port < 65536:
         fail("port", arguments.port, "between 1 and 65535")
     _check_address(arguments.host, arguments.port)
-    player = find_player(arguments)
-    env, vector_env = make_env(player.task, arguments.impl, player.overrides, arguments.num_envs)
-    act, memory = player.act(env, arguments.deterministic), player.memory(arguments.num_envs)
+    task, overrides, name = task_and_policy(arguments)
+    env, vector_env = make_env(task, arguments.impl, overrides, arguments.num_envs)
+    policy = team_policies(arguments, name, env)
 
     from mqe_jax.view.session import Session
     from mqe_jax.view.viewer import Viewer
 
-    viewer = Viewer(Session(env, vector_env, act, memory, arguments.seed), arguments.host, arguments.port)
+    viewer = Viewer(Session(env, vector_env, policy, arguments.seed), arguments.host, arguments.port)
     if arguments.host not in _LOCAL:
         echo(f"mqe: warning: every machine that reaches {arguments.host} can open this page and control the robots")
     echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")

@@ -8,7 +8,18 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Control, Deterministic, Impl, Json, PlannerName, Seed, Set, TaskRobot, implementation
+from mqe_jax.cli.options import (
+    Control,
+    Deterministic,
+    Impl,
+    Json,
+    OpponentName,
+    PolicyName,
+    Seed,
+    Set,
+    TaskRobot,
+    implementation,
+)
 
 
 @dataclass(frozen=True)
@@ -17,11 +28,8 @@ class View:
 
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
     """Id of a task, or run folder."""
-    planner: PlannerName = None
-    opponent: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Policy of team 1 in a match: scripted, random, idle, forward, or self (the same as team 0). Default: idle."""
-    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder of the policy. Default: the given run."""
+    policy: PolicyName = None
+    opponent: OpponentName = None
     num_envs: int = 1
     """Number of environments, side by side: 1 to 16."""
     host: str = "127.0.0.1"

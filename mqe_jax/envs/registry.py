@@ -12,7 +12,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.errors import InputError
 
 Planner = Callable[[dict[str, jax.Array]], jax.Array]
-"""Scripted policy: one environment's observation blocks by name -> actions (A, 3) in the `command` mode."""
+"""Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the `command` mode."""
 
 # The task, as MODULE:CLASS of mqe_jax.envs, and its scripted policy, as MODULE:FUNCTION of mqe_jax.planners or none.
 _SHIPPED: tuple[tuple[str, str | None], ...] = (

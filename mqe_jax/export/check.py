@@ -10,13 +10,16 @@ import numpy as np
 import onnx
 
 from mqe_jax.export.policy import input_shapes, policy_step
-from mqe_jax.train.policy import Policy
+from mqe_jax.train.policy import TrainedPolicy
 
 Arrays = dict[str, np.ndarray]
 
 
-def record(policy: Policy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
-    """Plays episodes with the mean actions; returns inputs and outputs of `policy_step` by name, leading axis T."""
+def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
+    """Returns inputs and outputs of `policy_step` by name, leading axis T, of episodes with mean actions.
+
+    The opponents of a match are idle.
+    """
     shapes = input_shapes(policy, env)
 
     @jax.jit
@@ -24,9 +27,10 @@ def record(policy: Policy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
         now = env.read(state.data)
         sensed = {"gravity": now.projected_gravity, "joint_position": now.joint_position}
         sensed |= {"joint_velocity": now.joint_velocity, "obs": state.obs}
-        inputs = {name: x[None, : env.num_agents] for name, x in sensed.items() if name in shapes} | memory
+        inputs = {name: x[None, : policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
-        return inputs, outputs, env.step(state, outputs["action"][0])
+        action = jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"][0])
+        return inputs, outputs, env.step(state, action)
 
     @jax.jit
     def start(key: jax.Array) -> tuple[Any, Any]:

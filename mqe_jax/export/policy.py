@@ -1,8 +1,7 @@
 """A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, walk policy.
 
 Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
-the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in
-that frame, commands and joint targets are in the robots' frame.
+the input `X` of the next step. Of a match, the graph is that of team 0.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
@@ -33,48 +32,44 @@ from mqe_jax.errors import InputError
 from mqe_jax.export.graph import OPSET
 from mqe_jax.export.translate import translate
 from mqe_jax.files import write_atomically
+from mqe_jax.policies import check_policy
 from mqe_jax.robots.robot import NUM_JOINTS
-from mqe_jax.train.policy import Policy
+from mqe_jax.train.policy import TrainedPolicy
 
 
-def to_onnx(policy: Policy, env: Any) -> onnx.ModelProto:
+def to_onnx(policy: TrainedPolicy, env: Any) -> onnx.ModelProto:
     """Returns the graph of a policy on its task, which defines control mode, robot and walk policy.
 
     Raises:
-        InputError: for a task whose sizes differ from the policy's, or a network with an operation that has no
-            translation.
+        InputError: for another task than the policy's, or a network with an operation that has no translation.
     """
-    sizes = (env.num_agents, env.observation_size, env.action_size)
-    trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
-    if sizes != trained:
-        raise InputError(f"policy: trained for (agents, observation, action) {trained}, but {env.name} has {sizes}")
+    check_policy(policy, env)
     step = functools.partial(policy_step, policy, env)
     return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
 
 
-def input_shapes(policy: Policy, env: Any) -> dict[str, tuple[int, ...]]:
+def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
         robots |= {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
         robots |= {"walk_history": (walk_policy.HISTORY, walk_policy.OBSERVATION_SIZE), "walk_gait": (1,)}
         robots |= {"walk_action": (NUM_JOINTS,), "walk_previous_action": (NUM_JOINTS,)}
-    shapes = {name: (env.num_agents, *shape) for name, shape in robots.items()}
+    shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
     return shapes | {name: x.shape for name, x in _network_memory(policy.initial_memory()).items()}
 
 
-def policy_step(policy: Policy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the outputs of one step by name, the function that the graph evaluates."""
     names = _network_memory(policy.initial_memory())
     memory = jax.tree.unflatten(jax.tree.structure(policy.initial_memory()), [inputs[name] for name in names])
-    action, memory = policy.act(inputs["obs"], memory, deterministic=True)
-    own = jax.vmap(env.unmirror_action)(action)
+    action, memory = policy.act(inputs["obs"], memory)
     outputs = {"action": action} | {f"next_{name}": x for name, x in _network_memory(memory).items()}
     if env.control == "torque":
-        return outputs | {"torque": own * env.robot.torque_limit}
+        return outputs | {"torque": action * env.robot.torque_limit}
     if env.control == "position":
-        return outputs | {"joint_target": walk_policy.joint_targets(env.robot, own, env.params.position_scale)}
-    return outputs | _walk(env, own, inputs)
+        return outputs | {"joint_target": walk_policy.joint_targets(env.robot, action, env.params.position_scale)}
+    return outputs | _walk(env, action, inputs)
 
 
 def _network_memory(memory: Any) -> dict[str, Any]:
@@ -120,7 +115,7 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
 
 
-def _properties(policy: Policy, env: Any) -> dict[str, str]:
+def _properties(policy: TrainedPolicy, env: Any) -> dict[str, str]:
     """Returns the metadata of the model as strings, JSON-encoded where structured."""
     layout = [[block.name, block.width, block.meaning] for block in env.observation_layout.blocks]
     return {

@@ -1,4 +1,4 @@
-"""Scripted policies (`--planner scripted`), one per task, with the observations and actions of a learned policy."""
+"""Scripted policies (`--policy scripted`), one per task, with the observations and actions of a learned policy."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from mqe_jax.errors import InputError
 
 
 def planner_of(task: str) -> Planner:
-    """Returns a task's scripted policy: one environment's observation blocks by name -> its actions (A, 3).
+    """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its actions (A, 3).
 
     Raises:
         InputError: if the task has none.
     """
     if task not in PLANNERS:
-        raise InputError(f"planner: {task} has no scripted policy; allowed for: {', '.join(PLANNERS)}")
+        raise InputError(f"policy: {task} has no scripted policy; allowed for: {', '.join(PLANNERS)}")
     planner = PLANNERS[task]
     return load("mqe_jax.planners", planner) if isinstance(planner, str) else planner
 
 
 def scripted_policy(env: QuadrupedEnv) -> Callable[[jax.Array], jax.Array]:
-    """Returns the scripted policy of a task, from one environment's observations (A, O) to its actions (A, 3).
+    """Returns the scripted policy of a task, from the observations (A, O) of one team to its actions (A, 3).
 
     Raises:
         InputError: if the task has none.

@@ -15,7 +15,7 @@ _REST = (7.6, 0.6)  # m, x and |y| of the goal on the far platform, on the side 
 
 
 def plan_bridge(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3), each in its own frame."""
+    """Returns the robot's action (1, 3) in its own frame."""
     (position, yaw), opponent = pose(obs["base"]), obs["opponent"][:, :2]
     x, y = position.T
     middle = jnp.where(opponent[:, 0] - x < _NEAR, jnp.clip(opponent[:, 1], -_MAX_AIM, _MAX_AIM), 0.0)

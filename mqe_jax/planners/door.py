@@ -11,9 +11,9 @@ _LANE = -0.62  # m, y: a long lever about the hinge, clear of the wall
 
 
 def plan_revolving_door(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3), each in its own frame."""
+    """Returns the robot's action (1, 3) in its own frame."""
     position, yaw = pose(obs["base"])
     in_lane = jnp.abs(position[:, 1] - _LANE) < 0.15
     through = position[:, 0] > 2.4
     ahead = jnp.where(in_lane | through | (position[:, 0] < 1.6), position[:, 0] + 1.5, 1.7)
-    return go_to(position, yaw, jnp.stack([ahead, jnp.full(2, _LANE)], axis=-1))
+    return go_to(position, yaw, jnp.stack([ahead, jnp.full_like(ahead, _LANE)], axis=-1))

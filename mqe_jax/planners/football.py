@@ -43,14 +43,14 @@ def plan_defender(obs: Observation) -> jax.Array:
 
 
 def plan_1vs1(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3), each in its own frame."""
-    far_teammate = jnp.full((2, 6), 1e3)
+    """Returns the robot's action (1, 3) in its own frame."""
+    far_teammate = jnp.full_like(obs["base"], 1e3)
     opponents = obs["opponents"][:, None, :2]
     return jax.vmap(_play)(obs["base"], far_teammate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
 def plan_2vs2(obs: Observation) -> jax.Array:
-    """Returns all robots' actions (4, 3), each in its own frame."""
+    """Returns both robots' actions (2, 3) in their team's frame."""
     opponents = obs["opponents"].reshape(-1, 2, 6)[..., :2]
     return jax.vmap(_play)(obs["base"], obs["teammate"], opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 

@@ -14,7 +14,7 @@ _EXCESS = 0.4  # m/s, goal speed of a pushing robot relative to the cylinder
 
 
 def plan_tug(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3), each in its own frame."""
+    """Returns the robot's action (1, 3) in its own frame."""
     (position, yaw), (cylinder, speed) = pose(obs["base"]), obs["cylinder"].T
     x, y = position.T
     # Align first: a robot that pushes off-axis slides along the cylinder.
@@ -22,5 +22,5 @@ def plan_tug(obs: Observation) -> jax.Array:
     # Full speed against a blocked cylinder deflects the robot and tips it over.
     push = jnp.minimum(cylinder, y + (jnp.maximum(speed, 0.0) + _EXCESS) / GAIN)
     ahead = jnp.where(jnp.abs(x - _AXIS_X) < _ALIGNED, push, before)
-    goal = jnp.stack([jnp.full(2, _AXIS_X), ahead], axis=-1)
+    goal = jnp.stack([jnp.full_like(ahead, _AXIS_X), ahead], axis=-1)
     return go_to(position, yaw, goal, jnp.pi / 2)

@@ -14,7 +14,7 @@ _EDGE = (1.5, 1.64)  # m, range of the distance from the centre at which the rob
 
 
 def plan_wrestling(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3), each in its own frame."""
+    """Returns the robot's action (1, 3) in its own frame."""
     (position, yaw), opponent = pose(obs["base"]), obs["opponent"][:, :2]
     far = jnp.linalg.norm(opponent - _CENTER, axis=-1)
     outward = (opponent - _CENTER) / jnp.maximum(far, 1e-3)[:, None]

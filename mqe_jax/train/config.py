@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import (
@@ -63,6 +63,8 @@ class PPO:
     do not dominate; none disables it."""
     advantage_clip_until: Positive = 1.0
     """Fraction of training during which `advantage_clip` applies."""
+    critic_warmup: Fraction = 0.0
+    """Initial fraction of training in which only the critic is trained, for a policy that starts from weights."""
 
 
 @record
@@ -72,9 +74,12 @@ class OptimizerSettings:
     learning_rate: Positive = 7e-4
     """Learning rate of actor and critic."""
     schedule: Literal["constant", "linear"] = "constant"
-    """Learning-rate schedule: constant, or linear to zero over the run."""
+    """Learning-rate schedule: constant, or linear to zero at the end of the run."""
+    anneal: Annotated[float, Gt(0), Le(1)] = 1.0
+    """Final fraction of the run over which the linear schedule falls."""
     target_kl: Positive | None = None
-    """Target KL divergence per minibatch of the adaptive learning rate; none uses the schedule alone."""
+    """Target KL divergence per minibatch of the adaptive learning rate, which does not rise while the schedule falls;
+    none uses the schedule alone."""
     eps: Positive = 1e-5
     """Adam's epsilon."""
     max_grad_norm: Positive | None = 10.0

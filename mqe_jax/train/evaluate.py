@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
-from mqe_jax.train.types import Memory, PyTree, Recorder, Trace, VectorEnv, join_traces, teams_of
+from mqe_jax.train.types import Memory, Recorder, TraceStep, VectorEnv, join_traces, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
@@ -122,17 +122,17 @@ class Evaluator:
         recorder: Recorder | None = None,
     ) -> None:
         self._env, self._block, self._max_steps, self._recorder = env, block, max_steps, recorder
-        snapshot = None if recorder is None else recorder.snapshot
+        trace_step = None if recorder is None else recorder.trace
 
         def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
             def own_act(obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
                 return act(params, obs, memory, key)
 
-            return _run_block(env, own_act, progress, key, memory, quota, block, snapshot)
+            return _run_block(env, own_act, progress, key, memory, quota, block, trace_step)
 
         def run(progress: _Progress, params: Any, keys: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
             progress, traces = jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
-            return progress, None if snapshot is None else join_traces(traces)
+            return progress, None if trace_step is None else join_traces(traces)
 
         self._begin = jax.jit(jax.vmap(lambda key: _begin(env, key, memory)))
         self._run = jax.jit(run)
@@ -175,7 +175,7 @@ def _run_block(
     initial_memory: Memory,
     quota: jax.Array,
     block: int,
-    snapshot: Callable[[Any], PyTree] | None,
+    trace_step: TraceStep | None,
 ) -> tuple[_Progress, Any]:
     own = np.array(teams_of(env)[0])
 
@@ -184,7 +184,7 @@ def _run_block(
         state = env.step(p.env_state, action)
         done = state.terminated | state.truncated
         counted = p.finished < quota
-        trace = () if snapshot is None else Trace(snapshot(p.env_state), action, state.metrics["diverged"])
+        trace = () if trace_step is None else trace_step(p.env_state, action, state)
 
         def restart(now: jax.Array, at_start: jax.Array) -> jax.Array:
             return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), at_start, now)

@@ -22,8 +22,7 @@ from mqe_jax.files import write_atomically
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import EvalResult, Evaluator
 from mqe_jax.train.learner import env_dims
-from mqe_jax.train.normalize import running_normalize
-from mqe_jax.train.policy import Policy, load_policy, save_policy
+from mqe_jax.train.policy import TrainedPolicy, policy_act, read_policy, save_policy
 from mqe_jax.train.types import Memory, VectorEnv
 
 EVALUATIONS_FILE = "evaluations.json"
@@ -41,24 +40,22 @@ class Monitor:
             raise InputError(
                 f"evaluation.episodes: {config.evaluation.episodes} must equal the env's num_envs, {env.num_envs}"
             )
-        network = config.network.build(env_dims(env, config))
+        dims = env_dims(env, config)
+        act_of = policy_act(dims, config.network, config.normalization.observations)
 
         def act(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-            policy, mode = params
-            if config.normalization.observations:
-                obs = running_normalize(policy["normalizer"], obs)
-            sampled = network.act(policy["params"], memory, obs, key)
-            mean = network.act(policy["params"], memory, obs, None)
-            action, _, memory = jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
-            return jnp.clip(config.action_scale * action, -1.0, 1.0), memory
+            arrays, mode = params
+            sampled, mean = act_of(arrays, obs, memory, key), act_of(arrays, obs, memory, None)
+            return jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
 
         self._config = config
-        self._evaluator = Evaluator(env, act, network.initial_memory(env.num_envs).actor)
+        self._evaluator = Evaluator(env, act, config.network.build(dims).initial_memory(env.num_envs).actor)
 
-    def evaluate(self, policies: Sequence[Policy], env_steps: Sequence[int], episodes: int) -> list[dict[str, Any]]:
+    def evaluate(
+        self, policies: Sequence[TrainedPolicy], env_steps: Sequence[int], episodes: int
+    ) -> list[dict[str, Any]]:
         """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with mean actions."""
-        trees = [{"params": policy.params, "normalizer": policy.normalizer} for policy in policies]
-        stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *trees)
+        stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *(policy.arrays for policy in policies))
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
         # The same random keys for every policy and training step, to reduce the variance of comparisons.
         keys = jnp.tile(jax.random.PRNGKey(self._config.seed), (2 * len(policies), 1))
@@ -81,10 +78,15 @@ def _plain(result: EvalResult) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
 
-def score(evaluation: dict[str, Any]) -> float:
-    """Returns the score by which evaluations are ranked: the average step reward under sampled actions."""
-    value = evaluation["sampled"]["average_step_reward"]
-    return -math.inf if value is None else float(value)
+def score(evaluation: dict[str, Any]) -> tuple[float, float]:
+    """Returns the score by which evaluations are ranked, under sampled actions.
+
+    It is the average step reward; in a match first the win rate against the opponents of the evaluation.
+    """
+    sampled = evaluation["sampled"]
+    values = (sampled.get("win_rate", 0.0), sampled["average_step_reward"])
+    win_rate, reward = (-math.inf if value is None else float(value) for value in values)
+    return win_rate, reward
 
 
 class EvaluationLog:
@@ -97,7 +99,7 @@ class EvaluationLog:
         self.evaluations = [e for e in before["evaluations"] if e["env_steps"] <= env_steps]
         self.absolute = before["absolute"] if before["absolute"] and before.get("ended_at") == env_steps else None
 
-    def add(self, evaluation: dict[str, Any], policy: Policy) -> None:
+    def add(self, evaluation: dict[str, Any], policy: TrainedPolicy) -> None:
         """Appends an evaluation, and saves its policy if it scores higher than those on disk."""
         best = self.best()
         if best is None or score(evaluation) > score(best):
@@ -117,11 +119,11 @@ class EvaluationLog:
         there = [e for e in self.evaluations if _best_path(self._run_dir, e).is_file()]
         return max(there, key=score, default=None)
 
-    def best_policy(self) -> tuple[Policy, int]:
+    def best_policy(self) -> tuple[TrainedPolicy, int]:
         """Returns the policy of the best evaluation and its environment steps."""
         best = self.best()
         assert best is not None
-        return load_policy(_best_path(self._run_dir, best)), best["env_steps"]
+        return read_policy(_best_path(self._run_dir, best)), best["env_steps"]
 
     def end(self, absolute: dict[str, Any], env_steps: int) -> None:
         """Writes the absolute metric of a run that ended after `env_steps`."""

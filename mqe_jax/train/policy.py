@@ -1,4 +1,4 @@
-"""A trained policy outside the training loop: save, load, act."""
+"""Policies: whatever acts for a team, and the trained ones, which are saved, loaded and exchanged."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -23,67 +23,126 @@ from mqe_jax.train.types import Memory, Params
 POLICY_FILE = "policy.safetensors"
 
 
-@dataclass(frozen=True)
-class Policy:
-    """A team's policy: the policy parameters of a network, and its observation statistics."""
+class Policy(Protocol):
+    """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled code.
+
+    `initial_memory(num_envs)` is the recurrent state at an episode's start, leading axis N;
+    `act(obs (N, A, O), memory, key) -> (action (N, A, D) in [-1, 1], memory)`.
+    """
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        ...
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of the team, A."""
+        ...
+
+    def initial_memory(self, num_envs: int) -> Memory: ...
+    def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]: ...
+
+
+class PolicyArrays(NamedTuple):
+    """The arrays in which trained policies of one architecture differ."""
 
     params: Params
     """Parameters as `Network.policy_params` returns them."""
     normalizer: RunningStatistics
+    """Statistics of the observations."""
+    action_scale: jax.Array
+    """Factor on the network's actions () float32."""
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """The policy of a network for a team."""
+
+    params: Params
+    """Parameters as `Network.policy_params` returns them."""
+    normalizer: RunningStatistics
+    """Statistics of the observations."""
     dims: EnvDims
+    """Sizes of the environment in which it was trained."""
     config: TrainConfig
+    """Settings with which it was trained."""
     metadata: Mapping[str, Any]
     """Further entries of the file: task, env_steps."""
+    deterministic: bool = False
+    """Whether it acts with its mean actions; otherwise they are sampled."""
+
+    @property
+    def task(self) -> str:
+        """Id of the task; empty where the file does not name it."""
+        return self.metadata.get("task") or self.config.task or ""
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of the team."""
+        return self.dims.agents
+
+    @property
+    def arrays(self) -> PolicyArrays:
+        """All arrays of the policy."""
+        return PolicyArrays(self.params, self.normalizer, jnp.float32(self.config.action_scale))
+
+    @property
+    def architecture(self) -> Any:
+        """Everything but the arrays; policies of equal architecture can be exchanged within compiled code."""
+        sizes = (self.task, self.dims.agents, self.dims.observation, self.dims.action)
+        return (*sizes, self.config.network, self.config.normalization.observations, self.deterministic)
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
         memory = self.config.network.build(self.dims).initial_memory(num_envs or 1).actor
         return jax.tree.map(lambda x: x[0], memory) if num_envs is None else memory
 
-    def act(
-        self, obs: Any, memory: Memory, key: jax.Array | None = None, *, deterministic: bool = False
-    ) -> tuple[jax.Array, Memory]:
+    def act(self, obs: Any, memory: Memory, key: jax.Array | None = None) -> tuple[jax.Array, Memory]:
         """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or (A, D).
 
         `memory` is the recurrent state; the caller resets it to `initial_memory` at an episode's start. Without a key,
-        or with `deterministic`, the action is the mean.
+        the action is the mean.
 
         Raises:
             InputError: for an observation of another shape.
         """
+        return self.act_with(self.arrays, obs, memory, key)
+
+    def act_with(
+        self, arrays: PolicyArrays, obs: Any, memory: Memory, key: jax.Array | None = None
+    ) -> tuple[jax.Array, Memory]:
+        """Returns what a policy of the same architecture with other arrays does; see `act`."""
         obs = jnp.asarray(obs, jnp.float32)
         agents, size = self.dims.agents, self.dims.observation
         if obs.ndim < 2 or obs.shape[-2:] != (agents, size):
             raise InputError(f"obs: shape {obs.shape} is not allowed; it must end in ({agents} agents, {size} numbers)")
-        act = _compiled_act(self.dims, self.config.network, self.config.normalization.observations)
-        action, memory = act(self.params, self.normalizer, obs, memory, None if deterministic else key)
-        return jnp.clip(self.config.action_scale * action, -1.0, 1.0), memory
+        act = policy_act(self.dims, self.config.network, self.config.normalization.observations)
+        return act(arrays, obs, memory, None if self.deterministic else key)
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any:
-    """Returns a network's compiled `act`, unscaled and unclipped."""
+def policy_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any:
+    """Returns a network's compiled `act(arrays, obs, memory, key or None) -> (action, memory)`, scaled and clipped."""
     network = settings.build(dims)
 
     @jax.jit
-    def act(
-        params: Params, normalizer: RunningStatistics, obs: jax.Array, memory: Memory, key: jax.Array | None
-    ) -> tuple[jax.Array, Memory]:
+    def act(arrays: PolicyArrays, obs: jax.Array, memory: Memory, key: jax.Array | None) -> tuple[jax.Array, Memory]:
         if normalize:
-            obs = running_normalize(normalizer, obs)
-        action, _, memory = network.act(params, memory, obs, key)
-        return action, memory
+            obs = running_normalize(arrays.normalizer, obs)
+        action, _, memory = network.act(arrays.params, memory, obs, key)
+        return jnp.clip(arrays.action_scale * action, -1.0, 1.0), memory
 
     return act
 
 
-def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata: Any) -> Policy:
+def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
     """Returns the policy of a learner state."""
     policy_params = config.network.build(dims).policy_params(state.params)
-    return Policy(policy_params, state.obs_normalizer.obs, dims, config, metadata)
+    return TrainedPolicy(policy_params, state.obs_normalizer.obs, dims, config, metadata)
 
 
-def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
+def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
     """Writes a policy into a run folder atomically; with `half`, its parameters as float16.
 
     Raises:
@@ -100,7 +159,7 @@ def save_policy(run_dir: str | Path, policy: Policy, name: str = POLICY_FILE, *,
     return path
 
 
-def load_policy(run: str | Path) -> Policy:
+def read_policy(run: str | Path) -> TrainedPolicy:
     """Reads the policy of a run folder, or a policy file; parameters stored as float16 become float32.
 
     Raises:
@@ -125,4 +184,4 @@ def load_policy(run: str | Path) -> Policy:
     tree = load_tree(path, jax.eval_shape(template), kind="policy", half=True).tree
     if wrong := nonfinite(tree):
         raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; it was written by a diverged run")
-    return Policy(tree["params"], tree["normalizer"], dims, config, metadata)
+    return TrainedPolicy(tree["params"], tree["normalizer"], dims, config, metadata)

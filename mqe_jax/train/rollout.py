@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +10,15 @@ import numpy as np
 
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import NetworkMemory, Params, PyTree, Trace, Transition, VectorEnv, is_outcome, teams_of
+from mqe_jax.train.types import (
+    NetworkMemory,
+    Params,
+    TraceStep,
+    Transition,
+    VectorEnv,
+    is_outcome,
+    teams_of,
+)
 
 
 class RolloutState(NamedTuple):
@@ -54,14 +61,16 @@ def rollout(
     *,
     normalize: bool,
     action_scale: float,
-    snapshot: Callable[[Any], PyTree] | None = None,
+    trace_step: TraceStep | None = None,
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
+    `length` is a multiple of the network's chunk length.
+
     The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
     steps and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
-    episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `snapshot`, the metrics also
-    hold `trace`, a `Trace` of all steps.
+    episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold
+    `trace`, a `Trace` of all steps.
     """
     own = np.array(teams_of(env)[0])
 
@@ -74,10 +83,10 @@ def rollout(
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None])
         scaled = action_scale * action
         after = env.step(before, scaled)
-        trace = () if snapshot is None else Trace(snapshot(before), scaled, after.metrics["diverged"])
+        trace = () if trace_step is None else trace_step(before, scaled, after)
         done = after.terminated | after.truncated
         transition = Transition(
-            memory=memory,
+            memory=memory._replace(actor=()),
             is_first=state.is_first,
             obs=before.obs,
             privileged_obs=before.privileged_obs,
@@ -102,9 +111,17 @@ def rollout(
         )
         return state, (transition, sums, trace)
 
-    state, (transitions, sums, trace) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    def one_chunk(state: RolloutState, keys: jax.Array) -> tuple[RolloutState, tuple[Any, Any]]:
+        start = reset_memory(state.memory, state.is_first).actor
+        state, steps = jax.lax.scan(one_step, state, keys)
+        return state, (start, steps)
+
+    keys = jax.random.split(key, length).reshape(-1, network.chunk_length, *key.shape)
+    state, (starts, steps) = jax.lax.scan(one_chunk, state, keys)
+    transitions, sums, trace = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), steps)
+    transitions = transitions._replace(memory=transitions.memory._replace(actor=starts))
     metrics: dict[str, Any] = _means(sums, length * env.num_envs)
-    return state, transitions, metrics if snapshot is None else {**metrics, "trace": trace}
+    return state, transitions, metrics if trace_step is None else {**metrics, "trace": trace}
 
 
 def _per_episode(name: str) -> bool:

@@ -31,7 +31,7 @@ from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
-from mqe_jax.train.policy import POLICY_FILE, Policy, policy_of, save_policy
+from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import shared_leaves, stack, take, without_shared
 from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
 from mqe_jax.train.types import Recorder, VectorEnv, join_traces
@@ -91,7 +91,7 @@ def train_seeds(
         fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
     check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
-    learner = make_learner(env, configs[0], None if recorder is None else recorder.snapshot)
+    learner = make_learner(env, configs[0], None if recorder is None else recorder.trace)
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
     with contextlib.ExitStack() as locks:
         for folder in folders:
@@ -228,7 +228,7 @@ class _Training:
             self._state, self._env_steps = after, int(rows[0]["env_steps"])
         return rows
 
-    def _policies(self) -> list[Policy]:
+    def _policies(self) -> list[TrainedPolicy]:
         dims = env_dims(self._env, self._config)
         return [
             policy_of(self._seed(i), dims, config, task=self._env.name, env_steps=self._env_steps)

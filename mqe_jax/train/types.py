@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -88,12 +89,16 @@ class Trace(NamedTuple):
 class Recorder(Protocol):
     """Records the steps before a divergence.
 
-    `snapshot(env_state)` returns the fields to record (N, ...), inside compiled code; `add(trace)` receives the steps
-    since the last call, and writes those of environments that diverged.
+    `trace(before, action, after)` returns one step, (N, ...), from the states before and after it, inside compiled
+    code; `add(trace)` receives the steps since the last call, and writes those of environments that diverged.
     """
 
-    def snapshot(self, env_state: Any) -> PyTree: ...
+    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace: ...
     def add(self, trace: Trace) -> None: ...
+
+
+TraceStep = Callable[[Any, jax.Array, Any], Trace]
+"""`Recorder.trace`."""
 
 
 def join_traces(traces: Trace) -> Trace:
@@ -139,7 +144,8 @@ class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
     memory: NetworkMemory
-    """Recurrent state before this step, zeroed at an episode's first step."""
+    """Recurrent state before this step, zeroed at an episode's first step; the actor's at the first steps of chunks
+    only (T / L)."""
     is_first: jax.Array
     """Whether the step is the first of its episode (N,) bool."""
     obs: jax.Array

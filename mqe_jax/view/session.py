@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.control import COMMAND_RANGES, commands_from_action
-from mqe_jax.train.evaluate import Act
+from mqe_jax.train.policy import Policy
 from mqe_jax.walk_policy import command_index
 
 DRIVEN = ("vx", "vy", "yaw_rate")
@@ -84,11 +84,12 @@ class Session:
     episodes: np.ndarray
     """Number of finished episodes of each environment (N,)."""
 
-    def __init__(self, env: Any, vector_env: Any, act: Act, memory: Any, seed: int = 0, history: float = 10.0) -> None:
-        """Creates the environments; `memory` is the initial recurrent state, `history` the length of the history, s."""
+    def __init__(self, env: Any, vector_env: Any, policy: Policy, seed: int = 0, history: float = 10.0) -> None:
+        """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
         self.paused, self.speed, self.drive = False, 1.0, Drive()
-        self._vector_env, self._act, self._first_memory = vector_env, act, memory
+        self._vector_env, self._policy = vector_env, policy
+        self._first_memory = policy.initial_memory(self.num_envs)
         self._key = jax.random.PRNGKey(seed)
         self._reset = jax.jit(vector_env.reset)
         self._step = jax.jit(self._advance)
@@ -134,7 +135,7 @@ class Session:
 
     def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
         env = self.env
-        action, memory = self._act(state.obs, memory, key)
+        action, memory = self._policy.act(state.obs, memory, key)
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, math
+
+from mqe_jax.engines import private
 
 _BEFORE_COLLISION = (
     mjx.kinematics,
@@ -35,6 +36,9 @@ class MarginStep:
     """`mjx.step` of a model for MJX's JAX implementation (Euler integration)."""
 
     model: mjx.Model
+    """The model without the margins that the step applies itself."""
+    max_contacts: int
+    """Maximum number of contacts that are kept of each dimension, -1 without a limit."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
@@ -44,6 +48,9 @@ class MarginStep:
         without_margins.geom_margin[:] = 0.0
         without_margins.geom_rbound[:] += inflation
         self.model = mjx.put_model(without_margins, impl="jax")
+        names = [model.numeric(i).name for i in range(model.nnumeric)]
+        capped = "max_contact_points" in names
+        self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1
         self._inflation = inflation.astype(np.float32)
         self._size = model.geom_size.astype(np.float32)
         self._size[:, 0] += self._inflation
@@ -57,10 +64,10 @@ class MarginStep:
         data = mjx.sensor_vel(model, data)
         data = mjx.fwd_actuation(model, data)
         data = mjx.fwd_acceleration(model, data)
-        if data._impl.efc_J.size == 0:
-            data = data.replace(qacc=data.qacc_smooth)
-        else:
+        if private.is_constrained(data):
             data = mjx.sensor_acc(model, mjx.solve(model, data))
+        else:
+            data = data.replace(qacc=data.qacc_smooth)
         return mjx.euler(model, data)
 
     def _forward_position(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -71,9 +78,9 @@ class MarginStep:
 
     def _collision(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
         inflated = model.replace(geom_size=jnp.asarray(self._size), geom_margin=jnp.asarray(self._margin))
-        if data._impl.ncon == 0:
+        if not private.contact(data).dist.size:
             return data
-        contact = _contacts(inflated, data)
+        contact = _contacts(inflated, data, self.max_contacts)
         first, second = jnp.asarray(self._inflation)[jnp.asarray(contact.geom)].T
         normal = contact.frame[:, 0]  # from the first geom to the second
         contact = contact.replace(
@@ -81,34 +88,33 @@ class MarginStep:
             pos=contact.pos - 0.5 * (first - second)[:, None] * normal,
             includemargin=contact.includemargin + first + second,
         )
-        return data.replace(_impl=data._impl.replace(contact=contact))
+        return private.with_contact(data, contact)
 
 
-def _contacts(model: mjx.Model, data: mjx.Data) -> mjx.Contact:
-    """Contacts by dimension, of each the deepest `max_contact_points`.
+def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
+    """Contacts by dimension, of each the deepest `cap`.
 
     As `mjx.collision`, with `_plane_box`, and with `_capsule_box` for boxes that move: for all walls it would cost 7%
     of a physics step in Narrow Gate.
     """
     by_dimension: dict[int, list[Any]] = {}
-    geoms = collision_driver._geom_groups(model)
     moves = model.body_weldid[model.geom_bodyid] != 0
-    for key, pairs in collision_driver._contact_groups(model, data).items():
-        if key.types == (mjx.GeomType.PLANE, mjx.GeomType.BOX):
-            dist, pos, frame = _plane_box(model, data, pairs.geom)
+    for pairs in private.geom_pairs(model, data):
+        geom = pairs.contact.geom
+        if pairs.types == (mjx.GeomType.PLANE, mjx.GeomType.BOX):
+            dist, pos, frame = _plane_box(model, data, geom)
         else:
-            function: Any = collision_driver._COLLISION_FUNC[key.types]  # pyright: ignore[reportArgumentType]
-            dist, pos, frame = function(model, data, key, pairs.geom)
-            rows = np.flatnonzero(moves[np.array(geoms[key])[:, 1]])
-            if key.types == (mjx.GeomType.CAPSULE, mjx.GeomType.BOX) and len(rows):
+            dist, pos, frame = pairs.collide(model, data)
+            rows = np.flatnonzero(moves[pairs.geoms[:, 1]])
+            if pairs.types == (mjx.GeomType.CAPSULE, mjx.GeomType.BOX) and len(rows):
                 both = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
-                nearest = _capsule_box(model, data, pairs.geom[rows])
+                nearest = _capsule_box(model, data, geom[rows])
                 corrected = _corrected(dist[both], pos[both], frame[both], *nearest)
                 dist, pos, frame = (x.at[both].set(y) for x, y in zip((dist, pos, frame), corrected, strict=True))
-        count = len(dist) // len(pairs.geom)
-        pairs = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), pairs)
-        by_dimension.setdefault(key.condim, []).append(pairs.replace(dist=dist, pos=pos, frame=frame))
-    cap, kept = collision_driver._numeric(model, "max_contact_points"), []
+        count = len(dist) // len(geom)
+        contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), pairs.contact)
+        by_dimension.setdefault(pairs.condim, []).append(contact.replace(dist=dist, pos=pos, frame=frame))
+    kept = []
     for _, parts in sorted(by_dimension.items()):
         contact = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
         if 0 <= cap < len(contact.dist):
@@ -126,7 +132,7 @@ def _plane_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax.A
     corners = jnp.where(jnp.sum(corners * normal, axis=-1, keepdims=True) > 0.0, -corners, corners)
     corners = corners + data.geom_xpos[box][:, None]
     dist = jnp.sum((corners - data.geom_xpos[plane][:, None]) * normal, axis=-1, keepdims=True)
-    frame = jax.vmap(math.make_frame)(normal[:, 0])
+    frame = private.make_frames(normal[:, 0])
     return dist.ravel(), (corners - 0.5 * dist * normal).reshape(-1, 3), jnp.repeat(frame, 4, axis=0)
 
 
@@ -183,6 +189,6 @@ def _corrected(
     none = jnp.ones(count)
     dist = jnp.where(wrong[:, None], jnp.stack([true_dist, none], axis=1), dist.reshape(count, 2))
     pos = jnp.where(wrong[:, None, None], true_pos[:, None], pos.reshape(count, 2, 3))
-    frames = jax.vmap(math.make_frame)(normal)
+    frames = private.make_frames(normal)
     frame = jnp.where(wrong[:, None, None, None], frames[:, None], frame.reshape(count, 2, 3, 3))
     return dist.ravel(), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)

@@ -1,46 +1,64 @@
-"""MuJoCo's C engine, called from JAX."""
+"""MuJoCo's C engine, called from JAX: all environments of a batch in one call."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
+from mqe_jax.engines import private
+from mqe_jax.engines.engine import Engine
 from mqe_jax.robots.motors import CLAMP, Motors
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
 
-class CEngine:
-    """MuJoCo's C engine as a pure JAX function: state in, state out, all environments of a batch in one call."""
+class CEngine(Engine):
+    """MuJoCo's C engine as a pure JAX function; no contact is ever dropped."""
 
-    def __init__(self, model: mujoco.MjModel, motors: Motors | None) -> None:
-        from mujoco.batch import Batch
+    impl = "c"
 
-        self._motors = motors
+    def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
+        super().__init__(model, **options)
         self._model = model.__copy__()
         # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._make = Batch
-        self._batches: dict[tuple[int, tuple[str, ...]], Any] = {}
+        self._batches: dict[tuple[int, tuple[str, ...]], Batch] = {}
         self._rows: dict[int, Motors | None] = {}
         self._lock = threading.Lock()
-        m = model
-        self._sizes = (m.nq, m.nv, m.nv, m.nsensordata)
+        self._sizes = (model.nq, model.nv, model.nv, model.nsensordata)
 
-    def step(self, data: mjx.Data, fields: dict[str, jax.Array], forced: bool, substeps: int) -> mjx.Data:
+    @classmethod
+    def preferred(cls) -> bool:
+        return jax.default_backend() == "cpu"
+
+    @classmethod
+    def obstacle(cls) -> str | None:
+        platform = jax.default_backend()
+        if platform == "cpu":
+            return None
+        return f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
+
+    def blank(self) -> mjx.Data:
+        return private.without_pointers(private.load_mjx().make_data(self.model, impl="cpp"))
+
+    def advance(
+        self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
+    ) -> tuple[mjx.Data, jax.Array]:
         names = tuple(sorted(fields))
         out = jax.ShapeDtypeStruct((sum(self._sizes),), jnp.float32)
         forces = (data.xfrc_applied,) if forced else ()
-        mocap = (data.mocap_pos, data.mocap_quat) if self._model.nmocap else ()
+        mocap = (data.mocap_pos, data.mocap_quat) if self.model.nmocap else ()
 
         def call(qpos: Any, *rest: Any) -> np.ndarray:
-            return self._call(names, forced, substeps, qpos, *rest)
+            return self._call(names, forced, num_substeps, qpos, *rest)
 
         row = jax.pure_callback(
             call,
@@ -55,13 +73,14 @@ class CEngine:
             vmap_method="broadcast_all",
         )
         qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
-        return data.replace(
+        data = data.replace(
             qpos=qpos,
             qvel=qvel,
             qacc_warmstart=warmstart,
             sensordata=sensordata,
-            time=data.time + substeps * self._model.opt.timestep,
+            time=data.time + num_substeps * self._model.opt.timestep,
         )
+        return data, jnp.zeros((), bool)
 
     def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
         qpos, *rest = (np.asarray(array) for array in arrays)
@@ -71,8 +90,8 @@ class CEngine:
         with self._lock:
             batch = self._batches.get((count, names))
             if batch is None:
-                batch = self._batches[count, names] = self._make(self._model, nsim=count)
-                self._rows[count] = None if self._motors is None else self._motors.repeated(count)
+                batch = self._batches[count, names] = Batch(self._model, nsim=count)
+                self._rows[count] = None if self.motors is None else self.motors.repeated(count)
             for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
                 batch.bind(name)[:] = next(flat)
             if self._model.nmocap:
@@ -92,7 +111,7 @@ class CEngine:
             row = np.concatenate(parts, axis=1).astype(np.float32)
         return row.reshape(*lead, -1)
 
-    def _drive(self, batch: Any, motors: Motors, substeps: int, names: tuple[str, ...]) -> None:
+    def _drive(self, batch: Batch, motors: Motors, substeps: int, names: tuple[str, ...]) -> None:
         """Steps a batch, with the motors' limits in every physics step; `motors` has a row per environment."""
         model = self._model
         gain = batch.expand("actuator_gainprm") if "actuator_gainprm" in names else model.actuator_gainprm

@@ -1,0 +1,321 @@
+"""A match as an environment of one team: against given opponents (`versus`), or with both teams learning (`Mirror`)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
+from mqe_jax.errors import InputError
+from mqe_jax.policies import load_policy, team_size
+from mqe_jax.settings import fail
+from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.types import Memory, PyTree
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Opponent:
+    """The opponent of a block of B environments."""
+
+    arrays: PyTree
+    """Arrays of the opponent; empty where it cannot change."""
+    before: PyTree
+    """Arrays of the opponent before the last change."""
+    waiting: jax.Array
+    """Environments whose episode is still against the opponent before the change (B,) bool."""
+    memory: Memory
+    """Recurrent state, leading axis B."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TeamState:
+    """State of M environments of one team of T agents, in N matches of A agents; see `EnvState`."""
+
+    match: State
+    """State of the matches, leading axis N."""
+    action: jax.Array
+    """Actions of all agents in the last step (N, A, D)."""
+    obs: jax.Array
+    """Observations (M, T, O)."""
+    privileged_obs: jax.Array
+    """Privileged observations (M, P)."""
+    final_obs: jax.Array
+    """Observations at the end of the last step (M, T, O)."""
+    final_privileged_obs: jax.Array
+    """Privileged observations at the end of the last step (M, P)."""
+    reward: jax.Array
+    """Rewards (M, T)."""
+    terminated: jax.Array
+    """Whether the episode terminated (M,) bool."""
+    truncated: jax.Array
+    """Whether the episode was truncated (M,) bool."""
+    metrics: dict[str, jax.Array]
+    """Metrics of the match, of team 0 (M,) each."""
+    step: jax.Array
+    """Environment steps since the reset (M,) int32; the first N are those of the matches."""
+    assistance: jax.Array
+    """Curriculum level (M,); the first N are those of the matches."""
+    opponents: tuple[Opponent, ...]
+    """The opponent of each block of environments."""
+    key: jax.Array
+    """Random key of the opponents' actions."""
+
+
+class OneTeam:
+    """What `Versus` and `Mirror` share: the interface of `VectorEnv`, for one team."""
+
+    env: QuadrupedEnv
+    """The task."""
+    matches: VectorEnv
+    """The matches."""
+    num_envs: int
+    """Number of environments M."""
+    num_agents: int
+    """Number of agents of a team T."""
+    teams: tuple[tuple[int, ...], ...]
+    """Agents of the only team."""
+    max_episode_steps: int
+    """Environment steps until the time limit."""
+
+    def __init__(self, matches: VectorEnv, num_envs: int) -> None:
+        if len(matches.teams) != 2:
+            raise InputError(f"env: {matches.name} is not a match; it has one team")
+        self.env, self.matches, self.num_envs = matches.env, matches, num_envs
+        self.name = matches.name
+        self.num_agents = team_size(matches)
+        self.teams = (tuple(range(self.num_agents)),)
+        self.max_episode_steps = matches.max_episode_steps
+        self.observation_size = matches.observation_size
+        self.privileged_observation_size = matches.privileged_observation_size
+        self.action_size = matches.action_size
+
+    def _stepped(self, state: TeamState, action: jax.Array) -> State:
+        """Advances the matches by a step with the actions of all agents (N, A, D)."""
+        count = self.matches.num_envs
+        match = dataclasses.replace(state.match, step=state.step[:count], assistance=state.assistance[:count])
+        return self.matches.step(match, action)
+
+    def _check_action(self, action: jax.Array) -> None:
+        shape = (self.num_envs, self.num_agents, self.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
+
+
+class Versus(OneTeam):
+    """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`."""
+
+    opponents: tuple[Policy, ...]
+    """Opponent of each block at the start."""
+
+    def __init__(self, matches: VectorEnv, opponents: Sequence[Policy]) -> None:
+        super().__init__(matches, matches.num_envs)
+        if not opponents or self.num_envs % len(opponents):
+            fail("opponents", len(opponents), f"a number that divides the number of environments, {self.num_envs}")
+        for policy in opponents:
+            if policy.task != self.name or policy.agents != self.num_agents:
+                raise InputError(
+                    f"opponents: a policy of {policy.agents} agents on {policy.task}; {self.name} needs one of "
+                    f"{self.num_agents}"
+                )
+        self.opponents = tuple(opponents)
+        self._size = self.num_envs // len(opponents)
+
+    def reset(self, key: jax.Array) -> TeamState:
+        """Returns the initial states of all environments, against the opponents given at the start."""
+        key, match_key = jax.random.split(key)
+        match = self.matches.reset(match_key)
+        opponents = []
+        for policy in self.opponents:
+            arrays = _arrays(policy)
+            waiting = jnp.zeros((self._size,), bool)
+            opponents.append(Opponent(arrays, arrays, waiting, policy.initial_memory(self._size)))
+        action = jnp.zeros((self.num_envs, self.matches.num_agents, self.action_size))
+        return self._seen(match, action, tuple(opponents), key)
+
+    def step(self, state: TeamState, action: jax.Array) -> TeamState:
+        """Advances all environments by one step with the actions of team 0 (N, T, D); resets those that ended.
+
+        Raises:
+            InputError: for actions of another shape.
+        """
+        self._check_action(action)
+        key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
+        others, opponents = [], []
+        for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
+            obs = state.match.obs[self._block(i), self.num_agents :]
+            other, memory = _act(policy, opponent, obs, keys[i])
+            others.append(jnp.asarray(other, jnp.float32))
+            opponents.append(dataclasses.replace(opponent, memory=memory))
+        both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.concatenate(others)], axis=1)
+        match = self._stepped(state, both)
+        done = match.terminated | match.truncated
+        started = tuple(self._restarted(i, opponent, done[self._block(i)]) for i, opponent in enumerate(opponents))
+        return self._seen(match, both, started, key)
+
+    def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
+        """Returns the state with another opponent in a block.
+
+        Each environment keeps its opponent until its episode ends; the state holds both until then. While environments
+        still wait for an earlier change, only the opponent for which they wait is replaced, also where it already
+        plays.
+
+        Args:
+            state: of the environments.
+            block: index of the block.
+            policy: the new opponent, of the same architecture as the first one.
+            at_once: exchange the opponent within the episodes, as for an opponent that is the newest policy itself.
+
+        Raises:
+            InputError: for a block whose opponent is not a trained policy, or a policy of another architecture.
+        """
+        first, opponent = self.opponents[block], state.opponents[block]
+        if not isinstance(first, TrainedPolicy):
+            raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
+        if policy.architecture != first.architecture:
+            raise InputError(
+                f"policy: of another architecture than block {block}: {policy.architecture}, not {first.architecture}"
+            )
+        arrays = _arrays(policy)
+        pending = jnp.any(opponent.waiting)
+        before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
+        waiting = jnp.where(pending, opponent.waiting, True)
+        if at_once:
+            before, waiting = arrays, jnp.zeros_like(opponent.waiting)
+        changed = dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)
+        opponents = (*state.opponents[:block], changed, *state.opponents[block + 1 :])
+        return dataclasses.replace(state, opponents=opponents)
+
+    def _block(self, index: int) -> slice:
+        return slice(index * self._size, (index + 1) * self._size)
+
+    def _restarted(self, index: int, opponent: Opponent, done: jax.Array) -> Opponent:
+        """Resets the recurrent state, and ends the waiting, of environments whose episode ended."""
+        first = self.opponents[index].initial_memory(self._size)
+        memory = jax.tree.map(lambda start, now: _where(done, start, now), first, opponent.memory)
+        return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done)
+
+    def _seen(self, match: State, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array) -> TeamState:
+        own = slice(0, self.num_agents)
+        return TeamState(
+            match=match,
+            action=action,
+            obs=match.obs[:, own],
+            privileged_obs=match.privileged_obs,
+            final_obs=match.final_obs[:, own],
+            final_privileged_obs=match.final_privileged_obs,
+            reward=match.reward[:, own],
+            terminated=match.terminated,
+            truncated=match.truncated,
+            metrics={name: value for name, value in match.metrics.items() if not name.startswith("team1/")},
+            step=match.step,
+            assistance=match.assistance,
+            opponents=opponents,
+            key=key,
+        )
+
+
+def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path]) -> Versus:
+    """Returns matches as environments of team 0 alone, against opponents that control team 1.
+
+    The environments come in equal blocks, one for each opponent, in their order. Trained policies sample their actions,
+    and can be exchanged (`Versus.change`); others are fixed.
+
+    Args:
+        env: the matches.
+        opponents: policies, or what `load_policy` accepts; their number divides the number of environments.
+
+    Raises:
+        InputError: for a task that is not a match, another number of opponents, or a policy of another task.
+    """
+    policies = [load_policy(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
+    return Versus(env, policies)
+
+
+class Mirror(OneTeam):
+    """N matches as 2 N environments of one team, first all teams 0, then all teams 1: one policy learns as both.
+
+    The privileged observation has one more number, the index of the team. The metrics are those of team 0 in both
+    halves; `diverged` and `overflow` are counted in the first.
+    """
+
+    def __init__(self, matches: VectorEnv) -> None:
+        super().__init__(matches, 2 * matches.num_envs)
+        self.privileged_observation_size += 1
+
+    def reset(self, key: jax.Array) -> TeamState:
+        """Returns the initial states of all environments."""
+        action = jnp.zeros((self.matches.num_envs, self.matches.num_agents, self.action_size))
+        return self._seen(self.matches.reset(key), action)
+
+    def step(self, state: TeamState, action: jax.Array) -> TeamState:
+        """Advances all environments by one step with actions (2 N, T, D); resets those that ended.
+
+        Raises:
+            InputError: for actions of another shape.
+        """
+        self._check_action(action)
+        both = jnp.concatenate(jnp.split(action, 2), axis=1)
+        return self._seen(self._stepped(state, both), both)
+
+    def _seen(self, match: State, action: jax.Array) -> TeamState:
+        def teams(x: jax.Array) -> jax.Array:
+            return jnp.concatenate(jnp.split(x, 2, axis=1))
+
+        def twice(x: jax.Array) -> jax.Array:
+            return jnp.concatenate([x, x])
+
+        def privileged(x: jax.Array) -> jax.Array:
+            team = jnp.repeat(jnp.arange(2.0), len(x))[:, None]
+            return jnp.concatenate([twice(x), team], axis=1)
+
+        metrics = {name: twice(value) for name, value in match.metrics.items() if not name.startswith("team1/")}
+        for name in ("diverged", "overflow"):
+            metrics[name] = jnp.concatenate([match.metrics[name], jnp.zeros_like(match.metrics[name])])
+        return TeamState(
+            match=match,
+            action=action,
+            obs=teams(match.obs),
+            privileged_obs=privileged(match.privileged_obs),
+            final_obs=teams(match.final_obs),
+            final_privileged_obs=privileged(match.final_privileged_obs),
+            reward=teams(match.reward),
+            terminated=twice(match.terminated),
+            truncated=twice(match.truncated),
+            metrics=metrics,
+            step=twice(match.step),
+            assistance=twice(match.assistance),
+            opponents=(),
+            key=jnp.zeros((2,), jnp.uint32),
+        )
+
+
+def _arrays(policy: Policy) -> PyTree:
+    """Returns the arrays in which a trained policy can change; none of others."""
+    return jax.tree.map(jnp.asarray, policy.arrays) if isinstance(policy, TrainedPolicy) else ()
+
+
+def _act(policy: Policy, opponent: Opponent, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+    """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
+    if not isinstance(policy, TrainedPolicy):
+        return policy.act(obs, opponent.memory, key)
+
+    def now() -> tuple[jax.Array, Any]:
+        return policy.act_with(opponent.arrays, obs, opponent.memory, key)
+
+    def either() -> tuple[jax.Array, Any]:
+        before = policy.act_with(opponent.before, obs, opponent.memory, key)
+        return jax.tree.map(lambda a, b: _where(opponent.waiting, a, b), before, now())
+
+    return jax.lax.cond(jnp.any(opponent.waiting), either, now)
+
+
+def _where(condition: jax.Array, yes: jax.Array, no: jax.Array) -> jax.Array:
+    """Selects along the leading axis: condition (B,) bool, yes and no (B, ...)."""
+    return jnp.where(condition.reshape(condition.shape + (1,) * (no.ndim - 1)), yes, no)

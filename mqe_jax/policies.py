@@ -1,0 +1,167 @@
+"""Policies by name: `load_policy` turns a name, a run folder or a policy file into a policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, overload
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.envs import TaskParams
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.planners import scripted_policy
+from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
+from mqe_jax.train.types import Memory
+
+NAMES = ("scripted", "random", "idle", "forward")
+"""Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
+
+_FORWARD = 0.25
+"""The first action of `forward`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SimplePolicy:
+    """A policy without parameters and recurrent state."""
+
+    task: str
+    """Id of the task."""
+    agents: int
+    """Number of agents of the team."""
+    plan: Callable[[jax.Array, jax.Array], jax.Array]
+    """Observations (N, A, O) and a key to actions (N, A, D)."""
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns an empty recurrent state."""
+        return ()
+
+    def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions; see `Policy`."""
+        return self.plan(obs, key), memory
+
+
+@dataclasses.dataclass(frozen=True)
+class BothTeams:
+    """The policies of a match's two teams, as one policy for the agents of both."""
+
+    first: Policy
+    """Policy of team 0."""
+    second: Policy
+    """Policy of team 1."""
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self.first.task
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of both teams."""
+        return self.first.agents + self.second.agents
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns the initial recurrent states of both."""
+        return self.first.initial_memory(num_envs), self.second.initial_memory(num_envs)
+
+    def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions of all agents; see `Policy`."""
+        keys, size = jax.random.split(key), self.first.agents
+        first, first_memory = self.first.act(obs[:, :size], memory[0], keys[0])
+        second, second_memory = self.second.act(obs[:, size:], memory[1], keys[1])
+        return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
+
+
+@overload
+def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
+@overload
+def load_policy(source: str | Path, env: Any, *, deterministic: bool = False) -> Policy: ...
+def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = False) -> Policy:
+    """Returns the policy of a name, a run folder or a policy file.
+
+    Args:
+        source: one of `NAMES`, or a path; a folder with one of these names is given as ./NAME.
+        env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
+        deterministic: whether a trained policy acts with its mean actions.
+
+    Returns:
+        A `TrainedPolicy` for a path, else a `SimplePolicy`.
+
+    Raises:
+        InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
+            scripted policy.
+    """
+    if str(source) in NAMES:
+        if env is None:
+            raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
+        return SimplePolicy(env.name, team_size(env), _plan(str(source), env))
+    if not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
+        hint = nearest(str(source), NAMES)
+        allowed = f"{', '.join(NAMES)}, a run folder, or a policy file"
+        raise InputError(f"policy: unknown {str(source)!r}{hint}; allowed: {allowed}")
+    policy = dataclasses.replace(read_policy(source), deterministic=deterministic)
+    if env is not None:
+        check_policy(policy, env, str(source))
+    return policy
+
+
+def team_size(env: Any) -> int:
+    """Returns the number of agents for which one policy acts: those of a team."""
+    return len(env.teams[0])
+
+
+def check_policy(policy: TrainedPolicy, env: Any, name: str = "policy") -> None:
+    """Checks that a trained policy is of this task, with its sizes, which depend on the task's parameters.
+
+    Raises:
+        InputError: naming both tasks, or both sizes.
+    """
+    if policy.task != env.name:
+        raise InputError(f"policy: {name} was trained on {policy.task or 'no named task'}, not on {env.name}")
+    sizes = (team_size(env), env.observation_size, env.action_size)
+    trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
+    if sizes != trained:
+        raise InputError(
+            f"policy: {name} was trained with (agents, observation, action) {trained}, but {env.name} has {sizes} here"
+        )
+
+
+def all_agents(env: Any, policy: Policy, opponent: Policy | None = None) -> Policy:
+    """Returns the policy of all agents of a task: of a match, that of both teams; without opponent, team 1 is idle.
+
+    Raises:
+        InputError: for an opponent in a task that is not a match.
+    """
+    if len(env.teams) < 2:
+        if opponent is not None:
+            raise InputError(f"opponent: {env.name} is not a competitive task; omit the opponent")
+        return policy
+    return BothTeams(policy, opponent or load_policy("idle", env))
+
+
+def _plan(name: str, env: Any) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Returns the function of observations (N, A, O) and a key that is the policy of a name."""
+    if name == "scripted":
+        scripted = _scripted(env)
+        return lambda obs, key: scripted(obs)
+    shape = (team_size(env), env.action_size)
+    if name == "random":
+        return lambda obs, key: jax.random.uniform(key, (len(obs), *shape), minval=-1.0, maxval=1.0)
+    first = _FORWARD if name == "forward" else 0.0
+    return lambda obs, key: jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
+
+
+def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
+    """Returns the task's scripted policy for a batch: observations (N, A, O) to actions (N, A, 3)."""
+    plan = scripted_policy(env)
+    if env.control != "command":
+        raise InputError(
+            f"policy: 'scripted' outputs walk commands; control must be 'command', not {env.control!r}; "
+            "with it give --policy random or idle"
+        )
+    if tuple(env.params.commands) != TaskParams.commands:
+        raise InputError(f"commands: {env.params.commands}; policy 'scripted' outputs {TaskParams.commands}")
+    return jax.vmap(plan)

@@ -1,0 +1,224 @@
+"""Matches as environments of one team, against opponents that may change, and policies by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import cli
+from mqe_jax.envs import VectorEnv, make
+from mqe_jax.errors import InputError
+from mqe_jax.opponents import Mirror, Versus, versus
+from mqe_jax.policies import BothTeams, all_agents, load_policy
+from mqe_jax.settings import build
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.policy import TrainedPolicy, policy_of
+
+KEY = jax.random.PRNGKey(0)
+MATCHES = (
+    "go1revolvingdoor",
+    "go1tug",
+    "go1wrestling",
+    "go1bridge",
+    "go1football-1vs1",
+    "go1football-2vs2",
+)
+SETTINGS: dict[str, Any] = {
+    "num_envs": 4,
+    "rollout_steps": 4,
+    "total_steps": 32,
+    "ppo": {"epochs": 1},
+    "network": {"hidden_sizes": [8], "gru_size": 4, "action_gain": 1.0},
+}
+
+
+def matches(task: str = "go1revolvingdoor", num_envs: int = 4, **params: Any) -> VectorEnv:
+    """Matches with joint targets as actions, of ten steps."""
+    params = {"control": "position", "episode_length": 0.2, **params}
+    return VectorEnv(make(task, impl="c", num_envs=num_envs, **params), num_envs)
+
+
+def new_policy(env: Any, seed: int = 0, **settings: Any) -> TrainedPolicy:
+    """An untrained policy of a team."""
+    config = build(TrainConfig, {**SETTINGS, "task": env.name, "num_envs": env.num_envs, **settings})
+    state = jax.jit(make_learner(env, config).init)(jax.random.PRNGKey(seed))
+    return policy_of(state, env_dims(env, config), config, task=env.name)
+
+
+@pytest.fixture(scope="module")
+def door() -> VectorEnv:
+    return matches()
+
+
+@pytest.fixture(scope="module")
+def policies(door: VectorEnv) -> list[TrainedPolicy]:
+    """Two policies of one architecture."""
+    return [new_policy(versus(door, ["idle"]), seed) for seed in (0, 1)]
+
+
+def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv) -> None:
+    assert all(load_policy(name, door.env).agents == 1 for name in ("random", "idle", "forward"))
+    both = all_agents(door.env, load_policy("forward", door.env))
+    assert isinstance(both, BothTeams) and both.agents == 2
+    action, _ = both.act(jnp.zeros((3, 2, 12)), both.initial_memory(3), KEY)
+    np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))  # without opponent: idle
+
+
+@pytest.mark.parametrize("task", MATCHES)
+def test_scripted_policies_act_for_one_team(task: str) -> None:
+    env = make(task, impl="c", num_envs=1)
+    size = env.num_agents // 2
+    obs = jnp.ones((3, size, env.observation_size))
+    action, _ = load_policy("scripted", env).act(obs, (), KEY)
+    assert action.shape == (3, size, 3)
+
+
+def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
+    env = versus(door, ["idle", "forward"])
+    assert (env.num_envs, env.num_agents, env.teams, env.observation_size) == (4, 1, ((0,),), 12)
+    state = jax.jit(env.step)(env.reset(KEY), jnp.full((4, 1, 12), 0.5))
+    np.testing.assert_allclose(state.action[:, 0], 0.5)
+    np.testing.assert_allclose(state.action[:, 1, 0], [0.0, 0.0, 0.25, 0.25])
+    np.testing.assert_array_equal(state.obs, state.match.obs[:, :1])
+    np.testing.assert_array_equal(state.reward, state.match.reward[:, :1])
+    assert {"team0/win", "team0/loss", "success"} <= set(state.metrics) and "team1/win" not in state.metrics
+
+
+def test_opponents_change_at_resets(policies: list[TrainedPolicy], door: VectorEnv) -> None:
+    """Old and new opponent are told apart by their actions, which are means."""
+    old, new = (dataclasses.replace(policy, deterministic=True) for policy in policies)
+    env = versus(door, [old, "idle"])
+    step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    state = env.reset(KEY)
+    # Environment 0 is one step from its time limit.
+    state = dataclasses.replace(state, step=state.step.at[0].set(door.max_episode_steps - 1))
+    state = env.change(state, 0, new)
+    played = []
+    for _ in range(3):
+        obs, opponent = state.match.obs[:2, 1:], state.opponents[0]
+        by = [policy.act(obs, opponent.memory)[0] for policy in (old, new)]
+        state = step(state, action)
+        played.append([[bool(jnp.allclose(state.action[i, 1:], x[i], atol=1e-5)) for x in by] for i in range(2)])
+    assert played[0] == [[True, False], [True, False]]
+    assert played[1] == played[2] == [[False, True], [True, False]]
+    assert state.opponents[0].waiting.tolist() == [False, True]
+    np.testing.assert_allclose(state.action[2:, 1], 0.0)
+
+
+def test_the_newest_policy_is_exchanged_within_an_episode(policies: list[TrainedPolicy], door: VectorEnv) -> None:
+    old, new = (dataclasses.replace(policy, deterministic=True) for policy in policies)
+    env = versus(door, [old])
+    state = jax.jit(env.step)(env.reset(KEY), jnp.zeros((4, 1, 12)))
+    state = env.change(state, 0, new, at_once=True)
+    expected, _ = new.act(state.match.obs[:, 1:], state.opponents[0].memory)
+    assert not bool(state.opponents[0].waiting.any())
+    state = jax.jit(env.step)(state, jnp.zeros((4, 1, 12)))
+    np.testing.assert_allclose(state.action[:, 1:], expected, atol=1e-5)
+
+
+def test_scale_and_statistics_belong_to_the_opponent(policies: list[TrainedPolicy], door: VectorEnv) -> None:
+    quiet = dataclasses.replace(policies[0], config=dataclasses.replace(policies[0].config, action_scale=1e-9))
+    env = versus(door, [policies[0]])
+    state = env.change(env.reset(KEY), 0, quiet, at_once=True)
+    state = jax.jit(env.step)(state, jnp.zeros((4, 1, 12)))
+    assert float(jnp.abs(state.action[:, 1]).max()) < 1e-6
+
+
+def test_an_opponents_memory_starts_anew_with_its_episode(policies: list[TrainedPolicy], door: VectorEnv) -> None:
+    env = versus(door, [policies[0]])
+    state = env.reset(KEY)
+    state = dataclasses.replace(state, step=state.step.at[1].set(door.max_episode_steps - 1))
+    state = jax.jit(env.step)(state, jnp.zeros((4, 1, 12)))
+    moved = jnp.abs(state.opponents[0].memory).max(axis=(1, 2)) > 0
+    assert moved.tolist() == [True, False, True, True]
+
+
+def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: VectorEnv) -> None:
+    with pytest.raises(InputError, match="opponents: 3 is not allowed"):
+        versus(door, ["idle"] * 3)
+    with pytest.raises(InputError, match="go1plane is not a match"):
+        versus(matches("go1plane"), ["idle"])
+    with pytest.raises(InputError, match="on go1revolvingdoor; go1tug needs"):
+        versus(matches("go1tug"), [policies[0]])
+    env = versus(door, ["idle", policies[0]])
+    with pytest.raises(InputError, match="block 0 is fixed"):
+        env.change(env.reset(KEY), 0, policies[0])
+    other = new_policy(env, network={"hidden_sizes": [16]})
+    with pytest.raises(InputError, match="another architecture"):
+        env.change(env.reset(KEY), 1, other)
+
+
+@pytest.mark.parametrize("kind", ["versus", "mirror"])
+@pytest.mark.parametrize("task", ["go1revolvingdoor", "go1football-2vs2"])
+def test_the_trainer_sees_one_team(task: str, kind: str) -> None:
+    """One joint value and one ratio for the team; outcomes of matches are among the metrics."""
+    inner = matches(task, 2)
+    env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)
+    settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
+    config = build(TrainConfig, {**SETTINGS, **settings, "num_envs": env.num_envs})
+    learner = make_learner(env, config)
+    dims = env_dims(env, config)
+    assert (dims.agents, dims.values) == (inner.num_agents // 2, 1)
+    _, metrics = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
+    assert float(metrics["episodes"]) >= 2
+    outcomes = [float(metrics[f"team0/{name}"]) for name in ("win", "draw", "loss")]
+    assert sum(outcomes) == pytest.approx(1.0)
+    assert np.isfinite(float(metrics["loss/policy"]))
+
+
+def test_a_mirrored_match_shows_both_teams() -> None:
+    inner = matches("go1tug", 3)
+    env = Mirror(inner)
+    state = env.reset(KEY)
+    assert state.obs.shape == (6, 1, 10) and env.num_envs == 6
+    np.testing.assert_array_equal(state.obs[3:], state.match.obs[:, 1:])
+    np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 0, 0, 1, 1, 1])
+    assert state.privileged_obs.shape == (6, env.privileged_observation_size)
+    action = jax.random.uniform(KEY, (6, 1, 12), minval=-1.0)
+    state = jax.jit(env.step)(state, action)
+    np.testing.assert_array_equal(state.action, jnp.stack([action[:3, 0], action[3:, 0]], axis=1))
+    np.testing.assert_allclose(state.reward[:3], -state.reward[3:], atol=1e-6)
+
+
+def test_the_command_line_plays_two_runs_against_each_other(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    task = ["go1revolvingdoor", "--impl", "c", "--control", "position", "--set", "episode_length=0.2"]
+    small = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "32", "--ppo.minibatches", "1"]
+    runs = [str(tmp_path / name) for name in "ab"]
+    for seed, run in enumerate(runs):
+        assert cli.main(["train", *task, *small, "--seed", str(seed), "--run-dir", run]) == 0
+    assert load_policy(runs[0]).agents == 1
+    capfd.readouterr()
+    assert cli.main(["eval", runs[0], "--opponent", runs[1], "--episodes", "4", "--num-envs", "2", "--json"]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["win_rate"] + result["draw_rate"] + result["loss_rate"] == pytest.approx(1.0)
+
+
+def even(task: str, episodes: int, num_envs: int) -> None:
+    """Random weights against themselves: wins minus losses are within 3 standard errors of 0."""
+    env = VectorEnv(make(task, impl="c", num_envs=num_envs), num_envs)
+    policy = new_policy(versus(env, ["idle"]), 3, network={"recurrent": False, "action_gain": 1.0})
+    fight: Versus = versus(env, [policy])
+    result = evaluate(fight, policy.act, episodes, KEY, memory=policy.initial_memory(num_envs))
+    win, loss = result.match["win_rate"], result.match["loss_rate"]
+    error = np.sqrt(max(win + loss - (win - loss) ** 2, 1 / episodes) / episodes)
+    print(f"{task}: {win:.3f} won, {loss:.3f} lost of {episodes}")
+    assert abs(win - loss) < 3 * error
+
+
+def test_random_weights_win_as_often_as_they_lose() -> None:
+    even("go1revolvingdoor", 32, 16)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("task", MATCHES)
+def test_random_weights_win_as_often_as_they_lose_in_every_match(task: str) -> None:
+    even(task, 512, 64)
