@@ -415,9 +415,3 @@ print(load_mjx().__name__)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout == "mujoco.mjx\n"
-
-
-def test_a_policy_file_stands_for_its_run() -> None:
-    file = Path(__file__).parents[1] / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned.safetensors"
-    player = commands.find_player(arguments.parse(["eval", str(file)]))  # pyright: ignore[reportArgumentType]
-    assert player.task == "go1gate" and not isinstance(player.policy, str)

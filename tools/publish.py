@@ -29,7 +29,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import absolute
 from mqe_jax.study.runs import REWARD, Cell, Curve, Run, number, read_runs
-from mqe_jax.train.policy import load_policy, save_policy
+from mqe_jax.train.policy import read_policy, save_policy
 
 ROOT = Path(__file__).parents[1]
 MEASUREMENTS = ROOT / "results" / "measurements.json"
@@ -165,7 +165,7 @@ def publish(sweeps: Sequence[Path], target: Path, policies: Sequence[str]) -> li
         if folder is None or best.absolute is None:
             missing.append(_name(best))
             continue
-        policy = load_policy(folder / "best" / f"step_{best.absolute['env_steps']:012d}.safetensors")
+        policy = read_policy(folder / "best" / f"step_{best.absolute['env_steps']:012d}.safetensors")
         path = target / "policies" / cell.task / f"{cell.path.name}.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         save_policy(path.parent, policy, path.name, half=True)
