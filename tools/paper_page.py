@@ -5,6 +5,7 @@ The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -13,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageColor
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import Cells, aggregate_tables, evaluated, final_reward, final_table, group
-from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles, draw_terms
+from mqe_jax.study.figures import LINES, draw_curves, draw_evaluations, draw_profiles, draw_terms
 from mqe_jax.study.reference import Reference, load_reference
 from mqe_jax.study.report import markdown
 from mqe_jax.study.runs import Cell, Run
@@ -29,6 +31,7 @@ GATE_TERMS = {"reward/approach": "Distance to Target Reward", "reward/success": 
 GATE_STEPS = 20_000_000
 SHAPED = (TUNED, "no-curriculum", "plain-network", "plain-curriculum", "shaped", "shaped-tuned", "unshaped")
 """The tuned settings and changes of them; their training rewards may include shaping."""
+SHADES = 64
 MIN_SEEDS = 3
 """Seeds that a verdict requires: the interval of a single seed is a point."""
 
@@ -96,7 +99,8 @@ def update(runs: Sequence[Run], folder: Path, page: Path) -> None:
         InputError: if the page lacks a section.
     """
     study = Study(runs, folder)
-    for name, content in figures(study).items():
+    for name, figure in figures(study).items():
+        content = reduced(figure)
         if not (path := page.parent / name).is_file() or path.read_bytes() != content:
             write_atomically(path, content)
     write_atomically(page, filled(page.read_text(encoding="utf-8"), study).encode())
@@ -120,6 +124,19 @@ def figures(study: Study) -> dict[str, bytes]:
         "profiles.png": draw_profiles(study.drawn, study.reference),
         "gate_terms.png": draw_terms(gate, GATE_TERMS, "Narrow Gate, MAPPO", GATE_STEPS),
     }
+
+
+def reduced(png: bytes) -> bytes:
+    """Returns a PNG with a palette of the exact colours of lines and `SHADES` others, a quarter of the size."""
+    image = Image.open(io.BytesIO(png)).convert("RGB")
+    lines = np.array([ImageColor.getrgb(color) for color in (*LINES, "#ffffff")])
+    shades = np.array(image.quantize(SHADES, dither=Image.Dither.NONE).getpalette())[: 3 * SHADES].reshape(-1, 3)
+    distances = np.abs(shades[:, None] - lines).max(axis=-1).min(axis=-1)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*lines.ravel(), *shades[distances > 8].ravel()])  # Pillow may confuse nearer ones
+    small = io.BytesIO()
+    image.quantize(palette=palette, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
+    return small.getvalue()
 
 
 def filled(text: str, study: Study) -> str:

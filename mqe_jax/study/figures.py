@@ -20,12 +20,8 @@ _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
 _COLORS_OF_TERMS = (_COLORS["jrpo"], _COLORS["mappo"], _COLORS["mat"])
 _DASHES = (0, (4, 3))
 _COLORS_OF_VARIANTS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
-_LINES = (*_COLORS_OF_VARIANTS, _PALE, "#ffffff")
-"""Colours that a PNG has exactly."""
-_SHADES = 64
-"""Maximum number of further colours of a PNG: with these it has a quarter of its size."""
-_NEAR = 8
-"""Difference to an exact colour, of 255, up to which Pillow could take a further one in its place."""
+LINES = (*_COLORS_OF_VARIANTS, _PALE)
+"""Colours of all lines."""
 
 
 def _figure(width: float, height: float) -> Any:
@@ -38,18 +34,9 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _png(figure: Any) -> bytes:
-    from PIL import Image, ImageColor
-
-    content, small = io.BytesIO(), io.BytesIO()
+    content = io.BytesIO()
     figure.savefig(content, format="png")
-    image = Image.open(content).convert("RGB")
-    lines = np.array([ImageColor.getrgb(color) for color in _LINES])
-    shades = np.array(image.quantize(_SHADES, dither=Image.Dither.NONE).getpalette())[: 3 * _SHADES].reshape(-1, 3)
-    distances = np.abs(shades[:, None] - lines).max(axis=-1).min(axis=-1)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([*lines.ravel(), *shades[distances > _NEAR].ravel()])
-    image.quantize(palette=palette, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
-    return small.getvalue()
+    return content.getvalue()
 
 
 def _color(algorithm: str, algorithms: Sequence[str]) -> str:

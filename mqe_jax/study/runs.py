@@ -109,7 +109,7 @@ def read_curve(path: Path) -> Curve:
             rows = list(reader)
             curve = {name: np.array([float(row[name]) for row in rows]) for name in reader.fieldnames or []}
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError(f"{path}: no such file; a run folder has one after its first update") from None
     except (OSError, TypeError, ValueError):
         raise InputError(f"{path}: is not a metrics.csv") from None
     if not {"env_steps", REWARD} <= set(curve) or not rows:

@@ -35,11 +35,6 @@ def interquartile_mean(scores: ArrayLike) -> Array:
     return np.sort(flat, axis=-1)[..., cut : flat.shape[-1] - cut].mean(axis=-1)
 
 
-def mean(scores: ArrayLike) -> Array:
-    """Returns the mean of all scores: (..., runs, tasks) -> (...)."""
-    return _flat(np.asarray(scores, np.float64)).mean(axis=-1)
-
-
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
     """Returns the fraction of scores above each threshold: (..., runs, tasks), (K,) -> (..., K)."""
     flat = _flat(np.asarray(scores, np.float64))
