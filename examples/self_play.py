@@ -17,12 +17,12 @@ from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.policy import policy_of
 
 
-def main(num_envs: int = 64, updates: int = 30, snapshot_every: int = 10, episodes: int = 64) -> list[EvalResult]:
+def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episodes: int = 32) -> list[EvalResult]:
     """Trains, and returns evaluations against the last snapshot and the scripted policy."""
     network = {"recurrent": False, "hidden_sizes": [64, 64], "layer_norm": True}
     settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
     config = build(TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True})
-    matches = VectorEnv(make("go1wrestling", num_envs=num_envs), num_envs)
+    matches = VectorEnv(make("go1wrestling", episode_length=5.0, num_envs=num_envs), num_envs)
 
     one_team = versus(matches, ["idle"])  # for the sizes of a policy; its first snapshot is untrained
     learner = make_learner(one_team, config)

@@ -21,6 +21,7 @@ from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.monitor import score
 from mqe_jax.train.policy import TrainedPolicy, policy_of
 
 KEY = jax.random.PRNGKey(0)
@@ -200,6 +201,16 @@ def test_the_command_line_plays_two_runs_against_each_other(tmp_path: Path, capf
     assert cli.main(["eval", runs[0], "--opponent", runs[1], "--episodes", "4", "--num-envs", "2", "--json"]) == 0
     result = json.loads(capfd.readouterr().out)
     assert result["win_rate"] + result["draw_rate"] + result["loss_rate"] == pytest.approx(1.0)
+
+
+def test_the_best_policy_of_a_match_is_the_one_that_wins_most() -> None:
+    def evaluation(**sampled: float | None) -> dict[str, Any]:
+        return {"sampled": sampled}
+
+    often = evaluation(win_rate=0.6, average_step_reward=-0.1)
+    seldom = evaluation(win_rate=0.5, average_step_reward=0.2)
+    assert score(often) > score(seldom) > score(evaluation(win_rate=0.5, average_step_reward=0.1))
+    assert score(evaluation(average_step_reward=0.2)) > score(evaluation(average_step_reward=None))
 
 
 def even(task: str, episodes: int, num_envs: int) -> None:

@@ -92,21 +92,10 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     assert float(metrics["episode_length"]) == 4.0
 
 
-@pytest.mark.parametrize("ratio", ["joint", "agent"])
-def test_joint_values_and_ratios_of_a_match_are_per_team(ratio: str) -> None:
-    """In a zero-sum match the values of the teams are opposite and both learn; averaged over both all would be 0."""
-    env = Probe(probes.show_step_and_parity, probes.pay_own_side, num_envs=32, features=5, teams=((1,), (0,)))
-    config = small(ppo={"ratio": ratio, "value": "joint", "gamma": 0.5}, network__critic_input="observations")
-    state, metrics = learn(env, config, 40)
-    network = make_learner(env, config).network
-    obs = state.rollout.env_state.obs[None]
-    value, _ = network.value(state.params, (), jnp.zeros((1, 32), bool), obs, jnp.zeros((1, 32, 5)))
-    value = value_denormalize(state.value_normalizer, value)[0]
-    assert value.shape == (32, 2)
-    assert float(value[:, 0].min()) > 0.5 and float(value[:, 1].max()) < -0.5
-    assert float(metrics["episode_return"]) > 2.0  # of the first team, 4 steps of about 1
-    mean, _, _ = network.act(network.policy_params(state.params), (), obs[0], None)
-    assert float(jnp.mean(mean[:, 0])) < -0.3 and float(jnp.mean(mean[:, 1])) > 0.3
+def test_an_environment_of_two_teams_is_refused() -> None:
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=32, teams=((1,), (0,)))
+    with pytest.raises(ValueError, match="probe has 2 teams"):
+        make_learner(env, small())
 
 
 def test_memory_carries_a_sign_through_an_episode() -> None:

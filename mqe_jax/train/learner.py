@@ -168,6 +168,9 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
 
 def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
+    if len(teams_of(env)) > 1:
+        count = len(teams_of(env))
+        raise InputError(f"env: {env.name} has {count} teams; give one: versus(env, opponents) or Mirror(env)")
     if env.num_envs != config.num_envs:
         fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
