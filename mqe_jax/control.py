@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
+from mqe_jax.engines import Engine
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.walk_policy import WalkMemory
@@ -143,7 +143,7 @@ class Controller:
     """Action mode: one of `MODES`."""
     robot: Robot
     """Robot type shared by all R robots."""
-    physics: Physics
+    physics: Engine
     """Physics of the environment."""
     index: RobotIndex
     """Index tables of the robots."""
@@ -241,8 +241,7 @@ class Controller:
         scatter = lambda values: jnp.zeros(self.physics.model.nu).at[self.index.actuator].set(values)  # noqa: E731
         params = self.actuator_params
         if params is None:
-            step = self.physics.step_with_overflow
-            data, overflow = step(data, scatter(target), fields=fields, xfrc_applied=xfrc_applied)
+            data, overflow = self.physics.step(data, scatter(target), fields=fields, xfrc_applied=xfrc_applied)
             return data, state, overflow
 
         def substep(
@@ -253,7 +252,7 @@ class Controller:
             velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
             limit = self.robot.torque_limit
             torque = jnp.clip(actuator_torque(params, errors, velocities), -limit, limit)
-            data, overflow = self.physics.step_with_overflow(
+            data, overflow = self.physics.step(
                 data, scatter(torque), fields=fields, xfrc_applied=xfrc_applied, num_substeps=1
             )
             return (data, errors[:2], velocities[:2]), overflow

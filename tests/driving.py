@@ -55,7 +55,7 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
 
         def one(data: Any, _: None) -> Any:
             old = data.qpos[:, joints]
-            data = jax.vmap(lambda d, t: env.physics.step(d, t.ravel(), num_substeps=1))(data, target)
+            data = jax.vmap(lambda d, t: env.physics.step(d, t.ravel(), num_substeps=1)[0])(data, target)
             return data, (jnp.abs(data.qpos[:, joints] - old) / timestep, data.qpos[:, joints])
 
         speed, angle = jax.lax.scan(one, state.data, None, env.physics.num_substeps)[1]

@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import PLANNERS, TASKS, State, VectorEnv, make
-from mqe_jax.physics import STATE_FIELDS
 from mqe_jax.planners import scripted_policy
 
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared

@@ -72,7 +72,7 @@ class FakeEnv:
 
     def __init__(self) -> None:
         self.mj_model = mujoco.MjModel.from_xml_string(XML)
-        self.physics = SimpleNamespace(impl="none", step=lambda data, ctrl: data)
+        self.physics = SimpleNamespace(impl="none", step=lambda data, ctrl: (data, False))
         self.robot_x = np.array([0, 19])
 
     def reset(self, key: jax.Array) -> FakeState:

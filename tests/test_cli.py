@@ -16,11 +16,14 @@ from fake_env import FakeEnv, FakeVectorEnv
 import mqe_jax
 from mqe_jax import cli
 from mqe_jax.cli import arguments, commands, setup, view
+from mqe_jax.cli.train_arguments import parse_train
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.policies import load_policy
+from mqe_jax.settings import override
 from mqe_jax.train import checkpoint
+from mqe_jax.train.mat import Mat
 from mqe_jax.train.nn import mlp_init
 from mqe_jax.viz import recording
 
@@ -84,7 +87,7 @@ def test_every_training_setting_has_a_flag_with_its_meaning(capfd: pytest.Captur
         cli.main(["train", "--help"])
     out = " ".join(capfd.readouterr().out.replace("│", " ").split())
     assert "--ppo.gae-lambda" in out and "Trace decay of generalised advantage estimation." in out
-    assert "a number between 0 and 1; default: 0.95" in out
+    assert "--ppo.gae-lambda FLOAT" in out and "(default: 0.95)" in out
     assert "--network.hidden-sizes" in out and "--seed" in out
 
 
@@ -273,8 +276,6 @@ def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
 
 BAD = {
     "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
-    "flag": (["bench", "--nope", "3"], ["--nope"]),
-    "number": (["eval", "fake", "--episodes", "many"], ["episodes", "many"]),
     "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
@@ -303,9 +304,6 @@ BAD = {
     "no run": (["eval", "."], ["config.yaml"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
     "config file": (["train", "fake", "--config", "none.yaml"], ["none.yaml"]),
-    "setting": (["train", "fake", "--ppo.gamma", "2"], ["ppo.gamma", "2", "between 0 and 1"]),
-    "setting's type": (["train", "fake", "--ppo.clip", "much"], ["ppo.clip: 'much'", "a number greater than 0"]),
-    "network's setting": (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network.hidden_sizes: [8, 0]"]),
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),
     "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
@@ -314,7 +312,6 @@ BAD = {
         ["dump_diverged: /proc/none cannot be written"],
     ),
     "negative seed": (["eval", "fake", "--seed", "-1"], ["seed: -1 is not allowed", "between 0 and 4294967295"]),
-    "large seed": (["train", "fake", "--seed", "99999999999999999999"], ["seed: 99999999999999999999", "4294967296"]),
     "recording": (["replay", "none.npz"], ["none.npz"]),
     "weights": (["walk", "eval", "--weights", "none.safetensors"], ["none.safetensors"]),
     "checkpoint": (["walk", "convert", "a.jit", "b.jit", "-o", "w.safetensors"], ["a.jit"]),
@@ -337,6 +334,38 @@ def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: py
         assert cli.main(["eval", "go1tug", flag, str(run_folder)]) == 2
         err = capfd.readouterr().err
         assert err.startswith(f"mqe: {flag[2:]}: ") and "was trained on fake, not on go1tug" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["bench", "--nope", "3"], ["--nope"]),
+        (["eval", "fake", "--episodes", "many"], ["episodes", "many"]),
+        (["train", "fake", "--ppo.gamma", "2"], ["ppo: gamma: 2.0", "between 0 and 1"]),
+        (["train", "fake", "--ppo.clip", "much"], ["ppo.clip", "'much'"]),
+        (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network: hidden_sizes: (8, 0)"]),
+        (["train", "fake", "--network.heads", "2"], ["--network.heads"]),
+        (["train", "fake", "--seed", "99999999999999999999"], ["seed: 99999999999999999999", "4294967296"]),
+    ],
+    ids=str,
+)
+def test_wrong_flags_are_named_by_tyro(
+    arguments: list[str], said: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(arguments) == 2
+    out, err = capfd.readouterr()
+    shown = " ".join(err.replace("│", " ").split())
+    assert out == "" and all(word in shown for word in said), shown
+
+
+def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
+    parsed = parse_train(["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"])
+    assert parsed.settings == override(
+        setup.base_config("go1gate", "demo"), {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
+    )
+    parsed = parse_train(["--network.name", "mat", "--network.heads", "2", "go1gate", "--checkpoint.no-environments"])
+    assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
+    assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
 
 
 def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -404,9 +433,10 @@ def test_tasks_are_listed_without_importing_mjx() -> None:
 
 
 def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:
-    assert setup.train_config("go1seesaw", "demo").task == "go1seesaw"
-    assert "the settings of demo are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
-    setup.train_config("go1gate", "demo")
+    demo = setup.base_config("go1seesaw", "demo")
+    assert setup.for_task(demo, "go1seesaw").task == "go1seesaw"
+    assert "the settings are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
+    setup.for_task(demo, "go1gate")
     assert not capfd.readouterr().err
 
 
@@ -418,8 +448,13 @@ class Missing:
         if name.split(".")[0] == "warp":
             raise ModuleNotFoundError("No module named 'warp'")
 sys.meta_path.insert(0, Missing())
-from mqe_jax.physics import load_mjx
+from mqe_jax.engines.private import load_mjx
 print(load_mjx().__name__)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout == "mujoco.mjx\n"
+
+
+def test_a_policy_file_knows_its_task() -> None:
+    file = Path(__file__).parents[1] / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned.safetensors"
+    assert load_policy(file).config.task == "go1gate"

@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from mqe_jax import engines
 from mqe_jax.envs import TASKS
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
-from mqe_jax.physics import Physics
 from mqe_jax.robots import read_robots
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, SpawnArea, Track
-from tests import engines
+from tests import engines as comparison
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a single step
 # Far apart, so that only the first robot touches them; the second one stands at x = 1.
@@ -91,9 +91,9 @@ def test_a_robot_meets_everything_alike_on_two_engines() -> None:
     )
     force, states = {}, {}
     for impl in ("c", "jax"):
-        physics = Physics(scene.model, impl=impl, num_substeps=1)
+        physics = engines.make(scene.model, impl=impl, num_substeps=1)
         state = jax.vmap(physics.init)(qpos, qvel, mocap_pos, ctrl)
-        step = jax.jit(jax.vmap(lambda data, physics=physics: physics.step_with_overflow(data, data.ctrl)))
+        step = jax.jit(jax.vmap(lambda data, physics=physics: physics.step(data, data.ctrl)))
         step = step.lower(state).compile(compiler_options=QUICK)
         for substep in range(4):
             state, overflow = step(state)
@@ -117,7 +117,7 @@ def test_a_robot_meets_everything_alike_on_two_engines() -> None:
 @pytest.mark.parametrize("task", list(TASKS))
 def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
     """Standing robots and episodes in play under random joint targets: contacts make small differences grow."""
-    figures = engines.disagreement(task, "jax", engines.record(task, num_envs=4))
+    figures = comparison.disagreement(task, "jax", comparison.record(task, num_envs=4))
     assert figures["standing/robots_1"] < 1e-3, figures
     assert figures["standing/robots_20"] < 0.02 and figures["standing/robots_20_max"] < 0.1, figures
     assert figures.get("standing/objects_20_max", 0.0) < 0.02, figures
@@ -130,6 +130,6 @@ def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
 @pytest.mark.parametrize("task", ["go1pushbox", "go1football-defender", "go1wrestling"])
 def test_mjx_agrees_with_the_c_engine_where_the_solver_converges(task: str) -> None:
     """With the default limit of 4 iterations some steps end before convergence, differently on each engine."""
-    figures = engines.disagreement(task, "jax", engines.record(task, num_envs=8, solver_iterations=20))
+    figures = comparison.disagreement(task, "jax", comparison.record(task, num_envs=8, solver_iterations=20))
     assert figures["standing/robots_1"] < 1e-4 and figures["play/robots_1"] < 1e-3, figures
     assert figures["standing/robots_20"] < 1e-4 and figures["play/robots_20"] < 1e-3, figures

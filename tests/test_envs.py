@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax.engines import Engine
 from mqe_jax.envs import TASKS, QuadrupedEnv, Randomization, State, VectorEnv, make, replay
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
-from mqe_jax.physics import Physics
 from tests.states import initial, made, moving, placed, robot_state
 
 Array = jax.Array
@@ -153,7 +153,7 @@ def test_two_engines_step_alike(task: str) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_two_engines_return_the_same_shapes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The task's code accepts the state of both; their physics, which takes seconds to trace, stands still."""
-    monkeypatch.setattr(Physics, "step_with_overflow", lambda self, data, ctrl, **_: (data, jnp.zeros((), bool)))
+    monkeypatch.setattr(Engine, "step", lambda self, data, ctrl, **_: (data, jnp.zeros((), bool)))
     shapes = []
     for env in (made(task), make(task, impl="jax", control="position", num_envs=2)):
         batch, action = VectorEnv(env, 2), jnp.zeros((2, env.num_agents, 12))
@@ -292,7 +292,7 @@ def test_randomisation_reaches_the_physics() -> None:
     ("call", "message"),
     [
         (lambda: make("go1gat"), r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate"),
-        (lambda: make("go1gate", impl="mjx"), r"impl: unknown engine 'mjx'.*allowed: auto, jax, warp, c"),
+        (lambda: make("go1gate", impl="mjx"), r"impl: unknown engine 'mjx'.*allowed: auto, warp, c, jax"),
         (lambda: make("go1gate", control="comand"), r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
         (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown name .*did you mean 'gate_width'"),
         (lambda: make("go1gate", rewards={"colision": 1.0}), r"rewards.colision.*did you mean 'collision'"),
@@ -444,7 +444,7 @@ def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
     fields = jax.vmap(env.randomizer.fields)(state.randomized)
 
     def fall(data: Any, fields: dict[str, Array]) -> Array:
-        return env.physics.step(data, data.ctrl, fields=fields, num_substeps=20).qvel
+        return env.physics.step(data, data.ctrl, fields=fields, num_substeps=20)[0].qvel
 
     after = np.asarray(jax.jit(jax.vmap(fall))(start, fields))
     for number in (0, 1):

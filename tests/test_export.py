@@ -31,7 +31,7 @@ from mqe_jax.export.check import errors, record  # noqa: E402
 from mqe_jax.export.policy import input_shapes, policy_step, shapes, to_onnx  # noqa: E402
 
 POLICIES = Path(__file__).parents[1] / "results" / "paper" / "policies"
-GATE = POLICIES / "go1gate" / "mappo+tuned"
+GATE = POLICIES / "go1gate" / "mappo+tuned.safetensors"
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
 
 
@@ -63,7 +63,7 @@ def error_on_random_inputs(policy: TrainedPolicy, env: Any) -> float:
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
     """The command compares the graph with JAX on episodes, and prints the largest error."""
-    run, file = POLICIES / "go1football-defender" / "mappo+tuned", tmp_path / "football.onnx"
+    run, file = POLICIES / "go1football-defender" / "mappo+tuned.safetensors", tmp_path / "football.onnx"
     assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
     assert 0.0 < said["largest_error"] < 1e-5
@@ -161,7 +161,7 @@ def test_a_registered_network_is_exported_with_all_its_recurrent_states(monkeypa
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("run", sorted(path.parent for path in POLICIES.glob("*/*/policy.safetensors")), ids=str)
+@pytest.mark.parametrize("run", sorted(POLICIES.glob("*/*.safetensors")), ids=str)
 def test_every_published_policy_agrees_on_a_thousand_steps(run: Path) -> None:
     policy = load_policy(run)
     env = make(str(policy.config.task), impl="c", num_envs=1, **policy.config.env)

@@ -108,7 +108,7 @@ def test_engines_agree_where_motors_saturate() -> None:
         speed = 0.9 * env.robot.joint_speed_limit * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
         data = state.data.replace(qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(speed))
         torque = jnp.where(speed > 0, 1.0, -1.0) * env.robot.torque_limit
-        step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)))
+        step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)[0]))
         states[impl] = step.lower(data, torque).compile(compiler_options=QUICK)(data, torque)
     for field, atol in (("qpos", 1e-4), ("qvel", 0.02)):
         c, other = (np.asarray(getattr(states[impl], field)) for impl in ("c", "jax"))

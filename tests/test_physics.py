@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from mqe_jax import make, physics
+from mqe_jax import engines, make
+from mqe_jax.engines import private
+from mqe_jax.engines.c import CEngine
+from mqe_jax.engines.mjx_step import MarginStep
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
-from mqe_jax.mjx_step import MarginStep
-from mqe_jax.physics import Physics
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -61,9 +62,9 @@ def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> N
     qpos, qvel, ctrl = standing(plane)
     reference = mujoco.MjData(plane.model)
     reference.qpos[:], reference.qvel[:], reference.ctrl[:] = qpos, qvel, ctrl
-    engine = Physics(plane.model, impl=impl, num_envs=1, num_substeps=1)
+    engine = engines.make(plane.model, impl=impl, num_envs=1, num_substeps=1)
     data = engine.init(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros((0, 3)), jnp.asarray(ctrl))
-    step = jax.jit(jax.vmap(lambda state: engine.step(state, jnp.asarray(ctrl))))
+    step = jax.jit(jax.vmap(lambda state: engine.step(state, jnp.asarray(ctrl))[0]))
     data = jax.vmap(lambda _: data)(jnp.zeros(1))
     data = step(data)
     mujoco.mj_step(plane.model, reference)
@@ -126,7 +127,7 @@ def test_contacts_with_boxes_are_those_of_the_c_engine() -> None:
     qpos, step = poses(model).astype(np.float32), MarginStep(model)
     fresh = mjx.make_data(model, impl="jax")
     after = jax.jit(jax.vmap(lambda q: step(step.model, fresh.replace(qpos=q))))(jnp.asarray(qpos))
-    contact = jax.tree.map(np.asarray, after._impl.contact)
+    contact = jax.tree.map(np.asarray, private.contact(after))
     reference, floor, wall = mujoco.MjData(model), model.geom("floor").id, model.geom("wall").id
     for number, q in enumerate(qpos):
         reference.qpos[:] = q
@@ -198,7 +199,7 @@ def test_trunk_force_is_read(impl: str) -> None:
     low = state.data.qpos.at[index.base_qpos[0, 2]].set(0.05)
     both = jax.vmap(lambda qpos: state.data.replace(qpos=qpos))(jnp.stack([near, low]))
     ctrl = jnp.asarray(state.data.ctrl)
-    after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)))(both)
+    after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)[0]))(both)
     robot_state = jax.vmap(env.read)(after)
     assert float(robot_state.trunk_force[0].min()) > 1.0
     assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
@@ -219,4 +220,29 @@ def test_gate_stands_where_each_environment_drew_it() -> None:
 
 def test_engine_names_are_checked() -> None:
     with pytest.raises(ValueError, match=r"impl.*'wrap'.*did you mean 'warp'"):
-        physics.resolve_impl("wrap")
+        engines.resolve("wrap")
+
+
+class Frozen(CEngine):
+    """An engine on which nothing moves."""
+
+    impl = "frozen"
+
+    def advance(self, data: Any, fields: Any, forced: bool, num_substeps: int) -> tuple[Any, jax.Array]:
+        return data, jnp.ones((), bool)
+
+
+def test_a_new_engine_is_one_class_and_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(engines.ENGINES, "frozen", f"{__name__}:Frozen")
+    env = make("go1gate", impl="frozen", control="position")
+    state = env.reset(jax.random.PRNGKey(0))
+    after = jax.jit(env.step)(state, jnp.ones((2, 12)))
+    np.testing.assert_array_equal(after.data.qpos, state.data.qpos)
+    assert env.impl == "frozen" and float(after.metrics["overflow"]) == 1.0
+    assert engines.resolve() != "frozen"
+
+
+def test_an_engine_that_cannot_run_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(private, "warp_is_installed", lambda: False)
+    with pytest.raises(ValueError, match=r"impl 'warp' needs the package warp-lang"):
+        engines.resolve("warp")

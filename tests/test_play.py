@@ -74,7 +74,7 @@ def test_the_written_scene_is_the_tasks_physics(task: str) -> None:
         np.testing.assert_allclose(walls, state.data.mocap_pos, atol=1e-6)
     after = state.data
     for _ in range(10):
-        after = env.physics.step(after, state.data.ctrl)
+        after, _ = env.physics.step(after, state.data.ctrl)
         mujoco.mj_step(model, data, settings["substeps"])
     np.testing.assert_allclose(data.qpos, after.qpos, atol=1e-4)
 

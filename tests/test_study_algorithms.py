@@ -12,7 +12,7 @@ import probes
 import pytest
 from probes import Probe
 
-from mqe_jax.cli.setup import train_config
+from mqe_jax.cli.setup import base_config
 from mqe_jax.errors import InputError
 from mqe_jax.settings import override
 from mqe_jax.train.actor_critic import ActorCritic
@@ -74,7 +74,7 @@ def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
     """The preset changes nothing in the paper's file but MAPPO's ratio, which OpenRL takes per dimension."""
-    config = train_config("go1gate", None, algorithm=algorithm)
+    config = base_config("go1gate", None, algorithm)
     again = override(override(config, preset(algorithm)), {"ppo.ratio": config.ppo.ratio})
     assert again == config, algorithm
     assert config.action_scale == 0.5 and config.num_envs == 500 and config.total_steps == 40_000_000
@@ -82,23 +82,21 @@ def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
 
 
 def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
-    demo = train_config("go1gate", "demo")
-    joint = train_config("go1gate", "demo", {"seed": 3}, {"gate_width": 1.0}, "jrpo")
-    assert (joint.ppo.ratio, joint.ppo.value, joint.seed) == ("joint", "joint", 3)
-    assert joint.network == demo.network and joint.env == {"gate_width": 1.0}
-    assert train_config("go1gate", "demo", algorithm="mat").network == Mat()
+    demo, joint = base_config("go1gate", "demo"), base_config("go1gate", "demo", "jrpo")
+    assert (joint.ppo.ratio, joint.ppo.value) == ("joint", "joint") and joint.network == demo.network
+    assert base_config("go1gate", "demo", "mat").network == Mat()
 
 
 def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
-    assert train_config("go1gate", None) == train_config("go1gate", "tuned/go1gate")
-    assert train_config("go1plane", None) == train_config("go1plane", "paper/mappo")
+    assert base_config("go1gate", None) == base_config("go1gate", "tuned/go1gate")
+    assert base_config("go1plane", None) == base_config("go1plane", "paper/mappo")
 
 
 def test_unknown_names_get_the_nearest() -> None:
     with pytest.raises(InputError, match=r"algorithm: 'mapo'.*did you mean 'mappo'"):
-        train_config("go1gate", "demo", algorithm="mapo")
+        base_config("go1gate", "demo", "mapo")
     with pytest.raises(InputError, match=r"config: unknown name 'deno' \(did you mean 'demo'"):
-        train_config("go1gate", "deno")
+        base_config("go1gate", "deno")
 
 
 def test_every_algorithm_has_the_papers_settings() -> None:

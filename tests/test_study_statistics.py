@@ -1,4 +1,7 @@
-"""Statistics of few runs, compared with the `rliable` package (tools/rliable_fixture.py)."""
+"""Statistics of few runs, compared with the package `rliable` 1.2.0 on random matrices (data/rliable.json).
+
+The package samples its bootstrap from numpy's global state, which was seeded before each interval.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import pytest
 from mqe_jax.errors import InputError
 from mqe_jax.study import statistics
 from mqe_jax.study.marl_eval import to_marl_eval
+from mqe_jax.study.runs import Cell, Run
 
 FIXTURE = json.loads((Path(__file__).parent / "data" / "rliable.json").read_text(encoding="utf-8"))
 CASES = pytest.mark.parametrize("case", FIXTURE["cases"], ids=lambda case: str(np.shape(case["x"])))
@@ -88,14 +92,10 @@ def test_normalized_scores_are_fractions_of_a_tasks_range() -> None:
 
 def test_marl_eval_export_has_the_documented_nesting() -> None:
     point = {"env_steps": 10, "sampled": {"average_step_reward": 0.5, "success_rate": 0.25}}
-    run = {
-        "task": "go1gate",
-        "algorithm": "mappo",
-        "seed": 3,
-        "evaluations": [point, {**point, "env_steps": 20}],
-        "absolute": {**point, "env_steps": 20},
-    }
-    exported = to_marl_eval([run])
+    run = Run(Cell("go1gate", "mappo"), 3, {}, [point, {**point, "env_steps": 20}], {**point, "env_steps": 20})
+    variant = Run(Cell("go1gate", "mappo", "tuned"), 3, {}, [], None)
+    exported = to_marl_eval([run, variant])
+    assert list(exported["mqe"]) == ["go1gate"]
     seed = exported["mqe"]["go1gate"]["mappo"]["seed_3"]
     assert list(seed) == ["step_1", "step_2", "absolute_metrics"]
     assert seed["step_2"] == {"step_count": 20, "average_step_reward": [0.5], "success_rate": [0.25]}

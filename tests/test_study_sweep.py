@@ -1,8 +1,7 @@
-"""Sweeps on a probe: what is left, stops at any moment, raw data and report at the end."""
+"""Sweeps on a probe: what is left, stops at any moment, complete run folders and a report at the end."""
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -18,8 +17,8 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import locked
 from mqe_jax.settings import build, override
 from mqe_jax.study import sweep as sweeps
+from mqe_jax.study.runs import read_runs
 from mqe_jax.study.sweep import Sweep
-from mqe_jax.train import runner
 from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig
 
@@ -80,17 +79,17 @@ def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) ->
     assert not run_until(folder, sweep, 5)
     assert [job.cell.algorithm for job in sweeps.plan(sweep, folder, config_of)] == ["jrpo"]
     assert sweeps.estimate(folder, left)[0] > 0
-    (folder / "raw" / "go1gate" / "mappo" / "seed1.json").unlink()  # killed before the last record was written
+    path = folder / "runs" / "go1gate" / "mappo" / "seed1" / "evaluations.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "absolute": None}))  # killed before its last file
+    assert sweeps.plan(sweep, folder, config_of)[0].folders == (path.parent,)
     assert run_until(folder, sweep, 100)
     assert sweeps.plan(sweep, folder, config_of) == []
-    for algorithm in ("mappo", "jrpo"):
-        for seed in (0, 1):
-            path = folder / "raw" / "go1gate" / algorithm / f"seed{seed}"
-            record = json.loads(path.with_suffix(".json").read_text())
-            assert record["evaluations"]["env_steps"] == [32, 48]
-            assert record["absolute"]["episodes"] == 40
-            steps = [row["env_steps"] for row in csv.DictReader(path.with_suffix(".csv").open())]
-            assert steps == ["16", "32", "48"]
+    runs = read_runs(folder)
+    assert [(run.cell.algorithm, run.seed) for run in runs] == [("jrpo", 0), ("jrpo", 1), ("mappo", 0), ("mappo", 1)]
+    for run in runs:
+        assert [point["env_steps"] for point in run.evaluations] == [32, 48]
+        assert run.absolute is not None and run.absolute["episodes"] == 40
+        assert list(run.curve["env_steps"]) == [16, 32, 48]
 
 
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
@@ -125,11 +124,11 @@ def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:
     assert [job.steps_left for job in jobs] == [16, 96]
 
 
-def test_variants_are_settings_of_the_study(tmp_path: Path) -> None:
-    text = FILE + "variants: {hierarchical: {}, scratch: {env: {control: position}}}\nseeds_together: 1\n"
+def test_variants_override_the_settings(tmp_path: Path) -> None:
+    text = FILE + "variants: {plain: {}, scratch: {env: {control: position}}}\nseeds_together: 1\n"
     jobs = sweeps.plan(load(tmp_path, text), tmp_path, config_of)
     assert len(jobs) == 8
-    scratch = [job for job in jobs if job.cell.setting == "scratch"]
+    scratch = [job for job in jobs if job.cell.variant == "scratch"]
     assert scratch[0].configs[0].env == {"control": "position"}
     assert scratch[0].folders[0] == tmp_path / "runs" / "go1gate" / "mappo+scratch" / "seed0"
 
@@ -168,7 +167,7 @@ def test_a_wrong_setting_is_named_with_its_place(text: str, name: str, tmp_path:
 
 
 def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:
-    text = FILE + "variants: {hierarchical: {}, scratch: {env: {control: position}}}\n"
+    text = FILE + "variants: {plain: {}, scratch: {env: {control: position}}}\n"
     sweep = load(tmp_path, text)
 
     def names(*patterns: str) -> list[str]:
@@ -194,27 +193,29 @@ def test_the_commands_say_what_is_left_and_report(
 ) -> None:
     load(tmp_path)
     monkeypatch.setattr(study_commands, "environments", lambda impl, config, seeds: (PROBE, PROBE))
-    trained = []
-    monkeypatch.setattr(sweeps, "train_seeds", lambda env, configs, *rest: trained.append(configs) or _pretend(*rest))
     arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]
     assert cli.main([*arguments, "--dry-run"]) == 0
     out = capfd.readouterr().out
-    assert "go1gate jrpo hierarchical" in out and "time unknown" in out and not (tmp_path / "study").exists()
+    assert "go1gate jrpo plain" in out and "time unknown" in out and not (tmp_path / "study").exists()
     assert cli.main([*arguments, "--cells", "*/mappo", "--json"]) == 0
-    result = json.loads(capfd.readouterr().out)
-    assert result["left"]["jobs"] == [] and [configs[0].ppo.ratio for configs in trained] == ["dimension"]
+    assert json.loads(capfd.readouterr().out)["left"]["jobs"] == []
+    assert [run.cell.algorithm for run in read_runs(tmp_path / "study")] == ["mappo", "mappo"]
     assert cli.main([*arguments, "--json"]) == 0
-    result = json.loads(capfd.readouterr().out)
-    assert result["left"]["jobs"] == [] and len(trained) == 2
-    assert "| go1gate | mappo |" in (tmp_path / "study" / "report" / "report.md").read_text()
-    assert cli.main(["report", str(tmp_path / "study")]) == 0
+    assert json.loads(capfd.readouterr().out)["left"]["jobs"] == []
+    text = (tmp_path / "study" / "report" / "report.md").read_text()
+    assert "| go1gate | mappo |" in text and "| go1gate | jrpo |" in text and "reference" not in text
+    (tmp_path / "values.yaml").write_text("label: theirs\nvalues: {plain: {go1gate: {mappo: 123.5}}}")
+    assert cli.main(["report", str(tmp_path / "study"), "--reference", str(tmp_path / "values.yaml")]) == 0
+    text = (tmp_path / "study" / "report" / "report.md").read_text()
+    assert "`reference`: theirs" in text and "| 124 |" in text
     (tmp_path / "small.yaml").write_text("tasks: [go1gat]")
     assert cli.main(arguments) == 2
     assert "did you mean 'go1gate'" in capfd.readouterr().err
 
 
-def _pretend(folders: tuple[Path, ...], *rest: Any) -> None:
-    """Writes the files of a training run."""
-    for folder in folders:
-        folder.mkdir(parents=True)
-        (folder / runner.CSV_FILE).write_text("env_steps,average_step_reward\n16,0.5\n32,0.75\n")
+def test_one_file_may_hold_several_sweeps(tmp_path: Path) -> None:
+    path = tmp_path / "sweeps.yaml"
+    path.write_text("first: {tasks: [go1gate]}\nsecond: {tasks: [go1tug]}")
+    assert sweeps.load_sweep(path, "second").tasks == ("go1tug",)
+    with pytest.raises(InputError, match=r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second"):
+        sweeps.load_sweep(path, "secnd")

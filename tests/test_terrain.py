@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from mqe_jax import engines
 from mqe_jax.errors import InputError
-from mqe_jax.physics import Physics
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import BLOCKS, EndWall, Gate, Plane, RoughGround, SpawnArea, Track, block
@@ -61,7 +61,7 @@ def test_mjx_accepts_rough_ground() -> None:
     """MJX refuses margins beside a height field; `MarginStep` adds those of the robot's shapes later."""
     model = rough_scene().model
     assert model.nhfield == 1 and model.geom_margin.max() > 0.0
-    assert Physics(model, impl="jax", num_envs=1).init(
+    assert engines.make(model, impl="jax", num_envs=1).init(
         jnp.asarray(model.qpos0), jnp.zeros(model.nv), jnp.zeros((0, 3)), jnp.zeros(model.nu)
     ).qpos.shape == (model.nq,)
 
@@ -81,13 +81,13 @@ def test_a_robot_stands_on_rough_ground(impl: str) -> None:
     """At least three feet are on the height field where they stand, and the trunk stays upright."""
     scene = rough_scene()
     model, index = scene.model, scene.index
-    physics = Physics(model, impl=impl, num_envs=1)
+    physics = engines.make(model, impl=impl, num_envs=1)
     qpos = np.array(model.qpos0)
     qpos[index.base_qpos[0]] = [2.0, 0.3, 0.42, 1, 0, 0, 0]
     qpos[index.joint_qpos] = GO1.default_joints
     ctrl = jnp.zeros(model.nu).at[index.actuator].set(GO1.default_joints)
     data = physics.init(jnp.asarray(qpos), jnp.zeros(model.nv), jnp.zeros((0, 3)), ctrl)
-    after = jax.jit(lambda data: jax.lax.scan(lambda d, _: (physics.step(d, ctrl), None), data, None, 50)[0])(data)
+    after = jax.jit(lambda data: jax.lax.scan(lambda d, _: (physics.step(d, ctrl)[0], None), data, None, 50)[0])(data)
     reference = mujoco.MjData(model)
     reference.qpos[:] = after.qpos
     mujoco.mj_kinematics(model, reference)

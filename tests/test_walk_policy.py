@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import pathlib
 import pickle
 import zipfile
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import cli, control, interrupts, robots, walk_policy
+from mqe_jax import cli, control, walk_policy
 from mqe_jax.errors import InputError
-from mqe_jax.files import append
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import Scene
-from mqe_jax.train import checkpoint
-from mqe_jax.walk import convert, training
+from mqe_jax.walk import convert
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.task import WalkTask
-from mqe_jax.walk.training import windows
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
 
 
@@ -232,94 +228,6 @@ def test_memory_shifts_and_advances() -> None:
     np.testing.assert_allclose(target, GO1.default_joints + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5)
     _, memory = walk_policy.walk(GO1, params, memory, *still)
     np.testing.assert_array_equal(memory.previous_action, first)
-
-
-def test_windows_are_the_histories_of_the_rollout() -> None:
-    """The 30-step windows gathered from single observations equal the histories kept step by step."""
-    random = np.random.default_rng(0)
-    steps, envs = 40, 3
-    obs = random.normal(size=(steps, envs, 70)).astype(np.float32)
-    episode_steps = np.arange(steps)[:, None] + np.zeros((1, envs), int)
-    episode_steps[10:, 1] = np.arange(steps - 10)  # environment 1 is reset at step 10
-    history, kept = np.zeros((envs, 30, 70), np.float32), []
-    for t in range(steps):
-        history = np.concatenate(
-            [np.where(episode_steps[t][:, None, None] == 0, 0, history[:, 1:]), obs[t][:, None]], axis=1
-        )
-        kept.append(history)
-    buffer = jnp.concatenate([jnp.zeros((29, envs, 70)), jnp.asarray(obs)])
-    t, n = np.meshgrid(np.arange(steps), np.arange(envs), indexing="ij")
-    found = windows(buffer, jnp.asarray(episode_steps), jnp.asarray(t.ravel()), jnp.asarray(n.ravel()))
-    np.testing.assert_array_equal(found, np.stack(kept).reshape(steps * envs, -1))
-
-
-def test_a_checkpoint_resumes_training_and_is_small_enough_to_carry(tmp_path: pathlib.Path) -> None:
-    """Weights, learning rate, iteration and key are exact, Adam's second moments to 8 bits; at most 16 MB a file."""
-    config = training.WalkConfig()
-    init_train_state = jax.jit(training.init_train_state, static_argnums=(1, 2))
-    learner = init_train_state(jax.random.PRNGKey(0), config, 110)
-    square = jax.tree.map(lambda x: jnp.square(x) + 1e-7, learner.params)
-    learner = dataclasses.replace(
-        learner,
-        optimizer=learner.optimizer._replace(square=square, updates=jnp.int32(40)),
-        learning_rate=jnp.float32(3e-4),
-        iteration=jnp.int32(7),
-    )
-    path = training.save(tmp_path, learner, GO1, config)
-    assert path.stat().st_size < 16e6
-    fresh = init_train_state(jax.random.PRNGKey(1), config, 110)
-    found = training.restore(tmp_path, fresh, GO1)
-    jax.tree.map(np.testing.assert_array_equal, found.params, learner.params)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1 / 128), found.optimizer.square, square)
-    assert int(found.optimizer.updates) == 40 and int(found.iteration) == 7
-    assert float(found.learning_rate) == pytest.approx(3e-4)
-    with pytest.raises(InputError, match=r"trained on go1; resume it with --robot go1, not go2"):
-        training.restore(tmp_path, fresh, robots.get("go2"))
-
-
-class Observed(NamedTuple):
-    obs: jax.Array
-
-
-class WalkStub:
-    """An environment that `train_walk` only resets; `make_iteration` is replaced."""
-
-    robot, privileged_size = GO1, 3
-
-    def reset(self, key: jax.Array, *others: Any) -> Any:
-        return Observed(jnp.zeros(70))
-
-
-def test_training_is_saved_before_a_signal_ends_it_and_resumes_without_doubled_rows(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stop_at = 25
-
-    def make_iteration(*arguments: Any) -> Any:
-        def iterate(state: Any, env_state: Any, history: Any, scale: Any) -> Any:
-            return dataclasses.replace(state, iteration=state.iteration + 1), env_state, history, {"kl": scale}
-
-        return iterate
-
-    def block(metrics: Any) -> None:
-        nonlocal stop_at
-        stop_at -= 1
-        if stop_at == 0:
-            interrupts._acts[-1]()  # as the thread does that a signal wakes up, and then ends the process
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(training, "make_iteration", make_iteration)
-    monkeypatch.setattr(jax, "block_until_ready", block)
-    env: Any = WalkStub()
-    config, policy = training.WalkConfig(num_envs=2, iterations=40), walk_policy.load_params(GO1)
-    with pytest.raises(KeyboardInterrupt):
-        training.train_walk(env, config, tmp_path, policy=policy)
-    names = [path.name for path in checkpoint.list_checkpoints(tmp_path)]
-    assert names == ["step_000000000000.safetensors", "step_000000000024.safetensors"]
-    append(tmp_path / "metrics.csv", b"30,1.0,0.5\n40,1")  # as a killed run leaves it
-    training.train_walk(env, config, tmp_path, resume=True, policy=policy)
-    table = (tmp_path / "metrics.csv").read_text().splitlines()
-    assert [line.split(",")[0] for line in table] == ["iteration", "10", "20", "30", "40"]
 
 
 def test_command_actions_are_the_papers() -> None:

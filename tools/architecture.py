@@ -19,7 +19,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "interrupts", "files", "settings"),
     ("collision", "rotation", "robots"),
     ("terrain", "objects", "npc"),
-    ("scene", "mjx_step", "c_engine", "physics"),
+    ("scene", "engines"),
     ("walk_policy", "control"),
     ("envs", "train"),
     ("planners", "walk"),
@@ -31,7 +31,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 ACROSS = {
     "settings": 0.12, "errors": 0.37, "interrupts": 0.62, "files": 0.87,
     "rotation": 0.86, "collision": 0.3, "robots": 0.58, "terrain": 0.12,
-    "objects": 0.33, "npc": 0.53, "scene": 0.3, "mjx_step": 0.47, "c_engine": 0.64, "physics": 0.82, "walk_policy": 0.5,
+    "objects": 0.33, "npc": 0.53, "scene": 0.3, "engines": 0.7, "walk_policy": 0.5,
     "control": 0.76, "envs": 0.25, "train": 0.9,
     "planners": 0.34, "walk": 0.62, "policies": 0.42, "opponents": 0.7,
     "study": 0.08, "viz": 0.27, "view": 0.46, "export": 0.65,

@@ -44,7 +44,7 @@ def work(case: str, steps: int, repeats: int) -> None:
         return (vector.step(state, action), key), None
 
     whole = jax.jit(lambda carry: jax.lax.scan(step, carry, None, steps)[0])
-    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl))
+    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
     bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
 
     def rate(run: Any, start: Any) -> float:

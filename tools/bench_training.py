@@ -26,7 +26,7 @@ def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, total_
     import jax
     import jax.numpy as jnp
 
-    from mqe_jax.cli.setup import environments, train_config
+    from mqe_jax.cli.setup import base_config, environments, for_task
     from mqe_jax.settings import override
     from mqe_jax.train.learner import env_dims, make_learner
     from mqe_jax.train.monitor import Monitor
@@ -35,7 +35,7 @@ def work(task: str, impl: str, algorithm: str, seeds: int, num_envs: int, total_
     from mqe_jax.train.seeds import shared_leaves, take
 
     config = override(
-        train_config(task, None, algorithm=algorithm),
+        for_task(base_config(task, None, algorithm), task),
         {"num_envs": num_envs, "total_steps": total_steps, "evaluation": {"every": 20}},
     )
     env, eval_env = environments(impl, config, seeds)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "play"
-RUN = ROOT / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned"
+RUN = ROOT / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned.safetensors"
 
 
 class Package(NamedTuple):

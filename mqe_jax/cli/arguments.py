@@ -5,13 +5,6 @@ Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import functools
-import importlib
-import io
-import operator
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +26,6 @@ from mqe_jax.cli.options import (
     Seed,
     Set,
     TaskRobot,
-    implementation,
 )
 from mqe_jax.cli.view_arguments import Export, View
 from mqe_jax.errors import InputError, nearest
@@ -50,7 +42,6 @@ First steps:
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
-COMMANDS = ("tasks", "train", "eval", "render", "view", "export", "replay", "bench", "demo", "walk", "sweep", "report")
 MARKERS = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
@@ -61,36 +52,9 @@ class Tasks:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().tasks(self)
+        from mqe_jax.cli import commands
 
-
-@dataclass(frozen=True)
-class Train:
-    """Train a policy on a task, into a run folder. Settings: a configuration file, overridden by the flags below."""
-
-    task: tyro.conf.Positional[str]
-    """Id of the task, such as go1gate (see `mqe tasks`)."""
-    config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
-    settings of --algorithm if given, else the task's tuned settings, else the paper's MAPPO."""
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
-    run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Run folder. Default: runs/TASK."""
-    resume: bool = False
-    """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
-    num_seeds: int = 1
-    """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
-    --run-dir."""
-    impl: Impl = "auto"
-    control: Control = None
-    robot: TaskRobot = None
-    set: Set = field(default_factory=list)
-    dump_diverged: DumpDiverged = None
-    settings: Annotated[Any, tyro.conf.Suppress] = None
-
-    def run(self) -> dict[str, Any] | None:
-        return implementation().train(self)
+        return commands.tasks(self)
 
 
 @dataclass(frozen=True)
@@ -115,7 +79,9 @@ class Eval:
     dump_diverged: DumpDiverged = None
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().evaluate(self)
+        from mqe_jax.cli import commands
+
+        return commands.evaluate(self)
 
 
 @dataclass(frozen=True)
@@ -153,7 +119,9 @@ class Render:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().render(self)
+        from mqe_jax.cli import commands
+
+        return commands.render(self)
 
 
 @dataclass(frozen=True)
@@ -169,7 +137,9 @@ class Replay:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().replay(self)
+        from mqe_jax.cli import commands
+
+        return commands.replay(self)
 
 
 @dataclass(frozen=True)
@@ -194,7 +164,9 @@ class Bench:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return implementation().bench(self)
+        from mqe_jax.cli import commands
+
+        return commands.bench(self)
 
 
 @dataclass(frozen=True)
@@ -210,7 +182,9 @@ class Demo:
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("demo").demo(self)
+        from mqe_jax.cli import demo
+
+        return demo.demo(self)
 
 
 @dataclass(frozen=True)
@@ -220,29 +194,37 @@ class Sweep:
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/algorithms.md)."""
     json: Json = False
+    part: str | None = None
+    """Name of one sweep in a file that maps names to sweeps."""
     folder: Path | None = None
-    """Folder of the sweep. Default: runs/NAME of the file."""
+    """Folder of the sweep. Default: runs/PART, or runs/NAME of the file."""
     cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
-    """Train these cells only: TASK/ALGORITHM, followed by +SETTING for settings other than hierarchical; may be a
-    pattern such as '*/mat', and may be repeated."""
+    """Train these cells only: TASK/ALGORITHM, followed by +VARIANT in a sweep with variants; may be a pattern such as
+    '*/mat', and may be repeated."""
     dry_run: bool = False
     """Print the remaining training runs and their estimated time, without training."""
     impl: Impl = "auto"
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("study_commands").sweep(self)
+        from mqe_jax.cli import study_commands
+
+        return study_commands.sweep(self)
 
 
 @dataclass(frozen=True)
 class Report:
-    """Write figures and tables of a sweep from its raw data, with the paper's values."""
+    """Write figures and tables of a sweep from its finished runs, with reference values."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder of the sweep, with its raw data in raw/; the report goes into report/."""
+    """Folder of the sweep, with its runs in runs/; the report goes into report/."""
+    reference: Path | None = None
+    """YAML file of reference values, such as the paper's in results/paper/reference.yaml."""
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("study_commands").report(self)
+        from mqe_jax.cli import study_commands
+
+        return study_commands.report(self)
 
 
 @dataclass(frozen=True)
@@ -250,33 +232,32 @@ class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 
     run_dir: Path = Path("runs/walk")
-    """Run folder: weights (rounded to float16), metrics.csv, checkpoints."""
+    """Run folder: walk.safetensors (rounded to float16), metrics.csv, checkpoints."""
     resume: bool = False
-    """Resume from the newest checkpoint in the run folder."""
+    """Continue from the newest checkpoint in the run folder, with environments reset."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to start from; may be those of another robot. Default: from scratch."""
     num_envs: int = 8192
     """Number of parallel environments."""
-    iterations: int = 1200
-    """PPO updates of 24 steps."""
-    max_seconds: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Time limit, s; training stops there after saving a checkpoint."""
-    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Weights to fine-tune; may be those of another robot. Default: from scratch."""
-    initial_std: float = 1.0
-    """Initial standard deviation of the actions."""
-    curriculum: int = 400
-    """Curriculum length: iterations over which slopes, forces and pushes are ramped to their maxima."""
-    critic_warmup: int = 0
-    """Initial iterations with the policy frozen, in which only critic and adaptation network are trained."""
-    symmetry: float = 0.5
-    """Coefficient of the loss of left-right symmetry; 0: none."""
-    anneal: float = 0.25
-    """Final fraction of training over which learning rate and entropy bonus are annealed linearly to zero."""
+    total_steps: int = 280_000_000
+    """Environment steps in all."""
+    set: Annotated[
+        list[str],
+        Repeated,
+        tyro.conf.arg(
+            name="set",
+            metavar="KEY=VALUE",
+            help="Setting of the training, such as network.symmetry_coef=1 (see docs/training.md); may be repeated.",
+        ),
+    ] = field(default_factory=list)
     impl: Impl = "auto"
     robot: Robot = "go1"
     seed: Seed = 1
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("walk_commands").walk_train(self)
+        from mqe_jax.cli import walk_commands
+
+        return walk_commands.walk_train(self)
 
 
 @dataclass(frozen=True)
@@ -295,7 +276,9 @@ class WalkEval:
     seed: Seed = 0
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("walk_commands").walk_eval(self)
+        from mqe_jax.cli import walk_commands
+
+        return walk_commands.walk_eval(self)
 
 
 @dataclass(frozen=True)
@@ -313,7 +296,9 @@ class WalkConvert:
     robot: Robot = "go1"
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("walk_commands").walk_convert(self)
+        from mqe_jax.cli import walk_commands
+
+        return walk_commands.walk_convert(self)
 
 
 @dataclass(frozen=True)
@@ -330,61 +315,46 @@ class Walk:
         return self.action.run()
 
 
-def _parser(wanted: Sequence[str]) -> Any:
-    """Returns the union of all subcommands; training flags are included only for the `train` subcommand."""
-    train: Any = Train
-    if "train" in wanted[:1]:
-        flags = importlib.import_module("mqe_jax.cli.flags").train_flags()
-        settings = ("settings", Annotated[flags, tyro.conf.arg(name="")], field(default=flags()))
-        train = dataclasses.make_dataclass("Train", [settings], bases=(Train,), frozen=True)
-        train.__doc__ = Train.__doc__
-    subcommand = tyro.conf.subcommand
-    records: list[Any] = [
-        Annotated[Tasks, subcommand("tasks")],
-        Annotated[train, subcommand("train", description=Train.__doc__)],
-        Annotated[Eval, subcommand("eval")],
-        Annotated[Render, subcommand("render")],
-        Annotated[View, subcommand("view")],
-        Annotated[Export, subcommand("export")],
-        Annotated[Replay, subcommand("replay")],
-        Annotated[Bench, subcommand("bench")],
-        Annotated[Demo, subcommand("demo")],
-        Annotated[Walk, subcommand("walk")],
-        Annotated[Sweep, subcommand("sweep")],
-        Annotated[Report, subcommand("report")],
-    ]
-    return functools.reduce(operator.or_, records)
+COMMANDS: dict[str, Any] = {
+    "tasks": Tasks,
+    "train": None,
+    "eval": Eval,
+    "render": Render,
+    "view": View,
+    "export": Export,
+    "replay": Replay,
+    "bench": Bench,
+    "demo": Demo,
+    "walk": Walk,
+    "sweep": Sweep,
+    "report": Report,
+}
+"""Arguments by command; those of `train` are in `mqe_jax.cli.train_arguments`, which imports the trainer's settings."""
+TRAIN = "Train a policy on a task, into a run folder."
+
+
+def overview() -> str:
+    """Returns the text of `mqe --help`."""
+    about = {name: TRAIN if kind is None else kind.__doc__.splitlines()[0] for name, kind in COMMANDS.items()}
+    lines = "\n".join(f"  {name:8} {line}" for name, line in about.items())
+    return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """Parses the command line; help exits with 0, an invalid argument raises a one-line InputError."""
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        hint = nearest(arguments[0], COMMANDS)
-        raise InputError(f"unknown command {arguments[0]!r}{hint}; allowed: {', '.join(COMMANDS)}")
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            return tyro.cli(
-                _parser(arguments),
-                prog="mqe",
-                description="Multi-agent quadruped tasks in JAX on MuJoCo MJX.",
-                args=list(arguments),
-                config=MARKERS,
-            )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise InputError(one_line(errors.getvalue())) from None
+    """Parses the command line, whose first word is the command.
 
+    Raises:
+        InputError: for an unknown command.
+        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
+    """
+    name, rest = arguments[0], list(arguments[1:])
+    if name in ("-h", "--help"):
+        print(overview())
+        raise SystemExit(0)
+    if name not in COMMANDS:
+        raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
+    if name == "train":
+        from mqe_jax.cli.train_arguments import parse_train
 
-def one_line(box: str) -> str:
-    """Returns tyro's boxed message as one line without the frame."""
-    lines = [re.sub(r"^[│|]\s*|\s*[│|]$", "", line).strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()]
-    kept = []
-    for line in lines:
-        if line.startswith("╭"):
-            continue
-        if line.startswith(("╰", "──", "━━")) or set(line) == {"─"}:
-            break
-        kept.append(line)
-    return " ".join(" ".join(kept).split()) or "the arguments cannot be read; see mqe --help"
+        return parse_train(rest)
+    return tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=MARKERS)

@@ -82,7 +82,7 @@ def bench(
 
     @jax.jit
     def bare(data: Any) -> Any:
-        step = jax.vmap(lambda d: env.physics.step(d, d.ctrl))
+        step = jax.vmap(lambda d: env.physics.step(d, d.ctrl)[0])
         return jax.lax.scan(lambda d, _: (step(d), None), data, None, steps)[0]
 
     # Starts at the reset state, under its constant control.

@@ -11,11 +11,11 @@ import numpy as np
 
 from mqe_jax import interrupts
 from mqe_jax.cli import bench as benchmark
-from mqe_jax.cli.arguments import Bench, Eval, Render, Replay, Tasks, Train
-from mqe_jax.cli.flags import given
+from mqe_jax.cli.arguments import Bench, Eval, Render, Replay, Tasks
 from mqe_jax.cli.output import echo, print_table
 from mqe_jax.cli.recorder import DivergenceRecorder
-from mqe_jax.cli.setup import environments, make_env, parse_overrides, train_config
+from mqe_jax.cli.setup import environments, for_task, make_env, parse_overrides
+from mqe_jax.cli.train_arguments import Train
 from mqe_jax.cli.view_arguments import View
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS
 from mqe_jax.envs import replay as recordings
@@ -68,9 +68,11 @@ def _overrides(arguments: Train | Eval | Render | View | Bench) -> dict[str, Any
 
 
 def _run_config(target: str) -> Any:
-    """Returns the settings in a run folder."""
+    """Returns the settings in a run folder or a policy file."""
+    if target.endswith(".safetensors"):
+        return load_policy(target).config
     if not Path(target).is_dir():
-        raise InputError(f"run: no folder {target!r}; allowed: a run folder, or a task's id")
+        raise InputError(f"run: no folder {target!r}; allowed: a run folder, a policy file, or a task's id")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
         raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder")
     config = runner.load_run_config(target)
@@ -117,12 +119,10 @@ def tasks(arguments: Tasks) -> dict[str, Any] | None:
 
 def train(arguments: Train) -> None:
     """Trains into the run folder."""
-    config = train_config(
-        arguments.task, arguments.config, given(arguments.settings), _overrides(arguments), arguments.algorithm
-    )
+    config = for_task(arguments.settings, arguments.target, _overrides(arguments))
     if arguments.num_seeds < 1:
         fail("num_seeds", arguments.num_seeds, "at least 1")
-    run_dir = arguments.run_dir or Path("runs") / arguments.task
+    run_dir = arguments.run_dir or Path("runs") / arguments.target
     configs, folders = [config], [run_dir]
     if arguments.num_seeds > 1:
         configs = [override(config, {"seed": config.seed + i}) for i in range(arguments.num_seeds)]
@@ -137,7 +137,7 @@ def train(arguments: Train) -> None:
             runner.train_seeds(vector_env, configs, folders, arguments.resume, eval_env=eval_env, recorder=recorder)
         finally:
             _echo_recorded(recorder)
-    curves.draw_curve(folders, run_dir / "curve.png", arguments.task)
+    curves.draw_curve(folders, run_dir / "curve.png", arguments.target)
     echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 
 

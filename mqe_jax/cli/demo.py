@@ -14,7 +14,7 @@ from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Demo
 from mqe_jax.cli.commands import draw
 from mqe_jax.cli.output import echo
-from mqe_jax.cli.setup import make_env, train_config
+from mqe_jax.cli.setup import base_config, for_task, make_env
 from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
@@ -33,7 +33,7 @@ DEMO_TASK = "go1gate"
 def demo(arguments: Demo) -> None:
     """Trains from scratch, evaluates before and after, writes curve and video; resumes an interrupted run."""
     began, run_dir = time.perf_counter(), arguments.run_dir
-    config = train_config(DEMO_TASK, arguments.config)
+    config = for_task(base_config(DEMO_TASK, arguments.config), DEMO_TASK)
     check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
     _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)

@@ -20,7 +20,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `mqe` and returns the exit code.
 
     0; 1 for a training run that became non-finite and 2 for bad input (InputError) or a file that cannot be read or
-    written (OSError), with one line on standard error. Any other exception is a defect and keeps its traceback.
+    written (OSError), with one line on standard error, or after tyro's message about the arguments. Any other
+    exception is a defect and keeps its traceback.
 
     As a program (`arguments` is None), SIGINT (Ctrl-C) ends the process with 130 and SIGTERM with 143, with one line on
     standard error, at any time from here on: a training after saving, everything else at once.
@@ -51,6 +52,10 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         return 0, ""
     try:
         _run(parse(arguments))
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        return 2, ""  # after tyro's message
     except KeyboardInterrupt:  # where `main` was called with arguments, from Python
         return interrupts.exit_code(signal.SIGINT), "interrupted"
     except BrokenPipeError:

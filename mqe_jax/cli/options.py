@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import io
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -19,12 +16,6 @@ class Command(Protocol):
     def run(self) -> dict[str, Any] | None:
         """Runs the command; returns the object that `--json` prints, if any."""
         ...
-
-
-def implementation(module: str = "commands") -> Any:
-    """Imports and returns a module of `mqe_jax.cli`."""
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note about a missing warp-lang
-        return importlib.import_module(f"mqe_jax.cli.{module}")
 
 
 Impl = Annotated[

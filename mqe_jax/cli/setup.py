@@ -99,27 +99,24 @@ def find_config(name: str) -> Path:
     raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
 
 
-def train_config(
-    task: str,
-    name: str | None,
-    settings: Mapping[str, Any] | None = None,
-    env: Mapping[str, Any] | None = None,
-    algorithm: str | None = None,
-) -> TrainConfig:
-    """Returns the settings of a training run: a file, the algorithm's preset, then `settings` and task parameters.
+def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
+    """Returns the settings of a file or a shipped name, with the algorithm's preset.
 
-    The default file is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else paper/mappo.
+    The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else paper/mappo.
 
     Raises:
-        InputError: for a file, an algorithm or a setting that is not allowed.
+        InputError: for a file or an algorithm that is not allowed.
     """
     changes = {} if algorithm is None else preset(algorithm)
-    overrides = {**(settings or {}), "task": task, "env": dict(env or {})}
     if name is None and algorithm is not None:
-        return load_config(find_config(f"paper/{algorithm}"), overrides)
+        return load_config(find_config(f"paper/{algorithm}"))
     if name is None:
         name = f"tuned/{task}" if (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file() else "paper/mappo"
-    config = load_config(find_config(name))
+    return override(load_config(find_config(name)), changes)
+
+
+def for_task(config: TrainConfig, task: str, env: Mapping[str, Any] | None = None) -> TrainConfig:
+    """Returns the settings with a task and its parameters; says so where they are those of another task."""
     if config.task not in (None, task):
-        echo(f"mqe: the settings of {name} are for {config.task!r}; training {task!r} with them")
-    return override(override(config, changes), overrides)
+        echo(f"mqe: the settings are for {config.task!r}; training {task!r} with them")
+    return override(config, {"task": task, "env": dict(env or {})})

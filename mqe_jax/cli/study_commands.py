@@ -11,25 +11,26 @@ from typing import Any
 from mqe_jax import interrupts
 from mqe_jax.cli.arguments import Report, Sweep
 from mqe_jax.cli.output import echo
-from mqe_jax.cli.setup import environments, train_config
+from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
+from mqe_jax.study.reference import load_reference
 from mqe_jax.train.config import TrainConfig
 
 
 def sweep(arguments: Sweep) -> dict[str, Any]:
     """Trains the remaining runs of a sweep and writes its report, or prints their estimated time."""
-    settings = sweeps.load_sweep(arguments.file)
+    settings = sweeps.load_sweep(arguments.file, arguments.part)
     for task in settings.tasks:
         if task not in TASKS and task not in ALIASES:
             raise InputError(f"tasks: unknown {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
-    folder = arguments.folder or Path("runs") / arguments.file.stem
+    folder = arguments.folder or Path("runs") / (arguments.part or arguments.file.stem)
 
     def config_of(task: str, algorithm: str) -> TrainConfig:
         name = settings.config and settings.config.replace("{task}", task)
-        return train_config(task, name, algorithm=algorithm)
+        return for_task(base_config(task, name, algorithm), task)
 
     jobs = sweeps.plan(settings, folder, config_of, arguments.cells)
     result = _estimate(folder, jobs)
@@ -39,7 +40,8 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
         return result
     sweeps.prepare(settings, folder)
     cells = "".join(f" --cells {shlex.quote(cell)}" for cell in arguments.cells)
-    with interrupts.before_exit(lambda: f"resume with: mqe sweep {arguments.file} --folder {folder}{cells}"):
+    part = "" if arguments.part is None else f" --part {shlex.quote(arguments.part)}"
+    with interrupts.before_exit(lambda: f"resume with: mqe sweep {arguments.file}{part} --folder {folder}{cells}"):
         others = sweeps.run(folder, jobs, functools.partial(environments, arguments.impl))
     if others:
         skipped = ", ".join(job.cell.path.as_posix() for job in others)
@@ -52,8 +54,9 @@ def sweep(arguments: Sweep) -> dict[str, Any]:
 
 
 def report(arguments: Report) -> dict[str, Any]:
-    """Writes the report of a sweep from its raw data."""
-    files = reports.report(arguments.folder)
+    """Writes the report of a sweep from its finished runs."""
+    reference = None if arguments.reference is None else load_reference(arguments.reference)
+    files = reports.report(arguments.folder, reference)
     echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
     return {"report": [str(file) for file in files]}
 
@@ -65,7 +68,7 @@ def _estimate(folder: Path, jobs: list[sweeps.Job]) -> dict[str, Any]:
         {
             "task": job.cell.task,
             "algorithm": job.cell.algorithm,
-            "setting": job.cell.setting,
+            "variant": job.cell.variant,
             "seeds": [config.seed for config in job.configs],
             "steps_left": job.steps_left,
             "seconds": None if math.isnan(s) else round(s),
@@ -79,7 +82,7 @@ def _estimate(folder: Path, jobs: list[sweeps.Job]) -> dict[str, Any]:
 
 def _print(result: dict[str, Any]) -> None:
     for row in [*result["jobs"], {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]}]:
-        name = " ".join(str(row[key]) for key in ("task", "algorithm", "setting") if key in row)
+        name = " ".join(str(row[key]) for key in ("task", "algorithm", "variant") if key in row)
         seeds = " ".join(map(str, row.get("seeds", [])))
         time = "time unknown" if row["seconds"] is None else f"{row['seconds'] / 3600:.2f} h"
         print(f"{name:<45} {f'seeds {seeds}' if seeds else '':<20} {row['steps_left'] / 1e6:>9.3g} M steps  {time}")

@@ -18,7 +18,6 @@ from mqe_jax.cli.options import (
     Seed,
     Set,
     TaskRobot,
-    implementation,
 )
 
 
@@ -44,7 +43,9 @@ class View:
     set: Set = field(default_factory=list)
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("view").view(self)
+        from mqe_jax.cli import view
+
+        return view.view(self)
 
 
 @dataclass(frozen=True)
@@ -58,4 +59,6 @@ class Export:
     json: Json = False
 
     def run(self) -> dict[str, Any] | None:
-        return implementation("export").export(self)
+        from mqe_jax.cli import export
+
+        return export.export(self)

@@ -8,59 +8,24 @@ from typing import Any
 from mqe_jax import interrupts
 from mqe_jax.cli.arguments import WalkConvert, WalkEval, WalkTrain
 from mqe_jax.cli.output import echo, print_table
+from mqe_jax.cli.setup import parse_overrides
 from mqe_jax.errors import InputError
-from mqe_jax.files import locked
-from mqe_jax.train.checkpoint import prepare_folder
 
 
 def walk_train(arguments: WalkTrain) -> None:
     """Trains the walk policy into the run folder."""
     from mqe_jax import robots, walk_policy
-    from mqe_jax.walk import training as walk
-    from mqe_jax.walk.env import WalkEnv
+    from mqe_jax.walk.training import train_walk
 
-    for name in ("num_envs", "iterations", "curriculum"):
-        if getattr(arguments, name) < 1:
-            raise InputError(f"{name}: {getattr(arguments, name)} is not allowed; it must be at least 1")
-    if not 0.0 < arguments.initial_std <= 10.0:
-        raise InputError(f"initial_std: {arguments.initial_std} is not allowed; it must be above 0 and at most 10")
-    if arguments.critic_warmup < 0:
-        raise InputError(f"critic_warmup: {arguments.critic_warmup} is not allowed; it must be at least 0")
-    if not 0.0 <= arguments.anneal <= 1.0:
-        raise InputError(f"anneal: {arguments.anneal} is not allowed; it must be in [0, 1]")
-    if not 0.0 <= arguments.symmetry <= 100.0:
-        raise InputError(f"symmetry: {arguments.symmetry} is not allowed; it must be in [0, 100]")
     robot = robots.get(arguments.robot)
-    policy = None if arguments.weights is None else walk_policy.load_params(robot, arguments.weights)
-    prepare_folder(arguments.run_dir, arguments.resume, ("metrics.csv", "walk.safetensors"))
-    env: Any = WalkEnv(robot, impl=arguments.impl, num_envs=arguments.num_envs)
-    config = walk.WalkConfig(
-        num_envs=arguments.num_envs,
-        iterations=arguments.iterations,
-        initial_std=arguments.initial_std,
-        curriculum=arguments.curriculum,
-        critic_warmup=arguments.critic_warmup,
-        symmetry_coef=arguments.symmetry,
-        anneal=arguments.anneal,
-        seed=arguments.seed,
-    )
-
-    def report(iteration: int, row: dict[str, float]) -> None:
-        shown = ("reward", "episode_length", "kl", "difficulty")
-        numbers = ", ".join(f"{name} {row[name]:.3g}" for name in shown if name in row)
-        echo(f"walk: {iteration} of {config.iterations} updates, {row['seconds']:.0f} s, {numbers}")
-
+    changes = {name: getattr(arguments, name) for name in ("num_envs", "total_steps", "seed")}
+    if arguments.weights is not None:
+        walk_policy.load_params(robot, arguments.weights)
+        changes["network.weights"] = str(arguments.weights.resolve())
+    changes |= parse_overrides(arguments.set)
     hint = f"resume with the same command and --resume; the run is in {arguments.run_dir}"
-    with locked(arguments.run_dir), interrupts.before_exit(lambda: hint):
-        walk.train_walk(
-            env,
-            config,
-            arguments.run_dir,
-            resume=arguments.resume,
-            policy=policy,
-            max_seconds=arguments.max_seconds,
-            report=report,
-        )
+    with interrupts.before_exit(lambda: hint):
+        train_walk(robot, arguments.run_dir, changes, impl=arguments.impl, resume=arguments.resume)
     echo(f"mqe: {arguments.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 

@@ -28,7 +28,7 @@ def autoreset(env: QuadrupedEnv, state: State) -> State:
         field.name: jax.tree.map(
             lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
         )
-        for field in dataclasses.fields(State)
+        for field in dataclasses.fields(state)
         if field.name not in ("data", "key", *_KEPT)
     }
     data = env.physics.merge(done, fresh.data, state.data)

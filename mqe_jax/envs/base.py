@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from jax.core import Tracer
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import engines, robots, walk_policy
 from mqe_jax.control import Controller, check_mode, load_actuator_network
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
@@ -28,7 +28,6 @@ from mqe_jax.envs.reward import weigh
 from mqe_jax.envs.state import State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
-from mqe_jax.physics import Physics
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
@@ -81,7 +80,7 @@ class QuadrupedEnv(Task):
         )
         self.compiled = compile_scene(self._scene)
         self.index, self.objects = self.compiled.index, self.compiled.objects
-        self.physics = Physics(
+        self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
             impl=impl,
@@ -165,11 +164,8 @@ class QuadrupedEnv(Task):
         return round(self.params.episode_length / self.dt)
 
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv:
-        """Returns an environment whose Warp contact buffers are sized for `num_envs` environments.
-
-        A no-op on the other engines, and where the buffers are large enough.
-        """
-        if self.impl != "warp" or self.physics.num_envs >= num_envs:
+        """Returns an environment whose engine holds `num_envs` environments: itself, or one with larger buffers."""
+        if self.physics.holds(num_envs):
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
-from mqe_jax.physics import STATE_FIELDS
 from mqe_jax.settings import to_mapping
 
 # Fields on which a step depends; the others are recomputed by it.

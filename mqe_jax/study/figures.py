@@ -1,4 +1,4 @@
-"""Figures of a study as PNG: learning curves in the paper's layout, evaluations, profiles, two reward terms."""
+"""Figures of a study as PNG: learning curves, evaluations during training, profiles, terms of the reward."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from mqe_jax.study import paper, statistics
-from mqe_jax.study.estimates import REWARD, TUNED, Array, Cells, band, evaluated, score_matrices
-from mqe_jax.study.records import Cell, Record
+from mqe_jax.study import statistics
+from mqe_jax.study.estimates import REWARD, Array, Cells, band, evaluated, score_matrices
+from mqe_jax.study.reference import Reference
+from mqe_jax.study.runs import Cell, Run
 
 _INK, _PALE = "#23252b", "#8a8f99"
 _COLORS = {"jrpo": "#4f86e0", "mat": "#3fae49", "mappo": "#b5316f"}
 _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
+_COLORS_OF_TERMS = (_COLORS["jrpo"], _COLORS["mappo"], _COLORS["mat"])
 _DASHES = (0, (4, 3))
-_COLORS_OF_SETTINGS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
-_LINES = (*_COLORS_OF_SETTINGS, _PALE, "#ffffff")
+_COLORS_OF_VARIANTS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
+_LINES = (*_COLORS_OF_VARIANTS, _PALE, "#ffffff")
 """Colours that a PNG has exactly."""
 _SHADES = 64
 """Maximum number of further colours of a PNG: with these it has a quarter of its size."""
@@ -55,45 +57,41 @@ def _color(algorithm: str, algorithms: Sequence[str]) -> str:
     return _COLORS.get(algorithm) or _OTHER_COLORS[others.index(algorithm) % len(_OTHER_COLORS)]
 
 
-def _label(algorithm: str) -> str:
-    return paper.ALGORITHMS.get(algorithm, algorithm.upper())
+def draw_curves(cells: Cells, reference: Reference) -> bytes:
+    """Returns the training curves: for each variant a block of tasks, two per row, with bands over seeds.
 
-
-def draw_curves(cells: Cells) -> bytes:
-    """Returns the paper's figure as PNG: for each setting a block of tasks, two per row, with bands over seeds.
-
-    Dashed lines are the paper's final values, in the algorithm's colour.
+    Dashed lines are the reference's values, in the algorithm's colour.
     """
-    settings = list(dict.fromkeys(cell.setting for cell in cells))
+    variants = list(dict.fromkeys(cell.variant for cell in cells))
     algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     across = min(2, len(tasks))
-    rows, columns = -(-len(tasks) // across), across * len(settings)
+    rows, columns = -(-len(tasks) // across), across * len(variants)
     figure = _figure(max(5.0, 3.7 * columns), 2.5 * rows + 0.9)
-    blocks = figure.subfigures(1, len(settings), squeeze=False)[0]
-    for block, setting in zip(blocks, settings, strict=True):
+    blocks = figure.subfigures(1, len(variants), squeeze=False)[0]
+    for block, variant in zip(blocks, variants, strict=True):
         grid = block.subplots(rows, across, squeeze=False).ravel()
         for axes, task in itertools.zip_longest(grid, tasks):
             if task is None:
                 axes.set_axis_off()
                 continue
             for algorithm in algorithms:
-                records = cells.get(Cell(task, algorithm, setting))
-                if records is not None:
-                    _draw_band(axes, records, REWARD, _color(algorithm, algorithms), _label(algorithm))
+                runs = cells.get(Cell(task, algorithm, variant))
+                if runs is not None:
+                    _draw_band(axes, runs, REWARD, _color(algorithm, algorithms), algorithm.upper())
             if not axes.lines:
                 axes.text(0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes)
                 axes.set_xticks([])
-            values = paper.VALUES.get(setting, {}).get(task, {})
+            values = reference.values.get(variant, {}).get(task, {})
             _draw_values(axes, {name: x for name, x in values.items() if name in algorithms})
-            _style_axes(axes, paper.TITLES.get(task, task))
-        block.suptitle(paper.SETTINGS.get(setting, setting), color=_INK, fontsize=11)
-    _legend(figure, algorithms, paper_line=True)
+            _style_axes(axes, reference.tasks.get(task, task))
+        block.suptitle(reference.variants.get(variant, variant), color=_INK, fontsize=11)
+    _legend(figure, algorithms, reference.label if reference.values else None)
     return _png(figure)
 
 
 def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
-    """Draws dashed lines at the paper's values by algorithm or `best`; where several coincide, dashes alternate."""
+    """Draws dashed lines at values by algorithm or `best`; where several coincide, dashes alternate."""
     for name, value in values.items():
         same = [other for other in values if values[other] == value]
         dashes = (_DASHES[1][0], _DASHES[1][1] + (len(same) - 1) * sum(_DASHES[1]))
@@ -101,43 +99,50 @@ def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
         axes.axhline(value, color=_COLORS.get(name, _INK), lw=1.0, ls=(offset, dashes), alpha=0.8)
 
 
-def draw_evaluations(cells: Cells, others: Cells) -> bytes:
-    """Returns the evaluations during training as PNG: cells of `others`, a panel for each of their tasks.
+def draw_evaluations(
+    cells: Cells,
+    reference: Reference,
+    *,
+    background: Cells | None = None,
+    background_label: str = "",
+    best: Mapping[str, float] | None = None,
+    best_label: str = "",
+) -> bytes:
+    """Returns the evaluations during training, of the unmodified task with sampled actions: a panel for each task.
 
-    Evaluations are of the unmodified task, actions sampled. Every panel has a legend of its own. Pale lines are
-    MAPPO's of `cells` with the paper's settings; dashed lines are the paper's best value of the task.
+    Every panel has its own legend. `background` has at most one cell for each task, drawn pale. Dashed lines are
+    the values in `best`, by task.
     """
-    tasks = list(dict.fromkeys(cell.task for cell in cells if any(other.task == cell.task for other in others)))
+    background, best = background or {}, best or {}
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
     across = min(2, len(tasks))
     rows = -(-len(tasks) // across)
     figure = _figure(max(5.0, 3.7 * across), 2.7 * rows + 0.6)
-    plain = evaluated({cell: runs for cell, runs in cells.items() if cell.setting == paper.HIERARCHICAL})
-    chosen, reference = evaluated(others), False
+    pale = {cell.task: runs for cell, runs in evaluated(background).items()}
+    chosen = evaluated(cells)
     for axes, task in itertools.zip_longest(figure.subplots(rows, across, squeeze=False).ravel(), tasks):
         if task is None:
             axes.set_axis_off()
             continue
-        runs = plain.get(Cell(task, "mappo"))
-        if runs is not None:
-            _draw_band(axes, runs, REWARD, _PALE, "")
-            reference = True
-        drawn = sorted((cell for cell in chosen if cell.task == task), key=lambda cell: cell.setting != TUNED)
-        for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_SETTINGS)):
-            _draw_band(axes, chosen[cell], REWARD, color, f"{_label(cell.algorithm)}, {cell.setting}")
-        value = paper.best(task)
-        if value is not None:
-            _draw_values(axes, {"best": value})
-        _style_axes(axes, paper.TITLES.get(task, task))
+        if task in pale:
+            _draw_band(axes, pale[task], REWARD, _PALE, "")
+        drawn = [cell for cell in chosen if cell.task == task]
+        for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_VARIANTS)):
+            _draw_band(axes, chosen[cell], REWARD, color, f"{cell.algorithm.upper()}, {cell.variant}")
+        if task in best:
+            _draw_values(axes, {"best": best[task]})
+        _style_axes(axes, reference.tasks.get(task, task))
         if drawn:
             bottom, top = axes.get_ylim()
             axes.set_ylim(bottom, top + 0.09 * len(drawn) * (top - bottom))  # room for the legend
             axes.legend(frameon=False, fontsize=6.5, loc="upper left")
-    _key(figure, {"MAPPO, paper's settings": _PALE} if reference else {}, "paper's best, after 40 M steps")
+    if pale or best:
+        _key(figure, {background_label: _PALE} if pale else {}, best_label if best else None)
     return _png(figure)
 
 
-def _draw_band(axes: Any, records: Sequence[Record], column: str, color: str, label: str) -> None:
-    steps, middle, low, high = band(records, column)
+def _draw_band(axes: Any, runs: Sequence[Run], column: str, color: str, label: str) -> None:
+    steps, middle, low, high = band(runs, column)
     axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.15, lw=0)
     axes.plot(steps / 1e6, middle, color=color, lw=1.5, label=label)
 
@@ -152,9 +157,8 @@ def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> N
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(figure: Any, algorithms: Sequence[str], paper_line: bool) -> None:
-    colors = {_label(name): _color(name, algorithms) for name in algorithms}
-    _key(figure, colors, "paper, after 40 M steps" if paper_line else None)
+def _legend(figure: Any, algorithms: Sequence[str], dashed: str | None = None) -> None:
+    _key(figure, {name.upper(): _color(name, algorithms) for name in algorithms}, dashed)
 
 
 def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
@@ -167,42 +171,39 @@ def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=8)
 
 
-def draw_profiles(cells: Cells) -> bytes:
-    """Returns performance profiles of each setting as PNG: the fraction of runs above each score."""
-    settings = [s for s in dict.fromkeys(cell.setting for cell in cells) if score_matrices(cells, s)]
+def draw_profiles(cells: Cells, reference: Reference) -> bytes:
+    """Returns performance profiles of each variant: the fraction of runs above each score."""
+    variants = [v for v in dict.fromkeys(cell.variant for cell in cells) if score_matrices(cells, v)]
     algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
     thresholds = np.linspace(0.0, 1.0, 101)
 
     def profile(scores: Array) -> Array:
         return statistics.performance_profile(scores, thresholds)
 
-    figure = _figure(max(5.0, 4.2 * len(settings)), 3.4)
-    for axes, setting in zip(figure.subplots(1, len(settings), squeeze=False)[0], settings, strict=True):
-        for name, scores in score_matrices(cells, setting).items():
+    figure = _figure(max(5.0, 4.2 * len(variants)), 3.4)
+    for axes, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
+        for name, scores in score_matrices(cells, variant).items():
             low, high = statistics.bootstrap_interval(scores, profile, np.random.default_rng(0))
             color = _color(name, algorithms)
             axes.fill_between(thresholds, low, high, color=color, alpha=0.15, lw=0)
             axes.plot(thresholds, profile(scores), color=color, lw=1.5)
-        _style_axes(axes, paper.SETTINGS.get(setting, setting), "fraction of runs above")
+        _style_axes(axes, reference.variants.get(variant, variant), "fraction of runs above")
         axes.set_xlabel("score, fraction of each task's range", fontsize=8)
         axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
-    _legend(figure, algorithms, paper_line=False)
+    _legend(figure, algorithms)
     return _png(figure)
 
 
-def gate_terms(records: Sequence[Record]) -> tuple[bytes, dict[str, list[Any]]]:
-    """Returns the paper's appendix figure of go1gate as PNG, and its data: two reward terms, first 20 M steps."""
+def draw_terms(runs: Sequence[Run], terms: Mapping[str, str], title: str, last: float) -> bytes:
+    """Returns the curves of reward terms, given their labels by column, up to `last` environment steps."""
     figure = _figure(5.2, 3.2)
     axes = figure.add_subplot()
-    columns: dict[str, list[Any]] = {name: [] for name in "term env_steps iqm low high".split()}
-    for (column, label), color in zip(paper.GATE_TERMS.items(), (_COLORS["jrpo"], _COLORS["mappo"]), strict=True):
-        steps, *estimate = band(records, column)
-        kept = steps <= paper.GATE_STEPS
+    for (column, label), color in zip(terms.items(), itertools.cycle(_COLORS_OF_TERMS)):
+        steps, *estimate = band(runs, column)
+        kept = steps <= last
         steps, (middle, low, high) = steps[kept], (x[kept] for x in estimate)
         axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.15, lw=0)
         axes.plot(steps / 1e6, middle, color=color, lw=1.5, label=label)
-        for name, items in zip(columns, ([column] * len(steps), steps, middle, low, high), strict=True):
-            columns[name].extend(items)
-    _style_axes(axes, "Narrow Gate, MAPPO", "reward per step")
+    _style_axes(axes, title, "reward per step")
     axes.legend(frameon=False, fontsize=8)
-    return _png(figure), columns
+    return _png(figure)

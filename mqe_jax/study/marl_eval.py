@@ -5,25 +5,29 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from mqe_jax.study.runs import PLAIN, Run
+
 ENVIRONMENT = "mqe"
 METRICS = ("average_step_reward", "success_rate")
 
 
-def to_marl_eval(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def to_marl_eval(runs: Iterable[Run]) -> dict[str, Any]:
     """Returns environment -> task -> algorithm -> run -> step_k -> {step_count, metric: [value]}, absolute_metrics.
 
-    `runs` are evaluation records (`mqe_jax.study.records`) of finished training runs. Each list holds one value, the
+    Runs without evaluations are left out; a variant is a task of its own, TASK+VARIANT. Each list holds one value, the
     mean over the evaluation's episodes under sampled actions; the format allows this instead of one value per episode.
     """
     tree: dict[str, Any] = {}
     for run in runs:
+        if run.absolute is None:
+            continue
         steps: dict[str, Any] = {
             f"step_{i}": {"step_count": point["env_steps"], **_metrics(point)}
-            for i, point in enumerate(run["evaluations"], start=1)
+            for i, point in enumerate(run.evaluations, start=1)
         }
-        steps["absolute_metrics"] = _metrics(run["absolute"])
-        algorithm = tree.setdefault(run["task"], {}).setdefault(run["algorithm"], {})
-        algorithm[f"seed_{run['seed']}"] = steps
+        steps["absolute_metrics"] = _metrics(run.absolute)
+        task = run.cell.task if run.cell.variant == PLAIN else f"{run.cell.task}+{run.cell.variant}"
+        tree.setdefault(task, {}).setdefault(run.cell.algorithm, {})[f"seed_{run.seed}"] = steps
     return {ENVIRONMENT: tree}
 
 

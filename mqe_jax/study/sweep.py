@@ -1,8 +1,7 @@
 """Sweeps: tasks x algorithms x variants x seeds in one folder, resumed after any interruption.
 
 FOLDER/sweep.yaml    settings of the sweep
-FOLDER/runs/...      run folders, with checkpoints
-FOLDER/raw/...       raw data of finished runs (`mqe_jax.study.records`)
+FOLDER/runs/...      run folders, complete, with checkpoints
 FOLDER/report/...    the report, regenerated when the sweep ends (`mqe_jax.study.report`)
 """
 
@@ -23,11 +22,9 @@ from annotated_types import MinLen
 from mqe_jax.errors import InputError, InUseError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import PositiveInt, Seed, build, fail, load_yaml, override, record, to_mapping
-from mqe_jax.study.paper import HIERARCHICAL
-from mqe_jax.study.records import Cell, Record, duration, read_curve, write_record
+from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.runner import OnUpdate, train_seeds
 from mqe_jax.train.types import VectorEnv
 
@@ -50,12 +47,11 @@ class Sweep:
     seeds_together: PositiveInt | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
-    """Settings file or shipped name, in which {task} stands for the task's id; none uses the paper's settings of each
-    algorithm."""
+    """Settings file or shipped name, in which {task} stands for the task's id; none uses paper/ALGORITHM."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings that override the file's in every run."""
-    variants: Mapping[str, Any] = field(default_factory=lambda: {HIERARCHICAL: {}})
-    """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `setting`."""
+    variants: Mapping[str, Any] = field(default_factory=lambda: {PLAIN: {}})
+    """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "seeds"):
@@ -84,13 +80,17 @@ class Job:
         return len(self.configs) * (config.num_updates * config.steps_per_update - self.steps_done)
 
 
-def load_sweep(path: Path) -> Sweep:
-    """Reads a sweep's YAML file.
+def load_sweep(path: Path, part: str | None = None) -> Sweep:
+    """Reads a sweep's YAML file; of a file that maps names to sweeps, the sweep `part`.
 
     Raises:
-        InputError: naming the file, for invalid content.
+        InputError: naming the file, for invalid content or an unknown part.
     """
     values = load_yaml(path)
+    if part is not None:
+        if not isinstance(values.get(part), dict):
+            raise InputError(f"{path}: has no part {part!r}{nearest(part, values)}; it has: {', '.join(values)}")
+        values = values[part]
     try:
         return build(Sweep, values)
     except InputError as error:
@@ -98,7 +98,7 @@ def load_sweep(path: Path) -> Sweep:
 
 
 def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
-    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+SETTING], match a pattern; all without patterns.
+    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all without patterns.
 
     Raises:
         InputError: for a pattern that matches no cell.
@@ -120,7 +120,7 @@ def plan(
 ) -> list[Job]:
     """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
 
-    `config_of(task, algorithm)` gives the settings that those of the sweep override. Runs with raw data are complete.
+    `config_of(task, algorithm)` gives the settings that those of the sweep override. Finished runs are left out.
     The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 
@@ -130,8 +130,8 @@ def plan(
     jobs = []
     for cell in select(sweep, cells):
         config = _overridden(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
-        config = _overridden(config, f"variants.{cell.setting}", sweep.variants[cell.setting])
-        left = [seed for seed in sweep.seeds if not _raw(folder, cell, seed).is_file()]
+        config = _overridden(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
+        left = [seed for seed in sweep.seeds if not finished(_run(folder, cell, seed))]
         started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
         fresh = [seed for seed in left if seed not in started]
         size = sweep.seeds_together or len(sweep.seeds)
@@ -159,10 +159,6 @@ def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) ->
 
 def _run(folder: Path, cell: Cell, seed: int) -> Path:
     return folder / "runs" / cell.path / f"seed{seed}"
-
-
-def _raw(folder: Path, cell: Cell, seed: int) -> Path:
-    return folder / "raw" / cell.path / f"seed{seed}.json"
 
 
 def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
@@ -208,7 +204,7 @@ def prepare(sweep: Sweep, folder: Path) -> None:
 
 
 def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> list[Job]:
-    """Trains the jobs sequentially; each resumes from its checkpoints and writes raw data at its end.
+    """Trains the jobs sequentially; each resumes from its checkpoints.
 
     Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
     first. Returns the jobs skipped because other processes hold the locks of their cells.
@@ -226,13 +222,8 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
             except InUseError:
                 left.append(job)
                 continue
-            if all(_raw(folder, job.cell, config.seed).is_file() for config in job.configs):
+            if all(map(finished, job.folders)):
                 continue  # finished by another process since the jobs were planned
             env, eval_env = environments(job.configs[0], len(job.configs))
             train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
-            for config, run_dir in zip(job.configs, job.folders, strict=True):
-                evaluation = read_evaluations(run_dir)
-                kept = {name: evaluation[name] for name in ("evaluations", "absolute")}
-                curve = read_curve(run_dir / "metrics.csv")
-                write_record(folder, Record(job.cell, config.seed, curve, kept, duration(curve)))
     return left

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
-from annotated_types import Ge, Gt, Lt
+import tyro
+from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import (
@@ -63,6 +64,8 @@ class PPO:
     do not dominate; none disables it."""
     advantage_clip_until: Positive = 1.0
     """Fraction of training during which `advantage_clip` applies."""
+    critic_warmup: Fraction = 0.0
+    """Initial fraction of training in which only the critic is trained, for a policy that starts from weights."""
 
 
 @record
@@ -72,9 +75,12 @@ class OptimizerSettings:
     learning_rate: Positive = 7e-4
     """Learning rate of actor and critic."""
     schedule: Literal["constant", "linear"] = "constant"
-    """Learning-rate schedule: constant, or linear to zero over the run."""
+    """Learning-rate schedule: constant, or linear to zero at the end of the run."""
+    anneal: Annotated[float, Gt(0), Le(1)] = 1.0
+    """Final fraction of the run over which the linear schedule falls."""
     target_kl: Positive | None = None
-    """Target KL divergence per minibatch of the adaptive learning rate; none uses the schedule alone."""
+    """Target KL divergence per minibatch of the adaptive learning rate, which does not rise while the schedule falls;
+    none uses the schedule alone."""
     eps: Positive = 1e-5
     """Adam's epsilon."""
     max_grad_norm: Positive | None = 10.0
@@ -141,11 +147,11 @@ class EvaluationSettings:
 class TrainConfig:
     """Settings of a training run; the defaults are the paper's MAPPO (arXiv 2403.16015, through OpenRL)."""
 
-    task: str | None = None
+    task: Annotated[str | None, tyro.conf.Suppress] = None
     """Id of the task."""
-    env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    env: Annotated[Mapping[str, Any], tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
     """Overrides of the task's parameters, passed to the environment unchanged."""
-    train_env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    train_env: Annotated[Mapping[str, Any], tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
     """Further overrides during training only, not in evaluation."""
     seed: Seed = 0
     """Random seed."""

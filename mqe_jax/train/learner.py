@@ -169,8 +169,9 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
 def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
     if len(teams_of(env)) > 1:
-        count = len(teams_of(env))
-        raise InputError(f"env: {env.name} has {count} teams; give one: versus(env, opponents) or Mirror(env)")
+        raise InputError(
+            f"env: {env.name} has {len(teams_of(env))} teams; give one: versus(env, opponents) or Mirror(env)"
+        )
     if env.num_envs != config.num_envs:
         fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
@@ -277,8 +278,9 @@ def _prepare(
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 
     steps = network.chunk_length
+    memory = transitions.memory._replace(critic=jax.tree.map(lambda x: x[::steps], transitions.memory.critic))
     batch = Batch(
-        memory=jax.tree.map(lambda x: x[::steps].reshape(-1, *x.shape[2:]), transitions.memory),
+        memory=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), memory),
         is_first=_chunks(transitions.is_first, steps),
         obs=_chunks(obs, steps),
         privileged_obs=_chunks(privileged, steps),
@@ -312,9 +314,10 @@ def _loss(
     teams: Teams,
     value_normalizer: ValueStatistics,
     entropy_coef: jax.Array,
+    actor_coef: jax.Array | float,
     batch: Batch,
 ) -> tuple[jax.Array, Metrics]:
-    """Returns the PPO loss () of a minibatch and its parts."""
+    """Returns the PPO loss () of a minibatch and its parts; `actor_coef` weights all but the critic's."""
     ppo = config.ppo
     now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
     log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob, teams)
@@ -334,7 +337,9 @@ def _loss(
         "approx_kl": jnp.mean(jnp.exp(per_agent) - 1.0 - per_agent),
         "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32)),
     }
-    return policy_loss + ppo.value_coef * critic_loss - entropy_coef * mean_entropy, metrics
+    metrics |= {f"loss/{name}": value for name, value in now.losses.items()}
+    actor_loss = policy_loss - entropy_coef * mean_entropy + sum(now.losses.values())
+    return actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
 
 
 def _team_of(teams: Teams) -> np.ndarray:
@@ -361,7 +366,10 @@ def _learn(
 ) -> tuple[Params, AdamState, jax.Array, Metrics]:
     """Runs the epochs over the batch; returns parameters, optimiser state, learning rate and mean metrics."""
     progress = state.updates.astype(jnp.float32) / config.num_updates
-    schedule = jnp.maximum(1.0 - progress, 0.0) if config.optimizer.schedule == "linear" else 1.0
+    schedule = jnp.float32(1.0)
+    if config.optimizer.schedule == "linear":
+        schedule = jnp.clip((1.0 - progress) / config.optimizer.anneal, 0.0, 1.0)
+    actor_coef = (progress >= config.ppo.critic_warmup).astype(jnp.float32) if config.ppo.critic_warmup else 1.0
     entropy_coef = jnp.float32(config.ppo.entropy_coef)
     if config.ppo.entropy_coef_final is not None:
         entropy_coef += jnp.minimum(progress, 1.0) * (config.ppo.entropy_coef_final - config.ppo.entropy_coef)
@@ -370,10 +378,12 @@ def _learn(
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
         gradient, metrics = jax.grad(_loss, has_aux=True)(
-            params, network, config, teams, value_normalizer, entropy_coef, minibatch
+            params, network, config, teams, value_normalizer, entropy_coef, actor_coef, minibatch
         )
         if config.optimizer.target_kl is not None:
-            learning_rate = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
+            adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
+            falls_only = (schedule < 1.0) | (jnp.float32(actor_coef) < 1.0)
+            learning_rate = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
         params, optimizer_state, grad_norm = optimizer.update(
             gradient, optimizer_state, params, learning_rate * schedule
         )

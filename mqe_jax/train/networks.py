@@ -48,6 +48,8 @@ class Evaluation(NamedTuple):
     """Entropies of the policy (L, C, A)."""
     value: jax.Array
     """Normalised values (L, C, V)."""
+    losses: Mapping[str, jax.Array] = {}
+    """Weighted losses () that the network adds to that of PPO, by name."""
 
 
 class Network(NamedTuple):

@@ -65,6 +65,8 @@ def rollout(
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
+    `length` is a multiple of the network's chunk length.
+
     The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
     steps and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
     episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold
@@ -84,7 +86,7 @@ def rollout(
         trace = () if trace_step is None else trace_step(before, scaled, after)
         done = after.terminated | after.truncated
         transition = Transition(
-            memory=memory,
+            memory=memory._replace(actor=()),
             is_first=state.is_first,
             obs=before.obs,
             privileged_obs=before.privileged_obs,
@@ -109,7 +111,15 @@ def rollout(
         )
         return state, (transition, sums, trace)
 
-    state, (transitions, sums, trace) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    def one_chunk(state: RolloutState, keys: jax.Array) -> tuple[RolloutState, tuple[Any, Any]]:
+        start = reset_memory(state.memory, state.is_first).actor
+        state, steps = jax.lax.scan(one_step, state, keys)
+        return state, (start, steps)
+
+    keys = jax.random.split(key, length).reshape(-1, network.chunk_length, *key.shape)
+    state, (starts, steps) = jax.lax.scan(one_chunk, state, keys)
+    transitions, sums, trace = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), steps)
+    transitions = transitions._replace(memory=transitions.memory._replace(actor=starts))
     metrics: dict[str, Any] = _means(sums, length * env.num_envs)
     return state, transitions, metrics if trace_step is None else {**metrics, "trace": trace}
 

@@ -1,4 +1,4 @@
-"""Plots of learning curves with the paper's final values."""
+"""Plots of learning curves."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import replacing
-from mqe_jax.study import paper
 
-_INK, _RUN, _SECOND, _PALE = "#23252b", "#2f7fd6", "#3fae49", "#8a8f99"
+_INK, _RUN, _SECOND = "#23252b", "#2f7fd6", "#3fae49"
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:
@@ -43,10 +42,7 @@ def smooth(values: Sequence[float], fraction: float = 0.02) -> list[float]:
 
 
 def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = None) -> None:
-    """Plots average step reward (and success) of runs over environment steps, and writes the image atomically.
-
-    Dashed lines are the paper's values after 40 M steps, for the tasks that it reports.
-    """
+    """Plots average step reward (and success) of runs over environment steps, and writes the image atomically."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -60,12 +56,6 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
         axes.plot(steps, reward, color=_RUN, lw=0.6, alpha=0.3)
         axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label="mqe_jax" if table is tables[0] else None)
     last = max((t["env_steps"][-1] for t in tables if t["env_steps"]), default=0.0) / 1e6
-    for (name, value), style in zip(
-        paper.VALUES[paper.HIERARCHICAL].get(task, {}).items(), ("--", "-.", ":"), strict=False
-    ):
-        axes.axhline(
-            value, color=_PALE, lw=1.0, ls=style, label=f"paper, {paper.ALGORITHMS[name]}, after 40 M steps: {value:g}"
-        )
     axes.set(xlabel="environment steps (millions)", ylabel="average step reward", xlim=(0, max(last, 1e-6)))
     axes.set_title(title or task, color=_INK, loc="left")
     axes.grid(alpha=0.25)

@@ -10,21 +10,22 @@ Randomisation and rewards (`mqe_jax.walk.rewards`) follow walk-these-ways (Margo
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robots, walk_policy
-from mqe_jax.physics import Physics
+from mqe_jax import engines, robots, walk_policy
+from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
-from mqe_jax.walk.task import EpisodeSpec, RandomizedBody, WalkTask, sample_body, sample_spec
+from mqe_jax.walk.task import RANDOMIZATION, EpisodeSpec, WalkState, WalkTask, sample_spec
 from mqe_jax.walk_policy import WalkMemory
 
 if TYPE_CHECKING:
@@ -32,53 +33,17 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class WalkState:
-    """State of one environment."""
-
-    data: mjx.Data
-    """Physics state."""
-    obs: jax.Array
-    """The walk policy's observation (70,), noisy if randomised."""
-    privileged_obs: jax.Array
-    """Observation of the critic (P,)."""
-    latent_target: jax.Array
-    """Regression target of the adaptation network (2,): friction and payload, scaled."""
-    reward: jax.Array
-    """Reward ()."""
-    terminated: jax.Array
-    """Whether the robot has fallen () bool."""
-    truncated: jax.Array
-    """Whether the episode was truncated at the time limit () bool."""
-    metrics: dict[str, jax.Array]
-    """Reward terms and tracking errors, () each."""
-    spec: EpisodeSpec
-    """Commands and disturbances."""
-    slope: jax.Array
-    """Current slope, rate-limited towards the spec's (2,), rad."""
-    force: jax.Array
-    """Current force, rate-limited towards the spec's (2,), N."""
-    body: RandomizedBody
-    """Randomised parameters of the robot."""
-    memory: WalkMemory
-    """Recurrent state of the walk policy: gait phase and last actions; the history is empty."""
-    mean_error: jax.Array
-    """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
-    step: jax.Array
-    """Steps counted towards the time limit () int32; starts at a random offset in training."""
-    episode_steps: jax.Array
-    """Steps since the reset () int32."""
-    difficulty: jax.Array
-    """Curriculum level () in [0, 1], which scales slopes, forces and pushes."""
-    key: jax.Array
-    """Random key."""
+MOTOR_OFFSET = 0.02  # greatest offset of a joint's target under randomisation, rad
 
 
 class WalkEnv:
-    """One robot that tracks commands on a slope under external forces; batch with `jax.vmap`."""
+    """One robot that tracks commands on a slope under external forces; batch with `VectorEnv` or `jax.vmap`."""
+
+    name = "walk"
+    num_agents = 1
+    teams = ((0,),)
+    observation_size = walk_policy.OBSERVATION_SIZE
+    action_size = NUM_JOINTS
 
     def __init__(self, robot: Robot, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
         self.robot = robot
@@ -91,7 +56,7 @@ class WalkEnv:
             solver_iterations=self.task.solver_iterations,
         )
         self.compiled = compile_scene(scene)
-        self.physics = Physics(
+        self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
             impl=impl,
@@ -102,27 +67,38 @@ class WalkEnv:
         walk_policy.check_period(scene.timestep, self.physics.num_substeps)
         self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)
+        randomization = RANDOMIZATION if self.task.randomize else Randomization()
+        self._randomizer = Randomizer(randomization, self.compiled.model, self.index, 1.0)
 
     @property
-    def privileged_size(self) -> int:
-        """Length of the critic's observation."""
+    def max_steps(self) -> int:
+        """Steps until the time limit."""
+        return round(self.task.episode_length / DT)
+
+    @functools.cached_property
+    def privileged_observation_size(self) -> int:
+        """Length P of the critic's observation."""
         return jax.eval_shape(self.reset, jax.random.PRNGKey(0)).privileged_obs.shape[0]
+
+    def with_num_envs(self, num_envs: int) -> WalkEnv:
+        """Returns an environment whose Warp buffers are sized for `num_envs` environments."""
+        if self.physics.impl != "warp" or self.physics.num_envs >= num_envs:
+            return self
+        return WalkEnv(self.robot, self.task, impl=self.physics.impl, num_envs=num_envs)
 
     # -- reset and step -----------------------------------------------------------------------------------------
 
-    def reset(
-        self,
-        key: jax.Array,
-        spec: EpisodeSpec | None = None,
-        difficulty: jax.Array | float = 1.0,
-        step: jax.Array | int = 0,
-    ) -> WalkState:
+    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0, spec: EpisodeSpec | None = None) -> WalkState:
         """Returns the initial state of an episode; samples a spec if none is given."""
-        next_key, spec_key, body_key, pose_key, noise_key = jax.random.split(key, 5)
-        difficulty = jnp.asarray(difficulty, jnp.float32)
+        next_key, spec_key, random_key, pose_key, noise_key = jax.random.split(key, 5)
+        assistance = jnp.asarray(assistance, jnp.float32)
         if spec is None:
-            spec = sample_spec(spec_key, self.task, self.robot, difficulty)
-        body = sample_body(body_key, self.task)
+            spec = sample_spec(spec_key, self.task, self.robot, 1.0 - assistance)
+        offset = jnp.zeros(NUM_JOINTS)
+        if self.task.randomize:
+            offset = MOTOR_OFFSET * jax.random.uniform(
+                jax.random.fold_in(random_key, 1), (NUM_JOINTS,), minval=-1.0, maxval=1.0
+            )
         a, b, c, d = jax.random.split(pose_key, 4)
         model, index = self.compiled.model, self.index
         yaw = jax.random.uniform(a, (), minval=-jnp.pi, maxval=jnp.pi)
@@ -142,31 +118,33 @@ class WalkEnv:
         memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), zeros, zeros, zero)
         state = WalkState(
             data=data,
-            obs=jnp.zeros(walk_policy.OBSERVATION_SIZE),
+            obs=zero,
             privileged_obs=zero,
-            reward=zero,
-            latent_target=jnp.stack([body.friction - 1.0, body.payload / 2.0]),
+            final_obs=zero,
+            final_privileged_obs=zero,
+            reward=jnp.zeros(1),
             terminated=jnp.zeros((), bool),
             truncated=jnp.zeros((), bool),
             metrics=_zero_metrics(self.task.rewards),
             spec=spec,
             slope=spec.slope,
             force=spec.force,
-            body=body,
+            random=self._randomizer.sample(random_key),
+            motor_offset=offset,
             memory=memory,
             mean_error=jnp.zeros(3),
-            step=jnp.asarray(step, jnp.int32),
+            step=jnp.zeros((), jnp.int32),
             episode_steps=jnp.zeros((), jnp.int32),
-            difficulty=difficulty,
+            assistance=assistance,
             key=next_key,
         )
         return self._observed(state, noise_key)
 
     def step(self, state: WalkState, action: jax.Array) -> WalkState:
-        """Advances by one policy step with an action (12,)."""
+        """Advances by one policy step with an action (1, 12)."""
         task, index = self.task, self.index
         key, direction_key, time_key, size_key, spec_key, noise_key = jax.random.split(state.key, 6)
-        action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
+        action = jnp.clip(action[0], -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
         target = walk_policy.joint_targets(self.robot, action)
         previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
         earlier_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
@@ -184,12 +162,12 @@ class WalkEnv:
         push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
 
-        ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.body.motor_offset)
-        data = self.physics.step(
+        ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.motor_offset)
+        data, _ = self.physics.step(
             data,
             ctrl,
-            fields=self._fields(state.body),
-            xfrc_applied=self._forces(data, state.body, slope, force),
+            fields=self._randomizer.fields(state.random),
+            xfrc_applied=self._forces(data, state.random, slope, force),
         )
         robot_state = self.read(data)
         commands = state.spec.commands
@@ -210,7 +188,7 @@ class WalkEnv:
             previous_target=previous_target,
             earlier_target=earlier_target,
             foot_force=self.foot_force(data),
-            strength=state.body.strength,
+            strength=state.random.motor_strength[0],
         )
         terms = reward_terms(inputs)
         reward, weighted = combine(terms, task.rewards)
@@ -224,19 +202,20 @@ class WalkEnv:
             "error_vx": jnp.square(error[0]),
             "error_vy": jnp.square(error[1]),
             "error_yaw": jnp.square(error[2]),
+            "diverged": (~finite).astype(jnp.float32),
         }
         spec = state.spec
         if task.command_period > 0:
             renewed = step % round(task.command_period / DT) == 0
-            fresh = sample_spec(spec_key, task, self.robot, state.difficulty)
+            fresh = sample_spec(spec_key, task, self.robot, 1.0 - state.assistance)
             spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, spec)
             mean_error = jnp.where(renewed, 0.0, mean_error)
         state = dataclasses.replace(
             state,
             data=data,
-            reward=jnp.where(finite, reward, 0.0),
+            reward=jnp.where(finite, reward, 0.0)[None],
             terminated=fallen,
-            truncated=~fallen & (step >= round(task.episode_length / DT)),
+            truncated=~fallen & (step >= self.max_steps),
             metrics=metrics,
             spec=spec,
             slope=slope,
@@ -259,29 +238,11 @@ class WalkEnv:
         """Returns the strongest contact force on each foot (4,), N."""
         return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
 
-    def _fields(self, body: RandomizedBody) -> dict[str, jax.Array]:
-        if not self.task.randomize:
-            return {}
-        model, index = self.compiled.model, self.index
-        trunk = int(index.trunk_body[0])
-        friction = jnp.asarray(model.geom_friction, jnp.float32).at[index.geoms[0], 0].set(body.friction)
-        mass = jnp.asarray(model.body_mass, jnp.float32).at[trunk].add(body.payload)
-        com = jnp.asarray(model.body_ipos, jnp.float32).at[trunk].add(body.com)
-        gain = jnp.asarray(model.actuator_gainprm, jnp.float32) * body.strength
-        bias = jnp.asarray(model.actuator_biasprm, jnp.float32) * body.strength
-        return {
-            "geom_friction": friction,
-            "body_mass": mass,
-            "body_ipos": com,
-            "actuator_gainprm": gain,
-            "actuator_biasprm": bias,
-        }
-
-    def _forces(self, data: mjx.Data, body: RandomizedBody, slope: jax.Array, force: jax.Array) -> jax.Array:
+    def _forces(self, data: mjx.Data, random: RandomizedParams, slope: jax.Array, force: jax.Array) -> jax.Array:
         """Returns external forces on all bodies (nbody, 6), N: the slope's change of gravity, and the trunk force."""
         trunk = int(self.index.trunk_body[0])
         turn = gravity_w(slope) - jnp.array([0.0, 0.0, -GRAVITY])
-        mass = jnp.asarray(self._mass, jnp.float32).at[trunk].add(body.payload)
+        mass = jnp.asarray(self._mass, jnp.float32).at[trunk].add(random.payload[0])
         quaternion = data.qpos[self.index.base_qpos[0, 3:]]
         yaw = quaternion_to_euler(quaternion)[2]
         along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
@@ -313,7 +274,7 @@ class WalkEnv:
         feet = robots.foot_positions(self.robot, joint_position)
         foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
         phases = walk_policy.foot_phases(state.memory.gait, state.spec.commands)
-        body = state.body
+        random = state.random
         privileged = jnp.concatenate(
             [
                 clean,
@@ -327,25 +288,17 @@ class WalkEnv:
                 2.0 * state.mean_error,
                 state.force / 20.0,
                 state.slope * 4.0,
-                body.com * 20.0,
-                jnp.stack([body.friction - 1.0, body.payload / 2.0, (body.strength - 1.0) * 5.0]),
+                random.center_of_mass[0] * 20.0,
+                (random.motor_strength - 1.0) * 5.0,
+                random.friction - 1.0,
+                random.payload / 2.0,
             ]
         )
-        obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))
+        obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))[None]
         privileged = jnp.nan_to_num(jnp.clip(privileged, -100.0, 100.0))
-        return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
-
-    def autoreset(self, state: WalkState) -> WalkState:
-        """Resets a finished environment; reward, termination flags and metrics of the last step are kept."""
-        done = state.terminated | state.truncated
-        key, reset_key = jax.random.split(state.key)
-        fresh = self.reset(reset_key, None, state.difficulty)
-        data = self.physics.merge(done, fresh.data, state.data)
-        keep = {name: getattr(state, name) for name in ("reward", "terminated", "truncated", "metrics", "difficulty")}
-        others = [field.name for field in dataclasses.fields(state) if field.name not in ("data", "key", *keep)]
-        pick = lambda new, old: jnp.where(done, new, old)  # noqa: E731
-        merged = {name: jax.tree.map(pick, getattr(fresh, name), getattr(state, name)) for name in others}
-        return WalkState(data=data, key=key, **keep, **merged)
+        return dataclasses.replace(
+            state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged
+        )
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:
@@ -363,4 +316,4 @@ def heading_velocity(robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
 
 def _zero_metrics(weights: WalkRewards) -> dict[str, Any]:
     names = [f"reward/{field.name}" for field in dataclasses.fields(weights)]
-    return {name: jnp.zeros(()) for name in [*names, "error_vx", "error_vy", "error_yaw"]}
+    return {name: jnp.zeros(()) for name in [*names, "error_vx", "error_vy", "error_yaw", "diverged"]}

@@ -103,7 +103,7 @@ def measure(
 
         def one(state: Any, memory: Any) -> Any:
             robot_state = env.read(state.data)
-            gravity = state.obs[:3]
+            gravity = state.obs[0, :3]
             commands = state.spec.commands
             _, memory = walk_policy.walk(
                 env.robot,
@@ -114,7 +114,7 @@ def measure(
                 robot_state.joint_position[0],
                 robot_state.joint_velocity[0],
             )
-            state = env.step(state, memory.action)
+            state = env.step(state, memory.action[None])
             robot_state = env.read(state.data)
             quaternion = robot_state.quaternion[0]
             feet = robots.foot_positions(env.robot, robot_state.joint_position[0])
@@ -130,7 +130,7 @@ def measure(
 
     @jax.jit
     def run(keys: jax.Array, spec: EpisodeSpec) -> Any:
-        state = jax.vmap(env.reset)(keys, spec)
+        state = jax.vmap(lambda key, spec: env.reset(key, spec=spec))(keys, spec)
         memory = jax.vmap(lambda _: walk_policy.initial_memory())(keys)
         return jax.lax.scan(advance, (state, memory), None, steps)[1]
 

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
-from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.envs.randomization import Randomization, RandomizedParams
+from mqe_jax.robots.robot import Robot
 from mqe_jax.walk.rewards import WalkRewards
+from mqe_jax.walk_policy import WalkMemory
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+LATENT_TARGET = slice(-2, None)  # of the privileged observation: friction and payload, scaled
+RANDOMIZATION = Randomization(
+    friction=(0.35, 1.8), payload=(-1.0, 2.5), center_of_mass=(-0.025, 0.025), motor_strength=(0.9, 1.1)
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,22 +71,52 @@ class EpisodeSpec:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class RandomizedBody:
-    """Randomised physical parameters of one environment's robot."""
+class WalkState:
+    """State of one environment."""
 
-    friction: jax.Array
-    """Sliding friction of its collision geoms ()."""
-    payload: jax.Array
-    """Additional mass of the trunk (), kg."""
-    com: jax.Array
-    """Shift of the trunk's centre of mass (3,), m."""
-    strength: jax.Array
-    """Factor on the motors' torques ()."""
+    data: mjx.Data
+    """Physics state."""
+    obs: jax.Array
+    """The walk policy's observation (1, 70), noisy if randomised."""
+    privileged_obs: jax.Array
+    """Observation of the critic (P,); `LATENT_TARGET` is the regression target of the adaptation network."""
+    final_obs: jax.Array
+    """Observation of the state that the last step reached (1, 70)."""
+    final_privileged_obs: jax.Array
+    """Privileged observation of the state that the last step reached (P,)."""
+    reward: jax.Array
+    """Reward (1,)."""
+    terminated: jax.Array
+    """Whether the robot has fallen () bool."""
+    truncated: jax.Array
+    """Whether the episode was truncated at the time limit () bool."""
+    metrics: dict[str, jax.Array]
+    """Reward terms and tracking errors, () each."""
+    spec: EpisodeSpec
+    """Commands and disturbances."""
+    slope: jax.Array
+    """Current slope, rate-limited towards the spec's (2,), rad."""
+    force: jax.Array
+    """Current force, rate-limited towards the spec's (2,), N."""
+    random: RandomizedParams
+    """Randomised physics parameters."""
     motor_offset: jax.Array
     """Offset added to the joint targets (12,), rad."""
+    memory: WalkMemory
+    """Recurrent state of the walk policy: gait phase and last actions; the history is empty."""
+    mean_error: jax.Array
+    """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
+    step: jax.Array
+    """Steps counted towards the time limit () int32; a trainer may set it to a random offset."""
+    episode_steps: jax.Array
+    """Steps since the reset () int32."""
+    assistance: jax.Array
+    """Curriculum () in [0, 1]: slopes, forces and pushes are scaled by 1 - assistance."""
+    key: jax.Array
+    """Random key."""
 
 
-def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Array) -> EpisodeSpec:
+def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Array | float) -> EpisodeSpec:
     """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and pushes."""
     keys = iter(jax.random.split(key, 24))
     uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
@@ -115,20 +156,5 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
         commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
         slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
         force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
-        push=task.push * difficulty,
-    )
-
-
-def sample_body(key: jax.Array, task: WalkTask) -> RandomizedBody:
-    """Samples the robot's physical parameters; nominal values without randomisation."""
-    if not task.randomize:
-        one, zero = jnp.ones(()), jnp.zeros(())
-        return RandomizedBody(one, zero, jnp.zeros(3), one, jnp.zeros(NUM_JOINTS))
-    f, p, c, s, o = jax.random.split(key, 5)
-    return RandomizedBody(
-        friction=jax.random.uniform(f, (), minval=0.35, maxval=1.8),
-        payload=jax.random.uniform(p, (), minval=-1.0, maxval=2.5),
-        com=jax.random.uniform(c, (3,), minval=-1.0, maxval=1.0) * jnp.array([0.03, 0.02, 0.02]),
-        strength=jax.random.uniform(s, (), minval=0.9, maxval=1.1),
-        motor_offset=jax.random.uniform(o, (NUM_JOINTS,), minval=-0.02, maxval=0.02),
+        push=jnp.asarray(task.push * difficulty),
     )

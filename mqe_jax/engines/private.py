@@ -1,0 +1,121 @@
+"""All uses of private modules and attributes of MuJoCo and MJX."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+from collections.abc import Callable
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+# Warp's flags for a solver at its iteration limit: expected with few iterations, and not an overflow.
+_ITERATIONS = 1 << 9 | 1 << 10
+
+
+def load_mjx() -> ModuleType:
+    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is not installed."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        from mujoco import mjx
+    for line in printed.getvalue().splitlines():
+        if not line.endswith("No module named 'warp'"):
+            print(line)
+    return mjx
+
+
+# -- MJX's data on the C engine -----------------------------------------------------------------------------------
+
+
+def without_pointers(data: mjx.Data) -> mjx.Data:
+    """Zeroes MJX's memory addresses in data made with impl `cpp`: they are invalid in another process."""
+    zeros = {name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")}
+    return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
+
+
+# -- Warp -----------------------------------------------------------------------------------------------------------
+
+
+def warp_is_installed() -> bool:
+    """Returns whether MJX found the package warp-lang."""
+    load_mjx()
+    from mujoco.mjx import warp as mjx_warp
+
+    return bool(mjx_warp.WARP_INSTALLED)
+
+
+def without_warnings(model: mjx.Model) -> mjx.Model:
+    """Disables Warp's printed warnings of overflows, which `Engine.step` returns."""
+    return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
+
+
+def without_overflow(data: mjx.Data) -> mjx.Data:
+    """Clears Warp's overflow flags."""
+    return data.replace(_impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow)))
+
+
+def overflow(data: mjx.Data) -> jax.Array:
+    """Returns whether Warp dropped contacts or constraints since its flags were cleared () bool."""
+    return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+
+
+# -- MJX-JAX --------------------------------------------------------------------------------------------------------
+
+
+def contact(data: mjx.Data) -> mjx.Contact:
+    """Returns MJX-JAX's list of contacts."""
+    return data._impl.contact
+
+
+def with_contact(data: mjx.Data, contact: mjx.Contact) -> mjx.Data:
+    """Returns data with another list of contacts."""
+    return data.replace(_impl=data._impl.replace(contact=contact))
+
+
+def is_constrained(data: mjx.Data) -> bool:
+    """Returns whether MJX-JAX's data have rows for constraints."""
+    return data._impl.efc_J.size > 0
+
+
+class GeomPairs(NamedTuple):
+    """K pairs of geoms that may touch, of the same types."""
+
+    types: tuple[Any, Any]
+    """Types of both geoms."""
+    condim: int
+    """Dimension of their contacts."""
+    geoms: np.ndarray
+    """Numbers of the geoms (K, 2)."""
+    contact: mjx.Contact
+    """Parameters of their contacts (K, ...)."""
+    collide: Callable[[mjx.Model, mjx.Data], tuple[jax.Array, jax.Array, jax.Array]]
+    """Returns distances (K C,), positions (K C, 3) and frames (K C, 3, 3) of C contacts for each pair."""
+
+
+def geom_pairs(model: mjx.Model, data: mjx.Data) -> list[GeomPairs]:
+    """Returns the pairs of geoms between which MJX-JAX computes contacts, by their types."""
+    from mujoco.mjx._src import collision_driver
+
+    found, geoms = [], collision_driver._geom_groups(model)
+    for key, pairs in collision_driver._contact_groups(model, data).items():
+        function: Any = collision_driver._COLLISION_FUNC[key.types]  # pyright: ignore[reportArgumentType]
+
+        def collide(model: mjx.Model, data: mjx.Data, function: Any = function, key: Any = key, pairs: Any = pairs):
+            return function(model, data, key, pairs.geom)
+
+        found.append(GeomPairs(key.types, key.condim, np.array(geoms[key]), pairs, collide))
+    return found
+
+
+def make_frames(normal: jax.Array) -> jax.Array:
+    """Returns contact frames (N, 3, 3) of contact normals (N, 3)."""
+    from mujoco.mjx._src import math
+
+    return jax.vmap(math.make_frame)(normal)

@@ -1,0 +1,134 @@
+"""Finished runs of a sweep, read from the run folders FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mqe_jax.errors import InputError
+from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.monitor import read_evaluations
+from mqe_jax.train.policy import POLICY_FILE
+from mqe_jax.train.runner import CONFIG_FILE, CSV_FILE, load_run_config
+
+REWARD = "average_step_reward"
+PLAIN = "plain"
+"""Name of the variant of a sweep without variants."""
+DIGITS = 6
+"""Significant digits in tables."""
+
+Curve = dict[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One task, algorithm and variant of a sweep; runs of different seeds belong to the same cell."""
+
+    task: str
+    algorithm: str
+    variant: str = PLAIN
+
+    @property
+    def path(self) -> Path:
+        """The cell's folder below `runs/`."""
+        suffix = "" if self.variant == PLAIN else f"+{self.variant}"
+        return Path(self.task) / f"{self.algorithm}{suffix}"
+
+    @classmethod
+    def at(cls, path: Path) -> Cell:
+        """Returns the cell of a folder, given its last two parts at least."""
+        algorithm, _, variant = path.name.partition("+")
+        return cls(path.parent.name, algorithm, variant or PLAIN)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One finished run: its cell and seed, its training curve by column, and its evaluations."""
+
+    cell: Cell
+    seed: int
+    curve: Curve
+    """Columns of metrics.csv, (updates,) each."""
+    evaluations: list[dict[str, Any]]
+    """Evaluations during training: {env_steps, sampled, deterministic}; `sampled` and `deterministic` map names such as
+    average_step_reward and success_rate to numbers or None."""
+    absolute: dict[str, Any] | None
+    """The absolute metric, an evaluation of the best checkpoint; None without evaluations."""
+
+
+def finished(run_dir: Path) -> bool:
+    """Returns whether a run has its last policy and, if it is evaluated, its absolute metric."""
+    if not (run_dir / CONFIG_FILE).is_file() or not (run_dir / POLICY_FILE).is_file():
+        return False
+    config = load_run_config(run_dir)
+    total = config.num_updates * config.steps_per_update
+    if read_metadata(run_dir / POLICY_FILE, kind="policy").get("env_steps") != total:
+        return False
+    evaluations = read_evaluations(run_dir)
+    return config.evaluation.every is None or (
+        evaluations["absolute"] is not None and evaluations.get("ended_at") == total
+    )
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """Reads the finished runs of a sweep's folder, ordered by path and seed.
+
+    Raises:
+        InputError: if there is none, or a file of one is damaged.
+    """
+    runs = []
+    for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
+        if finished(path.parent):
+            seed = int(path.parent.name.removeprefix("seed"))
+            evaluations = read_evaluations(path.parent)
+            curve = read_curve(path.parent / CSV_FILE)
+            cell = Cell.at(path.parent.parent)
+            runs.append(Run(cell, seed, curve, evaluations["evaluations"], evaluations["absolute"]))
+    if not runs:
+        raise InputError(f"{folder}: has no finished run runs/TASK/ALGORITHM/seed*; it must be a sweep's folder")
+    return sorted(runs, key=lambda run: (run.cell.path.as_posix(), run.seed))
+
+
+def read_curve(path: Path) -> Curve:
+    """Reads the columns of a metrics.csv.
+
+    Raises:
+        InputError: naming the file, if it is missing or malformed.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            curve = {name: np.array([float(row[name]) for row in rows]) for name in reader.fieldnames or []}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, TypeError, ValueError):
+        raise InputError(f"{path}: is not a metrics.csv") from None
+    if not {"env_steps", REWARD} <= set(curve) or not rows:
+        raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
+    return curve
+
+
+def number(value: float, digits: int = DIGITS) -> str:
+    """Returns a number with `digits` significant digits; integers, such as steps, in full."""
+    value = float(value)
+    whole = math.isfinite(value) and value.is_integer() and abs(value) < 1e15
+    return str(int(value)) if whole else f"{value:.{digits}g}"
+
+
+def table(columns: Mapping[str, Any], digits: int = DIGITS) -> str:
+    """Returns columns of equal length as CSV text; numbers as `number` writes them."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow([item if isinstance(item, str) else number(item, digits) for item in row])
+    return text.getvalue()

@@ -1,0 +1,127 @@
+"""The walk policy as a network of the trainer: a window of 30 observations, an adaptation network and a body.
+
+The memory is the last 29 observations (29 x 70 numbers). The trainer stores it at the first step of each chunk only,
+and `evaluate` builds the windows of the chunk's steps. The body receives the adaptation network's output without
+gradient; that network is trained by regression on `LATENT_TARGET`.
+
+Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax import robots, walk_policy
+from mqe_jax.settings import NonNegative, PositiveInt, fail
+from mqe_jax.train import nn
+from mqe_jax.train.gaussian import GaussianSettings
+from mqe_jax.train.loss import entropy, log_prob
+from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
+from mqe_jax.train.types import Memory, NetworkMemory, Params
+from mqe_jax.walk.symmetry import symmetry_loss
+from mqe_jax.walk.task import LATENT_TARGET
+from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
+
+_CRITIC = (512, 256, 128)
+
+
+@register_network("walk")
+class WalkNetwork(GaussianSettings):
+    """Settings of the walk policy and its critic, which sees the privileged observation."""
+
+    weights: str | None = None
+    """File of walk weights to start from, of any robot; none samples them."""
+    chunk_length: PositiveInt = 24
+    """Steps of a chunk, at whose first one the history is stored."""
+    adaptation_coef: NonNegative = 1.0
+    """Weight of the adaptation network's regression loss."""
+    symmetry_coef: NonNegative = 0.5
+    """Weight of the loss of left-right symmetry."""
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network; see `Network`."""
+        sizes = (dims.agents, dims.observation, dims.action)
+        if sizes != (1, OBSERVATION_SIZE, walk_policy.BODY_SIZES[-1]):
+            fail("network.name", "walk", "another network, except in the walking environment")
+        return _build(self, dims)
+
+
+def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array) -> jax.Array:
+    """Returns the flattened windows (L, C, 2100) of a chunk's steps; observations before an episode's start are zero.
+
+    Args:
+        memory: the 29 observations before the chunk (C, 29, 70).
+        is_first: whether a step is the first of an episode (L, C) bool.
+        obs: observations (L, C, 70).
+    """
+    steps, count = is_first.shape
+    before = jnp.moveaxis(memory, 1, 0)
+    rows = jnp.arange(steps)[:, None] + jnp.arange(HISTORY)
+    episode = jnp.cumsum(is_first, axis=0)
+    of_row = jnp.concatenate([jnp.zeros((len(before), count), episode.dtype), episode])
+    alive = of_row[rows] == episode[:, None]
+    window = jnp.concatenate([before, obs])[rows] * alive[..., None]
+    return jnp.swapaxes(window, 1, 2).reshape(steps, count, -1)
+
+
+def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
+    def init(key: jax.Array) -> Params:
+        policy_key, critic_key = jax.random.split(key)
+        if settings.weights is None:
+            policy = walk_policy.init_params(policy_key)
+        else:
+            policy = walk_policy.load_params(robots.get("go1"), settings.weights)
+        return {
+            "policy": jax.tree.map(jnp.asarray, policy),
+            "log_std": jnp.full(dims.action, settings.log_std_init, jnp.float32),
+            "critic": nn.mlp_init(critic_key, (dims.privileged, *_CRITIC, 1), final_scale=1.0),
+        }
+
+    def policy_params(params: Params) -> Params:
+        return {name: params[name] for name in ("policy", "log_std")}
+
+    def initial_memory(num_envs: int) -> NetworkMemory:
+        return NetworkMemory(jnp.zeros((num_envs, HISTORY - 1, OBSERVATION_SIZE)), ())
+
+    def mean_of(params: Params, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
+        latent = walk_policy.infer_latent(params["policy"], flat)
+        return walk_policy.infer_action(params["policy"], flat, jax.lax.stop_gradient(latent)), latent
+
+    def act(
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, Memory]:
+        window = jnp.concatenate([memory, obs], axis=-2)
+        mean, _ = mean_of(params, window.reshape(len(obs), -1))
+        log_std = settings.bounded_log_std(params["log_std"])
+        action = mean if key is None else mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        return action[:, None], log_prob(action, mean, log_std)[:, None], window[:, 1:]
+
+    def value(
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
+    ) -> tuple[jax.Array, Memory]:
+        return nn.mlp(params["critic"], privileged, jax.nn.elu), memory
+
+    def evaluate(
+        params: Params,
+        memory: NetworkMemory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        action: jax.Array,
+    ) -> Evaluation:
+        flat = windows(memory.actor, is_first, obs[..., 0, :])
+        mean, latent = mean_of(params, flat)
+        log_std = jnp.broadcast_to(settings.bounded_log_std(params["log_std"]), mean.shape)
+        error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
+        losses = {"adaptation": settings.adaptation_coef * error}
+        if settings.symmetry_coef > 0:
+            losses["symmetry"] = settings.symmetry_coef * symmetry_loss(params["policy"], flat, mean)
+        return Evaluation(
+            log_prob(action, mean[..., None, :], log_std[..., None, :]),
+            entropy(log_std)[..., None],
+            value(params, (), is_first, obs, privileged)[0],
+            losses,
+        )
+
+    return Network(init, policy_params, initial_memory, act, value, evaluate, settings.chunk_length)

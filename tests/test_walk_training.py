@@ -1,0 +1,136 @@
+"""The walk policy as a network of the trainer: windows, rollout and update, settings, a run."""
+
+from __future__ import annotations
+
+import itertools
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import cli, walk_policy
+from mqe_jax.errors import InputError
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.settings import override
+from mqe_jax.train.learner import make_learner
+from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.types import NetworkMemory
+from mqe_jax.walk.network import WalkNetwork, windows
+from mqe_jax.walk.training import WALK
+from tests.probes import Probe
+
+DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, teams=((0,),), values=1)
+
+
+def test_windows_are_the_histories_kept_step_by_step() -> None:
+    """Over two chunks of 20 steps; environment 1 starts an episode at step 10, environment 2 with the second chunk."""
+    random = np.random.default_rng(0)
+    steps, envs = 40, 3
+    obs = random.normal(size=(steps, envs, 70)).astype(np.float32)
+    is_first = np.zeros((steps, envs), bool)
+    is_first[0] = is_first[10, 1] = is_first[20, 2] = True
+    history, kept, starts = np.zeros((envs, 30, 70), np.float32), [], []
+    for t in range(steps):
+        before = np.where(is_first[t][:, None, None], 0, history[:, 1:])
+        history = np.concatenate([before, obs[t][:, None]], axis=1)
+        kept.append(history.reshape(envs, -1))
+        starts.append(before)
+    for start in (0, 20):
+        chunk = slice(start, start + 20)
+        found = windows(jnp.asarray(starts[start]), jnp.asarray(is_first[chunk]), jnp.asarray(obs[chunk]))
+        np.testing.assert_array_equal(found, np.stack(kept[chunk]))
+
+
+def waves(hidden: jax.Array, step: jax.Array) -> jax.Array:
+    return jnp.sin(jnp.arange(69) * (1.0 + 0.3 * step[:, None]) + hidden[:, None])
+
+
+def probe(num_envs: int = 4) -> Any:
+    """Observations that differ between steps; odd environments have longer episodes than even ones."""
+
+    def pay(hidden: jax.Array, action: jax.Array) -> jax.Array:
+        return -jnp.mean(jnp.square(action), axis=-1)
+
+    return Probe(
+        waves,
+        pay,
+        num_envs=num_envs,
+        num_agents=1,
+        action_size=12,
+        features=69,
+        max_episode_steps=5,
+        odd_episode_steps=31,
+        teams=((0,),),
+    )
+
+
+def settings(**changes: Any) -> Any:
+    small = {"num_envs": 4, "rollout_steps": 12, "network": {"chunk_length": 6}, "stagger_episodes": False}
+    return override(WALK, {**small, "curriculum.assistance": 0.0, **changes})
+
+
+def test_a_chunk_repeats_the_rollout() -> None:
+    """The first gradient step reproduces the rollout's log-densities: histories, chunks and resets are the same."""
+    learner = make_learner(probe(), settings(ppo={"epochs": 1, "minibatches": 1}))
+    update, state = jax.jit(learner.update), jax.jit(learner.init)(jax.random.PRNGKey(0))
+    for _ in range(4):
+        state, metrics = update(state)
+        assert abs(float(metrics["approx_kl"])) < 1e-5 and float(metrics["clip_fraction"]) == 0.0
+    assert state.rollout.memory.actor.shape == (4, 29, 70)
+
+
+def test_only_the_critic_learns_at_first() -> None:
+    config = settings(total_steps=3 * 48, ppo={"epochs": 1, "minibatches": 1, "critic_warmup": 0.5})
+    learner = make_learner(probe(), config)
+    update, states = jax.jit(learner.update), [jax.jit(learner.init)(jax.random.PRNGKey(0))]
+    for _ in range(3):
+        states.append(update(states[-1])[0])
+    for number, (before, after) in enumerate(itertools.pairwise(states)):
+        for name, moves in (("critic", True), ("policy", number == 2)):
+            pairs = zip(*(jax.tree.leaves(state.params[name]) for state in (before, after)), strict=True)
+            assert any(np.any(a != b) for a, b in pairs) == moves
+
+
+def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> None:
+    network = WalkNetwork(symmetry_coef=0.0).build(DIMS)
+    params = network.init(jax.random.PRNGKey(0))
+    obs = jax.random.normal(jax.random.PRNGKey(1), (3, 2, 1, 70))
+    privileged = jax.random.normal(jax.random.PRNGKey(2), (3, 2, 5))
+    rest = NetworkMemory(jnp.zeros((2, 29, 70)), ()), jnp.zeros((3, 2), bool), obs, privileged, jnp.zeros((3, 2, 1, 12))
+
+    def adaptation(params: Any) -> jax.Array:
+        return network.evaluate(params, *rest).losses["adaptation"]
+
+    latent = walk_policy.infer_latent(params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0]))
+    error = np.square(latent - privileged[..., -2:]).mean()
+    assert float(adaptation(params)) == pytest.approx(float(error), rel=1e-5)
+    policy_gradient = jax.grad(lambda p: network.evaluate(p, *rest).log_prob.sum())(params)["policy"]["adaptation"]
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(policy_gradient))  # the body's input has no gradient
+
+
+def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "start.safetensors"
+    start = walk_policy.init_params(jax.random.PRNGKey(3))
+    walk_policy.save_params(start, file)
+    params = WalkNetwork(weights=str(file)).build(DIMS).init(jax.random.PRNGKey(0))
+    jax.tree.map(np.testing.assert_array_equal, params["policy"], start)
+    with pytest.raises(InputError, match=r"network.name: 'walk' is not allowed"):
+        WalkNetwork().build(DIMS._replace(agents=2))
+
+
+@pytest.mark.soak
+def test_a_run_is_resumed_and_its_weights_walk(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = str(walk_policy.ASSETS / GO1.walk.weights)
+    train = ["walk", "train", "--run-dir", str(tmp_path), "--num-envs", "16", "--impl", "c", "--weights", weights]
+    train += ["--set", "optimizer.learning_rate=1e-5", "--set", "network.log_std_init=-2", "--total-steps"]
+    assert cli.main([*train, str(16 * 24)]) == 0
+    assert cli.main([*train, str(3 * 16 * 24), "--resume"]) == 0
+    rows = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert [row.split(",")[1] for row in rows] == ["updates", "1", "2", "3"]
+    evaluate = ["walk", "eval", "--weights", str(tmp_path / "walk.safetensors"), "--episodes", "4", "--impl", "c"]
+    assert cli.main([*evaluate, "--scenario", "trot"]) == 0
+    assert cli.main([*train, str(3 * 16 * 24), "--resume", "--robot", "go2"]) == 2
+    assert "env.robot: 'go2' differs" in capsys.readouterr().err

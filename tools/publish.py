@@ -1,0 +1,226 @@
+"""Publishes sweeps: curves and evaluations as two compressed tables, best policies, and the page with their figures.
+
+`python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and evaluations.csv.gz in
+results/paper, thinned, and writes the policies of their cells' best seeds (by the absolute metric) that match
+`--policies` to results/paper/policies, with parameters as float16. It then regenerates the figures and tables of
+docs/results/paper.md from these files alone; without a SWEEP only this.
+
+`python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import fnmatch
+import gzip
+import io
+import itertools
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import paper_page
+
+from mqe_jax.errors import InputError
+from mqe_jax.files import write_atomically
+from mqe_jax.study.estimates import absolute
+from mqe_jax.study.runs import REWARD, Cell, Curve, Run, number, read_runs
+from mqe_jax.train.policy import read_policy, save_policy
+
+ROOT = Path(__file__).parents[1]
+MEASUREMENTS = ROOT / "results" / "measurements.json"
+CURVES, EVALUATIONS = "curves.csv.gz", "evaluations.csv.gz"
+IDENTITY = ("task", "algorithm", "variant", "seed")
+ROWS, DIGITS = 50, 5
+"""Rows of a published curve, and significant digits."""
+COLUMNS = ("env_steps", REWARD, "success", "episode_length")
+"""Columns of a published curve, beside the terms of the reward that are not zero."""
+MODES = ("sampled", "deterministic")
+EVALUATED = (REWARD, "success_rate")
+"""Published numbers of evaluations during training; of the absolute metric all are."""
+
+Key = tuple[Cell, int]
+
+
+def thin(curve: Curve) -> Curve:
+    """Returns a curve of at most `ROWS` rows: means over groups of consecutive rows of about equal size.
+
+    `env_steps` are those at the end of a group; means ignore NaN.
+    """
+    count = len(curve["env_steps"])
+    ends = np.unique(np.linspace(0, count, min(count, ROWS) + 1).round().astype(int))
+    terms = sorted(name for name in curve if name.startswith("reward/") and np.nan_to_num(curve[name]).any())
+    thinned: Curve = {}
+    for name in [*(name for name in COLUMNS if name in curve), *terms]:
+        parts = [curve[name][a:b] for a, b in itertools.pairwise(ends)]
+        thinned[name] = np.array([part[-1] if name == "env_steps" else _mean(part) for part in parts])
+    return thinned
+
+
+def _mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else math.nan
+
+
+def read_tables(folder: Path) -> list[Run]:
+    """Reads the published runs of a folder, ordered by path and seed.
+
+    Raises:
+        InputError: for a table that is missing or damaged.
+    """
+    curves: dict[Key, list[dict[str, str]]] = {}
+    for key, row in _read(folder / CURVES):
+        curves.setdefault(key, []).append(row)
+    points: dict[Key, list[dict[str, Any]]] = {}
+    best: dict[Key, dict[str, Any]] = {}
+    for key, row in _read(folder / EVALUATIONS):
+        numbers = {name: int(row[name]) for name in ("env_steps", "episodes") if row[name]}
+        modes = {
+            mode: {name[len(mode) + 1 :]: float(x) for name, x in row.items() if x and name.startswith(f"{mode}/")}
+            for mode in MODES
+        }
+        if row["kind"] == "absolute":
+            best[key] = {**numbers, **modes}
+        else:
+            points.setdefault(key, []).append({**numbers, **modes})
+    runs = []
+    for key, rows in curves.items():
+        names = [name for name in rows[0] if rows[0][name]]
+        curve = {name: np.array([float(row[name]) for row in rows]) for name in names}
+        runs.append(Run(*key, curve, points.get(key, []), best.get(key)))
+    return sorted(runs, key=lambda run: (run.cell.path.as_posix(), run.seed))
+
+
+def _read(path: Path) -> Iterable[tuple[Key, dict[str, str]]]:
+    try:
+        for row in csv.DictReader(io.StringIO(gzip.decompress(path.read_bytes()).decode())):
+            task, algorithm, variant, seed = (row.pop(name) for name in IDENTITY)
+            yield (Cell(task, algorithm, variant), int(seed)), row
+    except (OSError, EOFError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: is not a table of runs ({error!r})") from None
+
+
+def write_tables(folder: Path, runs: Sequence[Run]) -> None:
+    """Writes both tables of a folder where their content changes; the same runs give the same bytes."""
+    curves, evaluations = [], []
+    for run in runs:
+        identity = dict(zip(IDENTITY, (run.cell.task, run.cell.algorithm, run.cell.variant, run.seed), strict=True))
+        curve = thin(run.curve)
+        curves += [{**identity, **dict(zip(curve, row, strict=True))} for row in zip(*curve.values(), strict=True)]
+        for point in run.evaluations:
+            evaluations.append({**identity, "kind": "training", **_numbers(point, EVALUATED)})
+        if run.absolute is not None:
+            evaluations.append({**identity, "kind": "absolute", **_numbers(run.absolute)})
+    for name, rows, first in ((CURVES, curves, COLUMNS), (EVALUATIONS, evaluations, ("kind", "env_steps", "episodes"))):
+        others = sorted({column for row in rows for column in row} - {*IDENTITY, *first})
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [*IDENTITY, *first, *others], lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: x if isinstance(x, str) else number(x, DIGITS) for k, x in row.items()})
+        folder.mkdir(parents=True, exist_ok=True)
+        content, path = text.getvalue().encode(), folder / name
+        if not path.is_file() or gzip.decompress(path.read_bytes()) != content:
+            write_atomically(path, gzip.compress(content, mtime=0))
+
+
+def _numbers(point: Mapping[str, Any], names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Returns the numbers of an evaluation as columns: env_steps, episodes, and MODE/NAME for `names` or all."""
+    columns = {name: point[name] for name in ("env_steps", "episodes") if name in point}
+    for mode in MODES:
+        values = point.get(mode, {})
+        columns |= {f"{mode}/{k}": x for k, x in values.items() if x is not None and (names is None or k in names)}
+    return columns
+
+
+def publish(sweeps: Sequence[Path], target: Path, policies: Sequence[str]) -> list[str]:
+    """Adds finished runs to the tables below `target`, and the best policies of their cells that match `policies`.
+
+    Returns the best runs whose policies are in none of the sweeps.
+
+    Raises:
+        InputError: for a sweep without finished runs, or with other results of a run that is published.
+    """
+    runs = {(run.cell, run.seed): run for run in read_tables(target)} if (target / CURVES).is_file() else {}
+    folders: dict[Key, Path] = {}
+    for sweep in sweeps:
+        for run in read_runs(sweep):
+            key = run.cell, run.seed
+            other = runs.setdefault(key, run)
+            if number(absolute(other, REWARD), DIGITS) != number(absolute(run, REWARD), DIGITS):
+                raise InputError(f"{sweep}: {_name(run)} differs from the one that is published; remove one of them")
+            folders[key] = sweep / "runs" / _name(run)
+    if folders:
+        write_tables(target, sorted(runs.values(), key=lambda run: (run.cell.path.as_posix(), run.seed)))
+    missing = []
+    for cell in dict.fromkeys(cell for cell, _ in folders):
+        if not any(fnmatch.fnmatch(cell.path.as_posix(), pattern) for pattern in policies):
+            continue
+        best = max((run for run in runs.values() if run.cell == cell), key=lambda run: _score(run))
+        folder = folders.get((cell, best.seed))
+        if folder is None or best.absolute is None:
+            missing.append(_name(best))
+            continue
+        policy = read_policy(folder / "best" / f"step_{best.absolute['env_steps']:012d}.safetensors")
+        path = target / "policies" / cell.task / f"{cell.path.name}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_policy(path.parent, policy, path.name, half=True)
+    return missing
+
+
+def _name(run: Run) -> str:
+    return f"{run.cell.path.as_posix()}/seed{run.seed}"
+
+
+def _score(run: Run) -> float:
+    value = absolute(run, REWARD)
+    return -math.inf if math.isnan(value) else value
+
+
+def add_measurement(name: str, file: Path, target: Path = MEASUREMENTS) -> None:
+    """Puts the content of a JSON file, or the rows of a CSV file, into a JSON file under a name."""
+    text = file.read_text(encoding="utf-8")
+    content = list(csv.DictReader(io.StringIO(text))) if file.suffix == ".csv" else json.loads(text)
+    entries = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
+    write_atomically(target, _entries({**entries, name: content}).encode())
+
+
+def _entries(entries: Mapping[str, Any]) -> str:
+    """Returns JSON with a line for each entry and each of its items."""
+    parts = []
+    for name, entry in sorted(entries.items()):
+        items = entry.items() if isinstance(entry, dict) else ((None, item) for item in entry)
+        lines = [("" if k is None else f"{json.dumps(k)}: ") + json.dumps(item) for k, item in items]
+        opening, closing = "{}" if isinstance(entry, dict) else "[]"
+        parts.append(f" {json.dumps(name)}: {opening}\n  " + ",\n  ".join(lines) + f"\n {closing}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def main() -> int:
+    """Publishes sweeps and regenerates the page; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sweeps", nargs="*", type=Path, metavar="SWEEP")
+    parser.add_argument("--target", type=Path, default=ROOT / "results" / "paper")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "paper.md")
+    parser.add_argument("--policies", nargs="*", default=("*+tuned",), metavar="PATTERN", help="of cells")
+    parser.add_argument("--measurement", nargs=2, metavar=("NAME", "FILE"))
+    arguments = parser.parse_args()
+    try:
+        if arguments.measurement:
+            add_measurement(arguments.measurement[0], Path(arguments.measurement[1]))
+            return 0
+        missing = publish(arguments.sweeps, arguments.target, arguments.policies)
+        paper_page.update(read_tables(arguments.target), arguments.target, arguments.page)
+    except InputError as error:
+        parser.exit(2, f"error: {error}\n")
+    for name in missing:
+        print(f"no policy found: {name}")
+    return 1 if missing else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
