@@ -158,11 +158,6 @@ def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
     return jnp.ones_like(hidden)
 
 
-def pay_own_side(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Pays about 1, and more the nearer agent 0 is to -0.5 and the farther agent 1 is from 0.5: a match of agents."""
-    return 1.0 + jnp.square(action[:, 0, 0] + 0.5) - jnp.square(action[:, 1, 0] - 0.5)
-
-
 def pay_near_hidden(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Reward maximal if all agents' actions are half the sign."""
     return -jnp.mean(jnp.square(action - 0.5 * hidden[:, None, None]), axis=(1, 2))

@@ -144,14 +144,21 @@ def test_a_divergence_is_recorded_and_replayed(
     assert clip.stat().st_size > 500
 
 
+@pytest.mark.parametrize(("task", "num_envs", "agents"), [("go1plane", "2", 1), ("go1revolvingdoor", "4", 2)])
 def test_a_divergence_in_training_is_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    task: str,
+    num_envs: str,
+    agents: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
+    """Of a match, whose teams are environments of their own, once and with the actions of both."""
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)  # in the second step
     (tmp_path / "small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
     command = [
         "train",
-        "go1plane",
+        task,
         "--impl",
         "c",
         "--control",
@@ -161,12 +168,13 @@ def test_a_divergence_in_training_is_recorded(
         "--config",
         "small.yaml",
     ]
-    command += ["--num-envs", "2", "--rollout-steps", "2", "--total-steps", "4", "--ppo.minibatches", "1"]
-    assert cli.main([*command, "--set", "num_agents=1", "--dump-diverged", "dump"]) == 0
+    command += ["--num-envs", num_envs, "--rollout-steps", "2", "--total-steps", "4", "--ppo.minibatches", "1"]
+    assert cli.main([*command, "--set", f"num_agents={agents}", "--dump-diverged", "dump"]) == 0
     assert "recorded 2 divergences" in capfd.readouterr().err
     for file in ("diverged_0000.npz", "diverged_0001.npz"):
         recording = load_recording(tmp_path / "dump" / file)
-        assert recording.task == "go1plane" and recording.states["step"].tolist() == [0, 1]
+        assert recording.task == task and recording.states["step"].tolist() == [0, 1]
+        assert recording.actions.shape == (2, agents, 12)
 
 
 def test_bench_prints_its_figures_and_appends_them(
