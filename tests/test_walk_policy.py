@@ -15,18 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import cli, control, interrupts, robots, walk_policy
+from mqe_jax import actuators, cli, interrupts, robots
 from mqe_jax.errors import InputError
 from mqe_jax.files import append
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import Scene
+from mqe_jax.skills import Proprioception, walk_policy
+from mqe_jax.skills.walk_policy import ADAPTATION_SIZES, BODY_SIZES, WalkPolicy
 from mqe_jax.train import checkpoint
 from mqe_jax.walk import convert, training
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import windows
-from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
+
+SKILL = WalkPolicy(GO1)
 
 
 def elu(x: np.ndarray) -> np.ndarray:
@@ -188,7 +191,7 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     memory = walk_policy.WalkMemory(jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(()))
-    commands = default_commands(GO1, "trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
+    commands = SKILL.default_commands("trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
     joints = GO1.default_joints + np.arange(12)
     obs = walk_policy.observe(
         GO1, memory, jnp.asarray(commands), jnp.array([0.0, 0.0, -1.0]), jnp.asarray(joints), jnp.full(12, 2.0)
@@ -206,7 +209,7 @@ def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     [("trot", [(0, 3), (1, 2)]), ("pace", [(0, 2), (1, 3)]), ("bound", [(0, 1), (2, 3)]), ("pronk", [(0, 1, 2, 3)])],
 )
 def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int, ...]]) -> None:
-    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(default_commands(GO1, gait))))
+    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(SKILL.default_commands(gait))))
     for group in together:
         assert np.ptp(phases[list(group)]) < 1e-6
     if len(together) == 2:
@@ -214,7 +217,7 @@ def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int,
 
 
 def test_phases_are_warped_by_the_duration() -> None:
-    commands = jnp.asarray(default_commands(GO1, "pronk", duration=0.8))
+    commands = jnp.asarray(SKILL.default_commands("pronk", duration=0.8))
     assert float(walk_policy.foot_phases(jnp.float32(0.4), commands)[0]) == pytest.approx(0.25)
     assert float(walk_policy.foot_phases(jnp.float32(0.9), commands)[0]) == pytest.approx(0.75)
     contact = desired_contact(jnp.array([0.25, 0.75]))
@@ -223,14 +226,15 @@ def test_phases_are_warped_by_the_duration() -> None:
 
 def test_memory_shifts_and_advances() -> None:
     params = walk_policy.load_params(GO1)
-    memory = walk_policy.initial_memory()
-    still = jnp.asarray(default_commands(GO1)), jnp.array([0.0, 0, -1]), jnp.asarray(GO1.default_joints), jnp.zeros(12)
-    target, memory = walk_policy.walk(GO1, params, memory, *still)
+    memory = SKILL.init_memory()
+    sensed = Proprioception(jnp.array([0.0, 0, -1]), jnp.asarray(GO1.default_joints), jnp.zeros(12))
+    still = jnp.asarray(SKILL.default_commands()), sensed
+    target, memory = SKILL.targets(params, memory, *still)
     assert target.shape == (12,) and float(memory.gait) == pytest.approx(0.06)
     assert not np.asarray(memory.history[:-1]).any() and np.asarray(memory.history[-1]).any()
     first = np.asarray(memory.action)
     np.testing.assert_allclose(target, GO1.default_joints + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5)
-    _, memory = walk_policy.walk(GO1, params, memory, *still)
+    _, memory = SKILL.targets(params, memory, *still)
     np.testing.assert_array_equal(memory.previous_action, first)
 
 
@@ -324,10 +328,10 @@ def test_training_is_saved_before_a_signal_ends_it_and_resumes_without_doubled_r
 
 def test_command_actions_are_the_papers() -> None:
     action = jnp.array([[0.25, -1.0, 0.5], [1.0, 0.0, 0.0]])
-    commands = control.commands_from_action(action, ("vx", "vy", "yaw_rate"), default_commands(GO1))
+    commands = SKILL.commands_from_action(action, ("vx", "vy", "yaw_rate"), SKILL.default_commands())
     np.testing.assert_allclose(commands[0, :3], [0.5, -0.5, 0.25])
     assert float(commands[1, 0]) == 1.0
-    np.testing.assert_allclose(commands[:, 3:], np.tile(default_commands(GO1)[3:], (2, 1)))
+    np.testing.assert_allclose(commands[:, 3:], np.tile(SKILL.default_commands()[3:], (2, 1)))
 
 
 def test_slope_turns_gravity() -> None:
@@ -369,7 +373,7 @@ def test_actuator_network_computes_softsign_layers() -> None:
         x = x @ flat[f"{layer}.weight"].T + flat[f"{layer}.bias"]
         x = x / (1 + np.abs(x))
     expected = (x @ flat["4.weight"].T + flat["4.bias"])[:, 0]
-    found = jax.jit(control.actuator_torque)(params, jnp.asarray(error), jnp.asarray(velocity))
+    found = jax.jit(actuators.actuator_torque)(params, jnp.asarray(error), jnp.asarray(velocity))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
 

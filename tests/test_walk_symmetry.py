@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import robots
 from mqe_jax.robots.robot import JOINT_NAMES
+from mqe_jax.skills import walk_policy
+from mqe_jax.skills.walk_policy import WalkMemory
 from mqe_jax.walk.symmetry import mirror_action, mirror_history, symmetry_loss
-from mqe_jax.walk_policy import WalkMemory
 
 GO1 = robots.get("go1")
-Y_AND_ROTATIONS = [walk_policy.command_index(name) for name in ("vy", "yaw_rate", "roll")]
+Y_AND_ROTATIONS = list(walk_policy.WalkPolicy.index(("vy", "yaw_rate", "roll")))
 
 
 def observation(joints: np.ndarray, gravity: np.ndarray, commands: np.ndarray, gait: float) -> np.ndarray:
@@ -27,7 +28,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
                          "RR" if n[:2] == "RL" else "RL") + n[2:])] for n in JOINT_NAMES])  # fmt: skip
     mirrored[0::3] *= -1.0
     for gait in ("trot", "pace"):
-        commands = np.array(walk_policy.default_commands(GO1, gait))
+        commands = np.array(walk_policy.WalkPolicy(GO1).default_commands(gait))
         commands[Y_AND_ROTATIONS] = 0.2, -0.4, 0.1
         other = commands.copy()
         other[Y_AND_ROTATIONS] *= -1.0

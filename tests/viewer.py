@@ -14,6 +14,8 @@ import numpy as np
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax.cli.players import planner
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.skills.walk_policy import WalkPolicy
 from mqe_jax.view.session import Session
 
 CAMERA = {
@@ -36,7 +38,7 @@ class Driven(FakeEnv):
 
     control = "command"
     params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
-    controller = SimpleNamespace(default_commands=np.zeros(15, np.float32))
+    controller = SimpleNamespace(skill=WalkPolicy(GO1), default_commands=np.zeros(15, np.float32))
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         return action * jnp.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]])

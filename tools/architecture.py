@@ -20,7 +20,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("collision", "rotation", "robots"),
     ("terrain", "objects", "npc"),
     ("scene", "engines"),
-    ("walk_policy", "control"),
+    ("actuators", "skills", "control"),
     ("envs", "train"),
     ("planners", "walk"),
     ("study", "viz", "view", "export", "adapters"),
@@ -30,8 +30,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 ACROSS = {
     "settings": 0.12, "errors": 0.37, "interrupts": 0.62, "files": 0.87,
     "rotation": 0.86, "collision": 0.3, "robots": 0.58, "terrain": 0.12,
-    "objects": 0.33, "npc": 0.53, "scene": 0.3, "engines": 0.7, "walk_policy": 0.5,
-    "control": 0.76, "envs": 0.25, "train": 0.9,
+    "objects": 0.33, "npc": 0.53, "scene": 0.3, "engines": 0.7, "actuators": 0.8,
+    "skills": 0.25, "control": 0.52, "envs": 0.25, "train": 0.9,
     "planners": 0.34, "walk": 0.62, "study": 0.08, "viz": 0.27, "view": 0.46, "export": 0.65,
     "adapters": 0.84, "cli": 0.5,
 }  # fmt: skip

@@ -15,7 +15,8 @@ from mqe_jax.train.checkpoint import prepare_folder
 
 def walk_train(arguments: WalkTrain) -> None:
     """Trains the walk policy into the run folder."""
-    from mqe_jax import robots, walk_policy
+    from mqe_jax import robots
+    from mqe_jax.skills import walk_policy
     from mqe_jax.walk import training as walk
     from mqe_jax.walk.env import WalkEnv
 
@@ -66,7 +67,8 @@ def walk_train(arguments: WalkTrain) -> None:
 
 def walk_eval(arguments: WalkEval) -> dict[str, Any]:
     """Evaluates the walk policy; prints a table, or returns the object for `--json`."""
-    from mqe_jax import robots, walk_policy
+    from mqe_jax import robots
+    from mqe_jax.skills import walk_policy
     from mqe_jax.walk.evaluation import evaluate_walk
 
     def report(name: str, figures: Mapping[str, float]) -> None:
@@ -89,7 +91,8 @@ def walk_eval(arguments: WalkEval) -> dict[str, Any]:
 
 def walk_convert(arguments: WalkConvert) -> None:
     """Converts official checkpoints."""
-    from mqe_jax import robots, walk_policy
+    from mqe_jax import robots
+    from mqe_jax.skills import walk_policy
     from mqe_jax.walk import convert
 
     if arguments.output.suffix != ".safetensors":

@@ -21,8 +21,6 @@ from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS
 
-# Sign of a command under reflection.
-_MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}
 # Joints of the opposite legs (FL <-> FR, RL <-> RR), and their signs under reflection: hip abduction flips.
 _OTHER_SIDE = np.arange(NUM_JOINTS).reshape(4, 3)[[1, 0, 3, 2]].ravel()
 _OTHER_SIGN = np.tile([-1.0, 1.0, 1.0], 4).astype(np.float32)
@@ -98,8 +96,8 @@ class Match(QuadrupedEnv):
         if self.symmetry == "turn":
             return action
         if self.control == "command":
-            names = self.params.commands
-            mirrored = action * np.array([_MIRRORED_COMMANDS.get(name, 1.0) for name in names], np.float32)
+            skill, names = self.controller.skill, self.params.commands
+            mirrored = action * np.array([skill.commands[i].mirror for i in skill.index(names)], np.float32)
         else:
             mirrored = action[:, _OTHER_SIDE] * _OTHER_SIGN
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)

@@ -1,4 +1,4 @@
-"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, walk policy.
+"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, skill.
 
 Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
 the input `X` of the next step. Agents of a mirrored team observe in their own frame, as in the task; `action` is in
@@ -6,13 +6,14 @@ that frame, commands and joint targets are in the robots' frame.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
-| `command` | `commands` (N, A, 15), `joint_target` (N, A, 12), rad |
+| `command` | `commands` (N, A, C), `joint_target` (N, A, 12), rad |
 | `position` | `joint_target` (N, A, 12), rad |
 | `torque` | `torque` (N, A, 12), N m |
 
 Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk frame, `joint_position`
-and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: `walk_history` (N, A, 30, 70), `walk_action` and
-`walk_previous_action` (N, A, 12), `walk_gait` (N, A, 1), and those of the network: `memory` if it is one array.
+and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: of the skill, for the walk policy `walk_history`
+(N, A, 30, 70), `walk_action` and `walk_previous_action` (N, A, 12), `walk_gait` (N, A, 1); and those of the network:
+`memory` if it is one array.
 """
 
 from __future__ import annotations
@@ -27,13 +28,12 @@ import jax
 import onnx
 
 import mqe_jax
-from mqe_jax import walk_policy
-from mqe_jax.control import commands_from_action
 from mqe_jax.errors import InputError
 from mqe_jax.export.graph import OPSET
 from mqe_jax.export.translate import translate
 from mqe_jax.files import write_atomically
 from mqe_jax.robots.robot import NUM_JOINTS
+from mqe_jax.skills import Proprioception, joint_targets
 from mqe_jax.train.policy import Policy
 
 
@@ -57,8 +57,8 @@ def input_shapes(policy: Policy, env: Any) -> dict[str, tuple[int, ...]]:
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
         robots |= {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
-        robots |= {"walk_history": (walk_policy.HISTORY, walk_policy.OBSERVATION_SIZE), "walk_gait": (1,)}
-        robots |= {"walk_action": (NUM_JOINTS,), "walk_previous_action": (NUM_JOINTS,)}
+        memory = env.controller.skill.init_memory()
+        robots |= {name: x.shape or (1,) for name, x in _skill_memory(env, memory).items()}
     shapes = {name: (env.num_agents, *shape) for name, shape in robots.items()}
     return shapes | {name: x.shape for name, x in _network_memory(policy.initial_memory()).items()}
 
@@ -73,8 +73,8 @@ def policy_step(policy: Policy, env: Any, inputs: Mapping[str, jax.Array]) -> di
     if env.control == "torque":
         return outputs | {"torque": own * env.robot.torque_limit}
     if env.control == "position":
-        return outputs | {"joint_target": walk_policy.joint_targets(env.robot, own, env.params.position_scale)}
-    return outputs | _walk(env, own, inputs)
+        return outputs | {"joint_target": joint_targets(env.robot, own, env.params.position_scale)}
+    return outputs | _skill(env, own, inputs)
 
 
 def _network_memory(memory: Any) -> dict[str, Any]:
@@ -83,23 +83,26 @@ def _network_memory(memory: Any) -> dict[str, Any]:
     return {"memory" if len(leaves) == 1 else f"memory_{i}": leaf for i, leaf in enumerate(leaves)}
 
 
-def _walk(env: Any, action: jax.Array, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    default = env.controller.default_commands
-    commands = jax.vmap(lambda a: commands_from_action(a, env.params.commands, default))(action)
-    memory = walk_policy.WalkMemory(
-        inputs["walk_history"], inputs["walk_action"], inputs["walk_previous_action"], inputs["walk_gait"][..., 0]
-    )
-    walk = jax.vmap(jax.vmap(functools.partial(walk_policy.walk, env.robot, env.controller.walk_params)))
-    sensed = (inputs["gravity"], inputs["joint_position"], inputs["joint_velocity"])
-    target, memory = walk(memory, commands, *sensed)
-    return {
-        "commands": commands,
-        "joint_target": target,
-        "next_walk_history": memory.history,
-        "next_walk_action": memory.action,
-        "next_walk_previous_action": memory.previous_action,
-        "next_walk_gait": memory.gait[..., None],
-    }
+def _skill_memory(env: Any, memory: Any) -> dict[str, Any]:
+    """Returns the arrays of a skill's recurrent state by name."""
+    leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
+    prefix = env.controller.skill.name
+    return {f"{prefix}_{jax.tree_util.keystr(path, simple=True, separator='_')}": leaf for path, leaf in leaves}
+
+
+def _skill(env: Any, action: jax.Array, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    controller = env.controller
+    skill, default = controller.skill, controller.default_commands
+    commands = jax.vmap(lambda a: skill.commands_from_action(a, env.params.commands, default))(action)
+    blank = skill.init_memory()
+    # A number per robot has an axis of length 1 in the graph.
+    leaves = [inputs[name] if x.shape else inputs[name][..., 0] for name, x in _skill_memory(env, blank).items()]
+    memory = jax.tree.unflatten(jax.tree.structure(blank), leaves)
+    act = functools.partial(skill.targets, controller.skill_params)
+    sensed = Proprioception(inputs["gravity"], inputs["joint_position"], inputs["joint_velocity"])
+    target, memory = jax.vmap(jax.vmap(act))(memory, commands, sensed)
+    after = {f"next_{name}": x if x.ndim > 2 else x[..., None] for name, x in _skill_memory(env, memory).items()}
+    return {"commands": commands, "joint_target": target, **after}
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:

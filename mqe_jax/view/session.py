@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.control import COMMAND_RANGES, commands_from_action
+from mqe_jax.skills.walk_policy import WalkPolicy
 from mqe_jax.train.evaluate import Act
-from mqe_jax.walk_policy import command_index
 
 DRIVEN = ("vx", "vy", "yaw_rate")
 """Teleoperation commands: m/s, m/s, rad/s."""
@@ -44,7 +43,7 @@ class Drive:
     """Clock, s."""
 
     def __post_init__(self) -> None:
-        self.limit = np.array([COMMAND_RANGES[name][1] for name in DRIVEN])
+        self.limit = WalkPolicy.ranges(DRIVEN)[1]
         self._held: dict[tuple[float, ...], float] = {}
 
     def change(self, step: tuple[float, float, float]) -> None:
@@ -95,7 +94,7 @@ class Session:
         self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(env.params.commands)
         if self.drivable:
             self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
-            self._gain = np.array([COMMAND_RANGES[name][0] for name in DRIVEN])
+            self._gain = env.controller.skill.ranges(DRIVEN)[0]
         self.steps = 0
         self.episodes = np.zeros(self.num_envs, int)
         self.reset()
@@ -140,11 +139,11 @@ class Session:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.
             own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, env.action_size)))
             action = jnp.where(mask[..., None], own, action)
-            index = np.array([command_index(name) for name in DRIVEN])
+            skill, default = env.controller.skill, env.controller.default_commands
 
             def applied(action: jax.Array) -> jax.Array:
                 action = env.unmirror_action(jnp.clip(action, -1.0, 1.0))
-                return commands_from_action(action, env.params.commands, env.controller.default_commands)[:, index]
+                return skill.commands_from_action(action, env.params.commands, default)[:, skill.index(DRIVEN)]
 
             commands = jax.vmap(applied)(action)
         state = self._vector_env.step(state, action)

@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 
 from mqe_jax.errors import InputError
-from mqe_jax.walk_policy import Params, nested_params
+from mqe_jax.skills.walk_policy import Params, nested_params
 
 
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:

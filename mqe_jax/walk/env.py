@@ -16,15 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import engines, robots, walk_policy
+from mqe_jax import engines, robots
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.skills import joint_targets, walk_policy
+from mqe_jax.skills.walk_policy import WalkMemory
 from mqe_jax.terrain import Plane, Track
 from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
 from mqe_jax.walk.task import EpisodeSpec, RandomizedBody, WalkTask, sample_body, sample_spec
-from mqe_jax.walk_policy import WalkMemory
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -98,7 +99,7 @@ class WalkEnv:
             contacts_per_env=16,
             max_constraints_per_env=80,
         )
-        walk_policy.check_period(scene.timestep, self.physics.num_substeps)
+        walk_policy.WalkPolicy.check_period(scene.timestep, self.physics.num_substeps)
         self.index = self.compiled.index
         self._mass = np.asarray(self.compiled.model.body_mass)
 
@@ -166,9 +167,9 @@ class WalkEnv:
         task, index = self.task, self.index
         key, direction_key, time_key, size_key, spec_key, noise_key = jax.random.split(state.key, 6)
         action = jnp.clip(action, -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
-        target = walk_policy.joint_targets(self.robot, action)
-        previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
-        earlier_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
+        target = joint_targets(self.robot, action)
+        previous_target = joint_targets(self.robot, state.memory.action)
+        earlier_target = joint_targets(self.robot, state.memory.previous_action)
 
         # Slope and force reach the spec's values within about half a second.
         slope = state.slope + jnp.clip(state.spec.slope - state.slope, -0.02, 0.02)

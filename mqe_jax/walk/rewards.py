@@ -12,10 +12,11 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import robots
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
+from mqe_jax.skills import walk_policy
 
 
 @dataclasses.dataclass(frozen=True)

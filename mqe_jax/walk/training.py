@@ -17,16 +17,17 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import interrupts, walk_policy
+from mqe_jax import interrupts
 from mqe_jax.errors import InputError
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.skills import walk_policy
+from mqe_jax.skills.walk_policy import HISTORY, OBSERVATION_SIZE
 from mqe_jax.train import checkpoint, nn
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.logs import CsvLog
 from mqe_jax.train.loss import clipped_surrogate, entropy, kl_divergence, log_prob
 from mqe_jax.train.optim import AdamState, adam
 from mqe_jax.walk.symmetry import symmetry_loss
-from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 
 class WalkEnvironment(Protocol):
