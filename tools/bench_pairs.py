@@ -44,7 +44,12 @@ def work(case: str, steps: int, repeats: int) -> None:
         return (vector.step(state, action), key), None
 
     whole = jax.jit(lambda carry: jax.lax.scan(step, carry, None, steps)[0])
-    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
+
+    def advance(data: Any) -> Any:
+        result = env.physics.step(data, data.ctrl)
+        return result[0] if isinstance(result, tuple) else result  # older checkouts return the data alone
+
+    bare_step = jax.vmap(advance)
     bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
 
     def rate(run: Any, start: Any) -> float:
