@@ -28,7 +28,7 @@ class WalkRewards:
 
     track_velocity: float = 0.6
     track_mean_velocity: float = 0.7
-    track_yaw: float = 0.3
+    track_yaw: float = 0.5
     track_mean_yaw: float = 0.4
     swing_force: float = -4.0
     stance_speed: float = -4.0
@@ -71,6 +71,11 @@ def desired_contact(phases: jax.Array, width: float = 0.07) -> jax.Array:
     """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off and touch-down."""
     cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=width)  # noqa: E731
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
+
+
+def _closeness(error: jax.Array, half: float) -> jax.Array:
+    """Returns 1 at no error and 1/2 at an error (D,) of length `half`: steep near 0, with a gradient far from it."""
+    return 1.0 / (1.0 + jnp.sum(jnp.square(error / half)))
 
 
 def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
@@ -117,9 +122,9 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {
         "track_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.error[:2])) / 0.25),
-        "track_mean_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.mean_error[:2])) / 0.02),
-        "track_yaw": jnp.exp(-jnp.square(inputs.error[2]) / 0.1),
-        "track_mean_yaw": jnp.exp(-jnp.square(inputs.mean_error[2]) / 0.04),
+        "track_mean_velocity": _closeness(inputs.mean_error[:2], 0.055),
+        "track_yaw": _closeness(inputs.error[2:], 0.14),
+        "track_mean_yaw": _closeness(inputs.mean_error[2:], 0.055),
         "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
         "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
         "body_height": jnp.square(height - robot.stand_height - commands[3]),

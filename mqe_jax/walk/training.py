@@ -29,7 +29,7 @@ WALK = TrainConfig(
     rollout_steps=24,
     stagger_episodes=True,
     seed=1,
-    ppo=PPO(epochs=5, minibatches=8, huber_delta=None, value_coef=2.0),
+    ppo=PPO(epochs=5, minibatches=4, huber_delta=None, value_coef=2.0),
     optimizer=OptimizerSettings(
         learning_rate=1e-3, schedule="linear", anneal=0.25, target_kl=0.01, eps=1e-8, max_grad_norm=1.0
     ),
