@@ -21,19 +21,20 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import math
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
+from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.skills import Command, Skill, register
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
@@ -47,68 +48,31 @@ JOINT_VELOCITY_SCALE = 0.05
 Params = dict[str, dict[str, dict[str, jax.Array]]]
 
 
-class Command(NamedTuple):
-    """One of the walk policy's commands: name, scale in the observation, default value (None: the robot's), unit."""
-
-    name: str
-    scale: float
-    default: float | None
-    unit: str
-
-
 COMMANDS = (
-    Command("vx", 2.0, 0.0, "m/s forward"),
-    Command("vy", 2.0, 0.0, "m/s to the left"),
-    Command("yaw_rate", 0.25, 0.0, "rad/s"),
-    Command("body_height", 2.0, 0.0, "m above the robot's standing height"),
-    Command("gait_frequency", 1.0, 3.0, "Hz"),
-    Command("phase", 1.0, 0.5, "of FL and RR"),
-    Command("offset", 1.0, 0.0, "of FL and FR"),
-    Command("bound", 1.0, 0.0, "of FL and RL"),
-    Command("duration", 1.0, 0.5, "fraction of the cycle in contact"),
-    Command("footswing_height", 0.15, 0.08, "m"),
-    Command("pitch", 0.3, 0.0, "rad"),
-    Command("roll", 0.3, 0.0, "rad"),
-    Command("stance_width", 1.0, None, "m"),
-    Command("stance_length", 1.0, None, "m"),
-    Command("auxiliary", 1.0, 0.0, "unused"),
+    Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0),
+    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0),
+    Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, scale=0.25, mirror=-1.0),
+    Command("body_height", "m above the robot's standing height", gain=0.12, limit=0.12, scale=2.0),
+    Command("gait_frequency", "Hz", 3.0, gain=1.0, limit=1.0),
+    Command("phase", "of FL and RR", 0.5),
+    Command("offset", "of FL and FR"),
+    Command("bound", "of FL and RL"),
+    Command("duration", "fraction of the cycle in contact", 0.5),
+    Command("footswing_height", "m", 0.08, gain=0.08, limit=0.08, scale=0.15),
+    Command("pitch", "rad", gain=0.25, limit=0.25, scale=0.3),
+    Command("roll", "rad", gain=0.1, limit=0.1, scale=0.3, mirror=-1.0),
+    Command("stance_width", "m", lambda robot: robot.walk.stance_width, gain=0.1, limit=0.1),
+    Command("stance_length", "m", lambda robot: robot.walk.stance_length, gain=0.06, limit=0.06),
+    Command("auxiliary", "unused"),
 )
-COMMAND_NAMES = tuple(command.name for command in COMMANDS)
 COMMAND_SCALE = np.array([command.scale for command in COMMANDS], np.float32)
 
-# (phase, offset, bound) of the named gaits.
-GAITS = {"trot": (0.5, 0.0, 0.0), "pronk": (0.0, 0.0, 0.0), "bound": (0.0, 0.5, 0.0), "pace": (0.0, 0.0, 0.5)}
-
-
-def check_period(timestep: float, num_substeps: int) -> None:
-    """Checks that `num_substeps` physics steps of `timestep` (s) are one policy step; raises an InputError."""
-    period = timestep * num_substeps
-    if not math.isclose(period, STEP):
-        raise InputError(
-            f"Scene.timestep: {timestep} s x {num_substeps} substeps is {period:g} s; "
-            f"the walk policy's period is {STEP} s"
-        )
-
-
-def command_index(name: str) -> int:
-    """Returns the position of a command in the 15-vector."""
-    if name not in COMMAND_NAMES:
-        raise InputError(
-            f"walk command: unknown name {name!r}{nearest(name, COMMAND_NAMES)}; allowed: {', '.join(COMMAND_NAMES)}"
-        )
-    return COMMAND_NAMES.index(name)
-
-
-def default_commands(robot: Robot, gait: str = "trot", **values: float) -> np.ndarray:
-    """Returns the default commands of a robot (15,), with a gait and single values replaced."""
-    if gait not in GAITS:
-        raise InputError(f"gait: unknown name {gait!r}{nearest(gait, GAITS)}; allowed: {', '.join(GAITS)}")
-    own = {"stance_width": robot.walk.stance_width, "stance_length": robot.walk.stance_length}
-    commands = np.array([own.get(name, default) for name, _, default, _ in COMMANDS], np.float32)
-    commands[5:8] = GAITS[gait]
-    for name, value in values.items():
-        commands[command_index(name)] = value
-    return commands
+GAITS = {
+    "trot": {"phase": 0.5, "offset": 0.0, "bound": 0.0},
+    "pronk": {"phase": 0.0, "offset": 0.0, "bound": 0.0},
+    "bound": {"phase": 0.0, "offset": 0.5, "bound": 0.0},
+    "pace": {"phase": 0.0, "offset": 0.0, "bound": 0.5},
+}
 
 
 @jax.tree_util.register_dataclass
@@ -126,12 +90,6 @@ class WalkMemory:
     """Phase of the gait cycle () in [0, 1)."""
 
 
-def initial_memory() -> WalkMemory:
-    """Returns the recurrent state of one robot after a reset."""
-    zeros = jnp.zeros(NUM_JOINTS)
-    return WalkMemory(jnp.zeros((HISTORY, OBSERVATION_SIZE)), zeros, zeros, jnp.zeros(()))
-
-
 def foot_phases(gait: jax.Array, commands: jax.Array) -> jax.Array:
     """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above."""
     phase, offset, bound, duration = commands[5], commands[6], commands[7], commands[8]
@@ -145,31 +103,15 @@ def advance_gait(gait: jax.Array, commands: jax.Array) -> jax.Array:
     return jnp.mod(gait + STEP * commands[4], 1.0)
 
 
-def observe(
-    robot: Robot,
-    memory: WalkMemory,
-    commands: jax.Array,
-    gravity_b: jax.Array,
-    joint_position: jax.Array,
-    joint_velocity: jax.Array,
-) -> jax.Array:
-    """Builds one observation (70,).
-
-    Args:
-        robot: robot type.
-        memory: recurrent state of its walk policy.
-        commands: unscaled (15,).
-        gravity_b: unit gravity vector in the trunk frame (3,).
-        joint_position: (12,), rad.
-        joint_velocity: (12,), rad/s.
-    """
+def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
+    """Builds one observation (70,), of unscaled commands (15,)."""
     clock = jnp.sin(2 * jnp.pi * foot_phases(memory.gait, commands))
     return jnp.concatenate(
         [
-            gravity_b,
+            sensed.gravity_b,
             commands * COMMAND_SCALE,
-            joint_position - robot.default_joints,
-            joint_velocity * JOINT_VELOCITY_SCALE,
+            sensed.joint_position - robot.default_joints,
+            sensed.joint_velocity * JOINT_VELOCITY_SCALE,
             memory.action,
             memory.previous_action,
             clock,
@@ -196,27 +138,36 @@ def infer_action(params: Params, history: jax.Array, latent: jax.Array) -> jax.A
     return _mlp(params["body"], jnp.concatenate([history, latent], axis=-1))
 
 
-def walk(
-    robot: Robot,
-    params: Params,
-    memory: WalkMemory,
-    commands: jax.Array,
-    gravity_b: jax.Array,
-    joint_position: jax.Array,
-    joint_velocity: jax.Array,
-) -> tuple[jax.Array, WalkMemory]:
-    """Computes one robot's joint targets (12,), rad, and the next recurrent state; arguments as in `observe`."""
-    observation = observe(robot, memory, commands, gravity_b, joint_position, joint_velocity)
-    history = jnp.concatenate([memory.history[1:], observation[None]])
-    flat = history.reshape(-1)
-    action = jnp.clip(infer_action(params, flat, infer_latent(params, flat)), -ACTION_CLIP, ACTION_CLIP)
-    gait = advance_gait(memory.gait, commands)
-    return joint_targets(robot, action), WalkMemory(history, action, memory.action, gait)
+@register
+class WalkPolicy(Skill):
+    """The walk policy as a skill."""
 
+    name = "walk"
+    commands = COMMANDS
+    gaits = GAITS
+    period = STEP
 
-def joint_targets(robot: Robot, action: jax.Array, scale: float = 1.0) -> jax.Array:
-    """Computes joint targets (..., 12), rad, from actions (..., 12): default + `scale` x the robot's scale x action."""
-    return jnp.asarray(robot.default_joints) + scale * robot.action_scale * action
+    def init_memory(self) -> WalkMemory:
+        zeros = jnp.zeros(NUM_JOINTS)
+        return WalkMemory(jnp.zeros((HISTORY, OBSERVATION_SIZE)), zeros, zeros, jnp.zeros(()))
+
+    def targets(
+        self, params: Params, memory: WalkMemory, command: jax.Array, proprioception: Proprioception
+    ) -> tuple[jax.Array, WalkMemory]:
+        observation = observe(self.robot, memory, command, proprioception)
+        history = jnp.concatenate([memory.history[1:], observation[None]])
+        flat = history.reshape(-1)
+        action = jnp.clip(infer_action(params, flat, infer_latent(params, flat)), -ACTION_CLIP, ACTION_CLIP)
+        gait = advance_gait(memory.gait, command)
+        return self.robot.joint_targets(action), WalkMemory(history, action, memory.action, gait)
+
+    def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
+        return load_params(self.robot, path)
+
+    def clock(self, memory: WalkMemory) -> jax.Array:
+        """Returns sine and cosine of the phase of the gait cycle (2,)."""
+        angle = 2 * jnp.pi * memory.gait
+        return jnp.stack([jnp.sin(angle), jnp.cos(angle)])
 
 
 def init_params(key: jax.Array) -> Params:
@@ -278,7 +229,7 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     if not file.is_file() and path is None:
         raise InputError(
             f"walk policy: no weights are shipped for {robot.name} (assets/{file.name}); {train} and give them as "
-            "walk_policy=FILE, or use control 'position' or 'torque'"
+            "skill_weights=FILE, or use control 'position' or 'torque'"
         )
     if not file.is_file():
         raise InputError(f"walk policy: no file {file}; {train} or convert official weights with 'mqe walk convert'")

@@ -50,8 +50,7 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
     def substeps(state: Any, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Shares of the speed limits and angles past the joint limits in the physics steps of one step (4, N, 12)."""
         now = jax.vmap(env.read)(state.data)
-        sensed = now.projected_gravity, now.joint_position, now.joint_velocity
-        target, _ = jax.vmap(env.controller.targets)(state.control, action, *sensed)
+        target, _ = jax.vmap(env.controller.targets)(state.control, action, now.proprioception)
 
         def one(data: Any, _: None) -> Any:
             old = data.qpos[:, joints]

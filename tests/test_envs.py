@@ -315,7 +315,7 @@ def test_randomisation_reaches_the_physics() -> None:
         (lambda: make("go1gate", num_envs=0), r"num_envs: 0 must be at least 1"),
         (lambda: make("go1plane", gait="gallop"), r"gait: unknown name 'gallop'"),
         (lambda: make("go1plane", commands=("vx", "vz")), r"commands: unknown command 'vz'"),
-        (lambda: make("go1plane", walk_policy="/nowhere"), r"walk policy: no file /nowhere"),
+        (lambda: make("go1plane", skill_weights="/nowhere"), r"walk policy: no file /nowhere"),
     ],
 )
 def test_bad_parameters_are_named(call: Any, message: str) -> None:

@@ -156,7 +156,7 @@ def test_a_registered_network_is_exported_with_all_its_recurrent_states(monkeypa
 
     env = stub_env(2)
     policy = new_policy(env, "torque", name="averaging")
-    assert sorted(input_shapes(policy, env)) == ["memory_0", "memory_1", "obs"]
+    assert sorted(input_shapes(policy, env)) == ["memory_fast", "memory_slow", "obs"]
     assert error_on_random_inputs(policy, env) < 2e-5
 
 

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.control import COMMAND_RANGES
 from mqe_jax.planners.seesaw import plan_seesaw
 from mqe_jax.planners.tug import plan_tug
+from mqe_jax.walk_policy import COMMANDS
 
-SPEED = COMMAND_RANGES["vx"][0]  # m/s per unit of forward action
+SPEED = COMMANDS[0].gain  # m/s per unit of forward action
 
 
 def push(speed: float, x: float = 1.6) -> np.ndarray:

@@ -14,15 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import cli, control, walk_policy
+from mqe_jax import actuators, cli, skills, walk_policy
+from mqe_jax.control import Controller
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.index import Proprioception
 from mqe_jax.scene import Scene
 from mqe_jax.walk import convert
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.task import WalkTask
-from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES, default_commands
+from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES
+
+DOWN = jnp.array([0.0, 0.0, -1.0])
+SKILL = skills.make("walk", GO1)
 
 
 def elu(x: np.ndarray) -> np.ndarray:
@@ -184,10 +189,10 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     memory = walk_policy.WalkMemory(jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(()))
-    commands = default_commands(GO1, "trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
+    commands = SKILL.default_commands("trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
     joints = GO1.default_joints + np.arange(12)
     obs = walk_policy.observe(
-        GO1, memory, jnp.asarray(commands), jnp.array([0.0, 0.0, -1.0]), jnp.asarray(joints), jnp.full(12, 2.0)
+        GO1, memory, jnp.asarray(commands), Proprioception(DOWN, jnp.asarray(joints), jnp.full(12, 2.0))
     )
     scaled = [2.0, -1.0, 0.1, 0, 3.0, 0.5, 0, 0, 0.5, 0.012, 0, 0, 0.25, 0.428, 0]
     np.testing.assert_allclose(obs[:18], [0, 0, -1, *scaled], atol=1e-6)
@@ -202,7 +207,7 @@ def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     [("trot", [(0, 3), (1, 2)]), ("pace", [(0, 2), (1, 3)]), ("bound", [(0, 1), (2, 3)]), ("pronk", [(0, 1, 2, 3)])],
 )
 def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int, ...]]) -> None:
-    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(default_commands(GO1, gait))))
+    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(SKILL.default_commands(gait))))
     for group in together:
         assert np.ptp(phases[list(group)]) < 1e-6
     if len(together) == 2:
@@ -210,7 +215,7 @@ def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int,
 
 
 def test_phases_are_warped_by_the_duration() -> None:
-    commands = jnp.asarray(default_commands(GO1, "pronk", duration=0.8))
+    commands = jnp.asarray(SKILL.default_commands("pronk", duration=0.8))
     assert float(walk_policy.foot_phases(jnp.float32(0.4), commands)[0]) == pytest.approx(0.25)
     assert float(walk_policy.foot_phases(jnp.float32(0.9), commands)[0]) == pytest.approx(0.75)
     contact = desired_contact(jnp.array([0.25, 0.75]))
@@ -219,23 +224,25 @@ def test_phases_are_warped_by_the_duration() -> None:
 
 def test_memory_shifts_and_advances() -> None:
     params = walk_policy.load_params(GO1)
-    memory = walk_policy.initial_memory()
-    still = jnp.asarray(default_commands(GO1)), jnp.array([0.0, 0, -1]), jnp.asarray(GO1.default_joints), jnp.zeros(12)
-    target, memory = walk_policy.walk(GO1, params, memory, *still)
+    memory = SKILL.init_memory()
+    still = Proprioception(DOWN, jnp.asarray(GO1.default_joints), jnp.zeros(12))
+    command = jnp.asarray(SKILL.default_commands())
+    target, memory = SKILL.targets(params, memory, command, still)
     assert target.shape == (12,) and float(memory.gait) == pytest.approx(0.06)
     assert not np.asarray(memory.history[:-1]).any() and np.asarray(memory.history[-1]).any()
     first = np.asarray(memory.action)
     np.testing.assert_allclose(target, GO1.default_joints + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5)
-    _, memory = walk_policy.walk(GO1, params, memory, *still)
+    _, memory = SKILL.targets(params, memory, command, still)
     np.testing.assert_array_equal(memory.previous_action, first)
 
 
 def test_command_actions_are_the_papers() -> None:
     action = jnp.array([[0.25, -1.0, 0.5], [1.0, 0.0, 0.0]])
-    commands = control.commands_from_action(action, ("vx", "vy", "yaw_rate"), default_commands(GO1))
+    default = SKILL.default_commands()
+    commands = Controller("command", GO1, 2, 2, SKILL, (), ("vx", "vy", "yaw_rate"), default).skill_commands(action)
     np.testing.assert_allclose(commands[0, :3], [0.5, -0.5, 0.25])
     assert float(commands[1, 0]) == 1.0
-    np.testing.assert_allclose(commands[:, 3:], np.tile(default_commands(GO1)[3:], (2, 1)))
+    np.testing.assert_allclose(commands[:, 3:], np.tile(default[3:], (2, 1)))
 
 
 def test_slope_turns_gravity() -> None:
@@ -277,7 +284,7 @@ def test_actuator_network_computes_softsign_layers() -> None:
         x = x @ flat[f"{layer}.weight"].T + flat[f"{layer}.bias"]
         x = x / (1 + np.abs(x))
     expected = (x @ flat["4.weight"].T + flat["4.bias"])[:, 0]
-    found = jax.jit(control.actuator_torque)(params, jnp.asarray(error), jnp.asarray(velocity))
+    found = jax.jit(actuators.actuator_torque)(params, jnp.asarray(error), jnp.asarray(velocity))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
 

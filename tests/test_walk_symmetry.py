@@ -5,18 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import robots, walk_policy
+from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import JOINT_NAMES
 from mqe_jax.walk.symmetry import mirror_action, mirror_history, symmetry_loss
 from mqe_jax.walk_policy import WalkMemory
 
 GO1 = robots.get("go1")
-Y_AND_ROTATIONS = [walk_policy.command_index(name) for name in ("vy", "yaw_rate", "roll")]
+SKILL = walk_policy.WalkPolicy(GO1)
+Y_AND_ROTATIONS = SKILL.index(("vy", "yaw_rate", "roll"))
 
 
 def observation(joints: np.ndarray, gravity: np.ndarray, commands: np.ndarray, gait: float) -> np.ndarray:
     memory = WalkMemory(jnp.zeros((0, 70)), jnp.asarray(joints), jnp.asarray(0.5 * joints), jnp.float32(gait))
-    arrays = [jnp.asarray(x) for x in (commands, gravity, joints, 2.0 * joints)]
-    return np.asarray(walk_policy.observe(GO1, memory, *arrays))
+    sensed = Proprioception(*(jnp.asarray(x) for x in (gravity, joints, 2.0 * joints)))
+    return np.asarray(walk_policy.observe(GO1, memory, jnp.asarray(commands), sensed))
 
 
 def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
@@ -27,7 +29,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
                          "RR" if n[:2] == "RL" else "RL") + n[2:])] for n in JOINT_NAMES])  # fmt: skip
     mirrored[0::3] *= -1.0
     for gait in ("trot", "pace"):
-        commands = np.array(walk_policy.default_commands(GO1, gait))
+        commands = np.array(SKILL.default_commands(gait))
         commands[Y_AND_ROTATIONS] = 0.2, -0.4, 0.1
         other = commands.copy()
         other[Y_AND_ROTATIONS] *= -1.0

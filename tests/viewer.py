@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from fake_env import FakeEnv, FakeVectorEnv
 
+from mqe_jax import skills
+from mqe_jax.control import Controller
 from mqe_jax.policies import load_policy
+from mqe_jax.robots.go1 import GO1
 from mqe_jax.view.session import Session
 
 CAMERA = {
@@ -36,7 +39,8 @@ class Driven(FakeEnv):
 
     control = "command"
     params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
-    controller = SimpleNamespace(default_commands=np.zeros(15, np.float32))
+    skill = skills.make("walk", GO1)
+    controller = Controller("command", GO1, 2, 2, skill, (), params.commands, np.zeros(15, np.float32))
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         return action * jnp.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]])

@@ -39,6 +39,7 @@ REFERENCE = {
     "terrain": ("mqe_jax.terrain", ()),
     "objects": ("mqe_jax.objects", ()),
     "robots": ("mqe_jax.robots.robot", ("Robot",)),
+    "skills": ("mqe_jax.skills", ()),
     "walk_policy": ("mqe_jax.walk_policy", ()),
     "planners": ("mqe_jax.planners", ()),
     "training_settings": ("mqe_jax.train.config", ()),

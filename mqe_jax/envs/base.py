@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 from jax.core import Tracer
 
-from mqe_jax import engines, robots, walk_policy
-from mqe_jax.control import Controller, check_mode, load_actuator_network
+from mqe_jax import engines, robots, skills
+from mqe_jax.actuators import Actuators, NetworkActuators, load_actuator_network
+from mqe_jax.control import Controller, check_mode
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.privileged import PrivilegedObservation
@@ -90,30 +91,34 @@ class QuadrupedEnv(Task):
         )
         self.impl = self.physics.impl
         self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
-        walks = control == "command" or self._scene.num_robots > self.num_agents
-        if walks:
-            walk_policy.check_period(scene.timestep, self.physics.num_substeps)
+        self.actuators = Actuators(self.physics, self.index)
+        if network:
+            weights = load_actuator_network(network)
+            self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
+        skill = skills.make(self.params.skill, self.robot)
+        uses_skill = control == "command" or scene.num_robots > self.num_agents
+        if uses_skill:
+            skill.check_period(scene.timestep, self.physics.num_substeps)
+        self.controller = Controller(
+            mode=control,
+            robot=self.robot,
+            num_robots=scene.num_robots,
+            num_agents=self.num_agents,
+            skill=skill,
+            skill_params=skill.load_params(self.params.skill_weights) if uses_skill else None,
+            commands=self.params.commands,
+            default_commands=skill.default_commands(self.params.gait),
+            lag=self.params.randomization.action_lag,
+            position_scale=self.params.position_scale,
+        )
         self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
         self.privileged = PrivilegedObservation(
             self.robot,
             self.compiled.model,
             self.index,
             num_anchors=len(self.compiled.layout.anchors),
-            gait=walks,
+            clock_size=jax.eval_shape(lambda: self.controller.clock(self.controller.reset())).shape[1],
             contact_forces=self.params.privileged_contact_forces,
-        )
-        self.controller = Controller(
-            mode=control,
-            robot=self.robot,
-            physics=self.physics,
-            index=self.index,
-            num_agents=self.num_agents,
-            walk_params=walk_policy.load_params(self.robot, self.params.walk_policy) if walks else None,
-            actuator_params=load_actuator_network(network) if network else None,
-            commands=self.params.commands,
-            default_commands=walk_policy.default_commands(self.robot, self.params.gait),
-            lag=self.params.randomization.action_lag,
-            position_scale=self.params.position_scale,
         )
 
     # -- public API ---------------------------------------------------------------------------------------------
@@ -182,7 +187,7 @@ class QuadrupedEnv(Task):
         anchors = self._sample_anchors(anchor_key)
         qpos, qvel = self._sample_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
-        ctrl = jnp.zeros(self.compiled.model.nu).at[self.index.actuator].set(self.controller.neutral)
+        ctrl = self.actuators.control(jnp.asarray(self.controller.neutral))
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
         robot_state = self.read(data)
         no = jnp.zeros((), bool)
@@ -200,6 +205,7 @@ class QuadrupedEnv(Task):
             step=jnp.zeros((), jnp.int32),
             anchors=anchors,
             control=self.controller.reset(),
+            actuators=self.actuators.init_memory(),
             randomized=self.randomizer.sample(physics_key),
             task=self.reset_task(task_key, robot_state, data, anchors),
             assistance=assistance,
@@ -233,22 +239,16 @@ class QuadrupedEnv(Task):
         target, control = self.controller.targets(
             state.control,
             action,
-            before.projected_gravity,
-            before.joint_position,
-            before.joint_velocity,
+            before.proprioception,
             self.npc_commands(state, before),
+            state.randomized.action_lag,
         )
         data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before, npc_key)
-        data, control, overflow = self.controller.apply(
-            control,
-            data,
-            target,
-            state.randomized.action_lag,
-            self.randomizer.fields(state.randomized),
-            self.external_forces(state),
-        )
+        fields, forces = self.randomizer.fields(state.randomized), self.external_forces(state)
+        data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
         robot_state = self.read(data)
-        state = dataclasses.replace(state, data=data, control=control, step=state.step + 1, key=key)
+        moved = {"data": data, "control": control, "actuators": actuators}
+        state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
 
         diverged = bad_action | self._diverged(data)
         collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
@@ -338,9 +338,8 @@ class QuadrupedEnv(Task):
         noise = self.params.randomization.observation_noise
         if noise:
             obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
-        privileged = self.privileged.observe(
-            robot_state, state.data, state.anchors, state.randomized, state.control.walk
-        )
+        clock = self.controller.clock(state.control)
+        privileged = self.privileged.observe(robot_state, state.data, state.anchors, state.randomized, clock)
         obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
         return dataclasses.replace(
             state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged

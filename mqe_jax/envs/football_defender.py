@@ -16,7 +16,6 @@ from mqe_jax.envs.state import State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
 from mqe_jax.settings import Fraction, record
-from mqe_jax.walk_policy import command_index
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -82,13 +81,13 @@ class Go1FootballDefender(Football):
     colors = (0, 1, 2)
 
     def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array:
-        """Walk commands of the defender (1, 15)."""
+        """Walk commands of the defender (1, C)."""
         commands = jnp.asarray(self.controller.default_commands)
         if not self.params.defender_idle:
             move = defend(
                 robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
             )
-            commands = commands.at[np.array([command_index(name) for name in ("vx", "vy", "yaw_rate")])].set(move)
+            commands = commands.at[self.controller.skill.index(("vx", "vy", "yaw_rate"))].set(move)
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:

@@ -19,13 +19,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotState
-from mqe_jax.robots.robot import NUM_JOINTS
-
-# Sign of a command under reflection.
-_MIRRORED_COMMANDS = {"vy": -1.0, "yaw_rate": -1.0, "roll": -1.0}
-# Joints of the opposite legs (FL <-> FR, RL <-> RR), and their signs under reflection: hip abduction flips.
-_OTHER_SIDE = np.arange(NUM_JOINTS).reshape(4, 3)[[1, 0, 3, 2]].ravel()
-_OTHER_SIGN = np.tile([-1.0, 1.0, 1.0], 4).astype(np.float32)
+from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 
 
 class Match(QuadrupedEnv):
@@ -98,10 +92,9 @@ class Match(QuadrupedEnv):
         if self.symmetry == "turn":
             return action
         if self.control == "command":
-            names = self.params.commands
-            mirrored = action * np.array([_MIRRORED_COMMANDS.get(name, 1.0) for name in names], np.float32)
+            mirrored = action * self.controller.skill.column("mirror", self.params.commands)
         else:
-            mirrored = action[:, _OTHER_SIDE] * _OTHER_SIGN
+            mirrored = action[:, MIRRORED_JOINTS] * MIRRORED_SIGNS
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)
 
     # -- rewards and result -------------------------------------------------------------------------------------

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from mqe_jax import robots
-from mqe_jax.control import check_commands
+import mqe_jax.walk_policy  # noqa: F401  (registers itself)
+from mqe_jax import robots, skills
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, Range, fail, record
@@ -43,16 +43,18 @@ class TaskParams:
     """Whether a contact force on an agent's trunk above `collision_force` ends the episode."""
     collision_force: Positive = 1.0
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
-    gait: str = "trot"
-    """Gait of the walk policy: trot, pronk, bound or pace."""
+    skill: str = "walk"
+    """Skill of the agents with control `command`, and of NPC robots (`mqe_jax.skills`)."""
+    skill_weights: str | None = None
+    """Weights file of the skill; the shipped one if None."""
+    gait: str | None = None
+    """Named default commands of the skill; of the walk policy trot, pronk, bound or pace, trot if None."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
-    """Walk commands that the action sets, in order."""
+    """Commands of the skill that the action sets, in order."""
     position_scale: Positive = 1.0
     """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
     joint angles, hips within 0.125 rad.
     """
-    walk_policy: str | None = None
-    """Weights file of the walk policy; the shipped one if None."""
     actuator_network: str | None = None
     """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: Positive = 1.0
@@ -83,8 +85,7 @@ class TaskParams:
     """
 
     def __post_init__(self) -> None:
-        check_commands(self.commands)
-        robots.get(self.robot)
+        skills.make(self.skill, robots.get(self.robot)).check_commands(self.commands)
         if self.min_height >= self.max_height:
             fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
 

@@ -13,7 +13,6 @@ from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.randomization import RandomizedParams
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
-from mqe_jax.walk_policy import WalkMemory
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -38,7 +37,7 @@ class PrivilegedObservation:
         model: compiled model.
         index: index tables of the robots.
         num_anchors: G.
-        gait: whether to include the gait phases of the walk policy.
+        clock_size: length of the clock of a robot's skill; 0 without a skill.
         contact_forces: whether to include contact forces on trunks and feet; requires the scene's foot sensors.
     """
 
@@ -52,7 +51,7 @@ class PrivilegedObservation:
         index: RobotIndex,
         *,
         num_anchors: int,
-        gait: bool,
+        clock_size: int,
         contact_forces: bool,
     ) -> None:
         count = index.num_robots
@@ -76,7 +75,7 @@ class PrivilegedObservation:
                     Block("center_of_mass", 3 * count, "shift of each trunk's centre of mass, m"),
                     Block("motor_strength", count, "factor on each robot's torques"),
                     Block("action_lag", 1, "environment steps"),
-                    Block("gait_phase", 2 * count if gait else 0, "sine and cosine of each robot's gait phase"),
+                    Block("gait_phase", clock_size * count, "of each robot's skill; walk policy: sine and cosine"),
                     Block("contact_force", 5 * count if contact_forces else 0, "on each robot's trunk and feet, N"),
                 )
                 if block.width
@@ -89,9 +88,9 @@ class PrivilegedObservation:
         data: mjx.Data,
         anchors: jax.Array,
         randomized: RandomizedParams,
-        walk: WalkMemory | None,
+        clock: jax.Array,
     ) -> jax.Array:
-        """Returns the observation of one environment (P,); `walk` is the walk policies' recurrent state (R, ...)."""
+        """Returns the observation of one environment (P,); `clock` is that of the skills (R, clock_size)."""
         robots = jnp.concatenate(
             [
                 robot_state.position_w,
@@ -113,10 +112,8 @@ class PrivilegedObservation:
             randomized.center_of_mass,
             randomized.motor_strength,
             randomized.action_lag.astype(jnp.float32),
+            clock,
         ]
-        if walk is not None:
-            angle = 2 * jnp.pi * walk.gait
-            parts.append(jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1))
         if self._foot_force is not None:
             feet = jnp.linalg.norm(data.sensordata[self._foot_force], axis=-1)
             parts.append(jnp.concatenate([robot_state.trunk_force[:, None], feet], axis=-1))

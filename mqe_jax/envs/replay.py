@@ -22,7 +22,7 @@ from mqe_jax.files import write_atomically
 from mqe_jax.settings import to_mapping
 
 # Fields on which a step depends; the others are recomputed by it.
-_FIELDS = ("step", "anchors", "control", "randomized", "task", "assistance", "frozen_steps", "key")
+_FIELDS = ("step", "anchors", "control", "actuators", "randomized", "task", "assistance", "frozen_steps", "key")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -45,6 +45,8 @@ class State:
     """Positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame."""
     control: ControlState
     """Controller state."""
+    actuators: Any
+    """Recurrent state of the actuators."""
     randomized: RandomizedParams
     """Randomised physics parameters."""
     task: Any

@@ -84,7 +84,7 @@ class Task:
         return None
 
     def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array | None:
-        """Returns the walk commands (R - A, 15) of the NPC robots, or None if there are none."""
+        """Returns the skill's commands (R - A, C) for the NPC robots, or None if there are none."""
         return None
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:

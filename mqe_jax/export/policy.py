@@ -1,17 +1,18 @@
-"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, walk policy.
+"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, skill.
 
 Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
 the input `X` of the next step. Of a match, the graph is that of team 0.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
-| `command` | `commands` (N, A, 15), `joint_target` (N, A, 12), rad |
+| `command` | `commands` (N, A, C), `joint_target` (N, A, 12), rad |
 | `position` | `joint_target` (N, A, 12), rad |
 | `torque` | `torque` (N, A, 12), N m |
 
 Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk frame, `joint_position`
-and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: `walk_history` (N, A, 30, 70), `walk_action` and
-`walk_previous_action` (N, A, 12), `walk_gait` (N, A, 1), and those of the network: `memory` if it is one array.
+and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of the skill, of the walk policy `walk_history`
+(N, A, 30, 70), `walk_action`, `walk_previous_action` (N, A, 12) and `walk_gait` (N, A), and those of the network:
+`memory` if it is one array, else `memory_NAME`.
 """
 
 from __future__ import annotations
@@ -26,13 +27,12 @@ import jax
 import onnx
 
 import mqe_jax
-from mqe_jax import walk_policy
-from mqe_jax.control import commands_from_action
 from mqe_jax.errors import InputError
 from mqe_jax.export.graph import OPSET
 from mqe_jax.export.translate import translate
 from mqe_jax.files import write_atomically
 from mqe_jax.policies import check_policy
+from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -53,48 +53,37 @@ def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
         robots |= {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
-        robots |= {"walk_history": (walk_policy.HISTORY, walk_policy.OBSERVATION_SIZE), "walk_gait": (1,)}
-        robots |= {"walk_action": (NUM_JOINTS,), "walk_previous_action": (NUM_JOINTS,)}
+        skill = env.controller.skill
+        robots |= {name: x.shape for name, x in _named(skill.name, skill.init_memory()).items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
-    return shapes | {name: x.shape for name, x in _network_memory(policy.initial_memory()).items()}
+    return shapes | {name: x.shape for name, x in _named("memory", policy.initial_memory()).items()}
 
 
 def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the outputs of one step by name, the function that the graph evaluates."""
-    names = _network_memory(policy.initial_memory())
-    memory = jax.tree.unflatten(jax.tree.structure(policy.initial_memory()), [inputs[name] for name in names])
-    action, memory = policy.act(inputs["obs"], memory)
-    outputs = {"action": action} | {f"next_{name}": x for name, x in _network_memory(memory).items()}
+    action, memory = policy.act(inputs["obs"], _filled("memory", policy.initial_memory(), inputs))
+    outputs = {"action": action} | _named("next_memory", memory)
     if env.control == "torque":
         return outputs | {"torque": action * env.robot.torque_limit}
     if env.control == "position":
-        return outputs | {"joint_target": walk_policy.joint_targets(env.robot, action, env.params.position_scale)}
-    return outputs | _walk(env, action, inputs)
+        return outputs | {"joint_target": env.robot.joint_targets(action, env.params.position_scale)}
+    controller, skill = env.controller, env.controller.skill
+    commands = jax.vmap(controller.skill_commands)(action)
+    sensed = Proprioception(*(inputs[name] for name in ("gravity", "joint_position", "joint_velocity")))
+    act = jax.vmap(jax.vmap(functools.partial(skill.targets, controller.skill_params)))
+    target, memory = act(_filled(skill.name, skill.init_memory(), inputs), commands, sensed)
+    return outputs | {"commands": commands, "joint_target": target} | _named(f"next_{skill.name}", memory)
 
 
-def _network_memory(memory: Any) -> dict[str, Any]:
-    """Returns the arrays of a network's recurrent state by name."""
-    leaves = jax.tree.leaves(memory)
-    return {"memory" if len(leaves) == 1 else f"memory_{i}": leaf for i, leaf in enumerate(leaves)}
+def _named(prefix: str, memory: Any) -> dict[str, Any]:
+    """Returns the arrays of a recurrent state by name."""
+    leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
+    return {"_".join([prefix, *(jax.tree_util.keystr((k,), simple=True) for k in path)]): x for path, x in leaves}
 
 
-def _walk(env: Any, action: jax.Array, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    default = env.controller.default_commands
-    commands = jax.vmap(lambda a: commands_from_action(a, env.params.commands, default))(action)
-    memory = walk_policy.WalkMemory(
-        inputs["walk_history"], inputs["walk_action"], inputs["walk_previous_action"], inputs["walk_gait"][..., 0]
-    )
-    walk = jax.vmap(jax.vmap(functools.partial(walk_policy.walk, env.robot, env.controller.walk_params)))
-    sensed = (inputs["gravity"], inputs["joint_position"], inputs["joint_velocity"])
-    target, memory = walk(memory, commands, *sensed)
-    return {
-        "commands": commands,
-        "joint_target": target,
-        "next_walk_history": memory.history,
-        "next_walk_action": memory.action,
-        "next_walk_previous_action": memory.previous_action,
-        "next_walk_gait": memory.gait[..., None],
-    }
+def _filled(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
+    """Returns a recurrent state of the structure of `memory` with the arrays of the inputs."""
+    return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in _named(prefix, memory)])
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:

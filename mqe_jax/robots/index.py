@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -107,6 +107,17 @@ def index_robots(
     )
 
 
+class Proprioception(NamedTuple):
+    """What a skill senses of one robot."""
+
+    gravity_b: jax.Array
+    """Unit gravity vector in the trunk frame (3,)."""
+    joint_position: jax.Array
+    """Joint angles (12,), rad."""
+    joint_velocity: jax.Array
+    """Joint velocities (12,), rad/s."""
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RobotState:
@@ -141,6 +152,11 @@ class RobotState:
     def projected_gravity(self) -> jax.Array:
         """Unit gravity vector in the trunk frame (R, 3)."""
         return rotate_inverse(self.quaternion, jnp.array([0.0, 0.0, -1.0]))
+
+    @property
+    def proprioception(self) -> Proprioception:
+        """What the robots' skills sense, leading axis R."""
+        return Proprioception(self.projected_gravity, self.joint_position, self.joint_velocity)
 
 
 def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotState:

@@ -12,6 +12,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError
@@ -21,6 +23,9 @@ JOINTS = ("hip", "thigh", "calf")
 NUM_LEGS = len(LEGS)
 NUM_JOINTS = NUM_LEGS * len(JOINTS)
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
+# Reflection of left and right: a joint's counterpart, and the sign of its value, which hips change.
+MIRRORED_JOINTS = np.arange(NUM_JOINTS).reshape(NUM_LEGS, -1)[[1, 0, 3, 2]].ravel()
+MIRRORED_SIGNS = np.tile(np.array([-1.0, 1.0, 1.0], np.float32), NUM_LEGS)
 LINKS = ("trunk", *JOINTS)
 # Body parts of collision shapes.
 PARTS = ("trunk", "hip", "thigh", "calf", "foot")
@@ -281,6 +286,10 @@ class Robot:
         parts = [shape.part for shape in self.collision]
         if parts.count("foot") != 1 or "trunk" not in parts:
             raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")
+
+    def joint_targets(self, action: jax.Array, scale: float = 1.0) -> jax.Array:
+        """Returns joint targets (..., 12), rad: default + `scale` x the robot's scale x action (..., 12)."""
+        return jnp.asarray(self.default_joints) + scale * self.action_scale * action
 
     def shapes(self, contacts: str = "full") -> tuple[CollisionShape, ...]:
         """Returns the collision shapes of a set, one of `CONTACTS`.

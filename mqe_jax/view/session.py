@@ -12,9 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.control import COMMAND_RANGES, commands_from_action
 from mqe_jax.train.policy import Policy
-from mqe_jax.walk_policy import command_index
 
 DRIVEN = ("vx", "vy", "yaw_rate")
 """Teleoperation commands: m/s, m/s, rad/s."""
@@ -34,6 +32,8 @@ class Frame(NamedTuple):
 class Drive:
     """Teleoperation of one robot: a command set by keys, plus the commands of held buttons."""
 
+    limit: np.ndarray
+    """Greatest command (3,), m/s and rad/s."""
     env: int = 0
     """Index of its environment."""
     robot: int | None = None
@@ -44,7 +44,6 @@ class Drive:
     """Clock, s."""
 
     def __post_init__(self) -> None:
-        self.limit = np.array([COMMAND_RANGES[name][1] for name in DRIVEN])
         self._held: dict[tuple[float, ...], float] = {}
 
     def change(self, step: tuple[float, float, float]) -> None:
@@ -87,7 +86,7 @@ class Session:
     def __init__(self, env: Any, vector_env: Any, policy: Policy, seed: int = 0, history: float = 10.0) -> None:
         """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
-        self.paused, self.speed, self.drive = False, 1.0, Drive()
+        self.paused, self.speed, self.drive = False, 1.0, Drive(np.zeros(3))
         self._vector_env, self._policy = vector_env, policy
         self._first_memory = policy.initial_memory(self.num_envs)
         self._key = jax.random.PRNGKey(seed)
@@ -96,7 +95,8 @@ class Session:
         self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(env.params.commands)
         if self.drivable:
             self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
-            self._gain = np.array([COMMAND_RANGES[name][0] for name in DRIVEN])
+            skill = env.controller.skill
+            self._gain, self.drive.limit = (skill.column(field, DRIVEN) for field in ("gain", "limit"))
         self.steps = 0
         self.episodes = np.zeros(self.num_envs, int)
         self.reset()
@@ -141,13 +141,8 @@ class Session:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.
             own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, env.action_size)))
             action = jnp.where(mask[..., None], own, action)
-            index = np.array([command_index(name) for name in DRIVEN])
-
-            def applied(action: jax.Array) -> jax.Array:
-                action = env.unmirror_action(jnp.clip(action, -1.0, 1.0))
-                return commands_from_action(action, env.params.commands, env.controller.default_commands)[:, index]
-
-            commands = jax.vmap(applied)(action)
+            applied = jax.vmap(lambda a: env.controller.skill_commands(env.unmirror_action(jnp.clip(a, -1.0, 1.0))))
+            commands = applied(action)[..., env.controller.skill.index(DRIVEN)]
         state = self._vector_env.step(state, action)
         done = state.terminated | state.truncated
 

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import engines, robots, walk_policy
+from mqe_jax.actuators import Actuators
 from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
-from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.index import Proprioception, RobotState
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
@@ -56,6 +57,7 @@ class WalkEnv:
             solver_iterations=self.task.solver_iterations,
         )
         self.compiled = compile_scene(scene)
+        self.skill = walk_policy.WalkPolicy(robot)
         self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
@@ -64,8 +66,9 @@ class WalkEnv:
             contacts_per_env=16,
             max_constraints_per_env=80,
         )
-        walk_policy.check_period(scene.timestep, self.physics.num_substeps)
+        self.skill.check_period(scene.timestep, self.physics.num_substeps)
         self.index = self.compiled.index
+        self.actuators = Actuators(self.physics, self.index)
         self._mass = np.asarray(self.compiled.model.body_mass)
         randomization = RANDOMIZATION if self.task.randomize else Randomization()
         self._randomizer = Randomizer(randomization, self.compiled.model, self.index, 1.0)
@@ -112,7 +115,7 @@ class WalkEnv:
         qpos = qpos.at[index.base_qpos[0]].set(jnp.concatenate([jnp.stack([0.0, 0.0, height]), quaternion]))
         speed = jax.random.uniform(d, (6,), minval=-0.5, maxval=0.5)
         qvel = jnp.zeros(model.nv).at[index.base_qvel[0]].set(speed)
-        ctrl = jnp.zeros(model.nu).at[index.actuator[0]].set(self.robot.default_joints)
+        ctrl = self.actuators.control(jnp.asarray(self.robot.default_joints))
         data = self.physics.init(qpos, qvel, jnp.zeros((0, 3)), ctrl)
         zero, zeros = jnp.zeros(()), jnp.zeros(NUM_JOINTS)
         memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), zeros, zeros, zero)
@@ -145,9 +148,9 @@ class WalkEnv:
         task, index = self.task, self.index
         key, direction_key, time_key, size_key, spec_key, noise_key = jax.random.split(state.key, 6)
         action = jnp.clip(action[0], -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
-        target = walk_policy.joint_targets(self.robot, action)
-        previous_target = walk_policy.joint_targets(self.robot, state.memory.action)
-        earlier_target = walk_policy.joint_targets(self.robot, state.memory.previous_action)
+        target = self.robot.joint_targets(action)
+        previous_target = self.robot.joint_targets(state.memory.action)
+        earlier_target = self.robot.joint_targets(state.memory.previous_action)
 
         # Slope and force reach the spec's values within about half a second.
         slope = state.slope + jnp.clip(state.spec.slope - state.slope, -0.02, 0.02)
@@ -162,13 +165,8 @@ class WalkEnv:
         push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
 
-        ctrl = jnp.zeros(self.compiled.model.nu).at[index.actuator[0]].set(target + state.motor_offset)
-        data, _ = self.physics.step(
-            data,
-            ctrl,
-            fields=self._randomizer.fields(state.random),
-            xfrc_applied=self._forces(data, state.random, slope, force),
-        )
+        fields, forces = self._randomizer.fields(state.random), self._forces(data, state.random, slope, force)
+        data, _, _ = self.actuators.step(data, (), target + state.motor_offset, fields, forces)
         robot_state = self.read(data)
         commands = state.spec.commands
         velocity, yaw_rate = heading_velocity(robot_state)
@@ -254,24 +252,15 @@ class WalkEnv:
         robot_state = self.read(state.data)
         quaternion = robot_state.quaternion[0]
         gravity = rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
-        joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
-        clean = walk_policy.observe(
-            self.robot, state.memory, state.spec.commands, gravity, joint_position, joint_velocity
-        )
-        obs = clean
+        sensed = Proprioception(gravity, robot_state.joint_position[0], robot_state.joint_velocity[0])
+        obs = clean = walk_policy.observe(self.robot, state.memory, state.spec.commands, sensed)
         if self.task.randomize:
-            a, b, c = jax.random.split(key, 3)
-            obs = walk_policy.observe(
-                self.robot,
-                state.memory,
-                state.spec.commands,
-                gravity + 0.02 * jax.random.normal(a, (3,)),
-                joint_position + 0.005 * jax.random.normal(b, (NUM_JOINTS,)),
-                joint_velocity + 0.5 * jax.random.normal(c, (NUM_JOINTS,)),
-            )
+            parts = zip(sensed, (0.02, 0.005, 0.5), jax.random.split(key, 3), strict=True)
+            noisy = Proprioception(*(x + size * jax.random.normal(part_key, x.shape) for x, size, part_key in parts))
+            obs = walk_policy.observe(self.robot, state.memory, state.spec.commands, noisy)
         velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
-        feet = robots.foot_positions(self.robot, joint_position)
+        feet = robots.foot_positions(self.robot, sensed.joint_position)
         foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
         phases = walk_policy.foot_phases(state.memory.gait, state.spec.commands)
         random = state.random

@@ -12,6 +12,7 @@ import numpy as np
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
 from mqe_jax.walk.env import WalkEnv, heading_velocity
@@ -73,7 +74,7 @@ def sample_specs(robot: Robot, scenario: Scenario, key: jax.Array, episodes: int
     velocity = jax.random.uniform(key, (episodes, 3), minval=-span, maxval=span)
     if scenario.velocity is not None:
         velocity = jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
-    rest = walk_policy.default_commands(robot, scenario.gait, gait_frequency=scenario.frequency)[3:]
+    rest = walk_policy.WalkPolicy(robot).default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
     full = lambda values: jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))  # noqa: E731
     return EpisodeSpec(
         commands=jnp.concatenate([velocity, full(rest)], axis=1),
@@ -103,17 +104,9 @@ def measure(
 
         def one(state: Any, memory: Any) -> Any:
             robot_state = env.read(state.data)
-            gravity = state.obs[0, :3]
             commands = state.spec.commands
-            _, memory = walk_policy.walk(
-                env.robot,
-                params,
-                memory,
-                commands,
-                gravity,
-                robot_state.joint_position[0],
-                robot_state.joint_velocity[0],
-            )
+            sensed = Proprioception(state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0])
+            _, memory = env.skill.targets(params, memory, commands, sensed)
             state = env.step(state, memory.action[None])
             robot_state = env.read(state.data)
             quaternion = robot_state.quaternion[0]
@@ -131,7 +124,7 @@ def measure(
     @jax.jit
     def run(keys: jax.Array, spec: EpisodeSpec) -> Any:
         state = jax.vmap(lambda key, spec: env.reset(key, spec=spec))(keys, spec)
-        memory = jax.vmap(lambda _: walk_policy.initial_memory())(keys)
+        memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
         return jax.lax.scan(advance, (state, memory), None, steps)[1]
 
     specs = sample_specs(env.robot, scenario, spec_key, episodes)

@@ -11,24 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
-from mqe_jax.robots.robot import JOINT_NAMES
+from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 from mqe_jax.walk_policy import OBSERVATION_SIZE
 
-_OTHER_SIDE = str.maketrans("LR", "RL")
-_JOINTS = np.array([JOINT_NAMES.index(name[0] + name[1].translate(_OTHER_SIDE) + name[2:]) for name in JOINT_NAMES])
-_JOINT_SIGNS = np.array([-1.0 if name.endswith("hip") else 1.0 for name in JOINT_NAMES], np.float32)
 _FEET = np.array([1, 0, 3, 2])
 
 
 def _observation() -> tuple[np.ndarray, np.ndarray]:
     """Returns source (70,) and sign (70,) of each number of a mirrored observation."""
-    commands = len(walk_policy.COMMANDS)
-    signs = np.ones(commands, np.float32)
-    signs[[walk_policy.command_index(name) for name in ("vy", "yaw_rate", "roll")]] = -1.0
+    signs = np.array([command.mirror for command in walk_policy.COMMANDS], np.float32)
     blocks: list[tuple[np.ndarray, np.ndarray]] = [
         (np.arange(3), np.array([1.0, -1.0, 1.0], np.float32)),  # gravity
-        (np.arange(commands), signs),
-        *[(_JOINTS, _JOINT_SIGNS)] * 4,  # position, velocity, last action, the one before
+        (np.arange(len(signs)), signs),
+        *[(MIRRORED_JOINTS, MIRRORED_SIGNS)] * 4,  # position, velocity, last action, the one before
         (_FEET, np.ones(4, np.float32)),  # clock
     ]
     starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
@@ -46,7 +41,7 @@ def mirror_history(flat: jax.Array) -> jax.Array:
 
 def mirror_action(action: jax.Array) -> jax.Array:
     """Mirrors actions (..., 12)."""
-    return action[..., _JOINTS] * _JOINT_SIGNS
+    return action[..., MIRRORED_JOINTS] * MIRRORED_SIGNS
 
 
 def symmetry_loss(params: walk_policy.Params, flat: jax.Array, mean: jax.Array) -> jax.Array:

@@ -1,0 +1,135 @@
+"""Actuators: targets of all robots' joints to the engine's control, and the physics under it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.engines import Engine
+from mqe_jax.errors import InputError
+from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.robot import NUM_JOINTS, Robot
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+
+@dataclasses.dataclass(frozen=True)
+class Actuators:
+    """The actuators of the compiled model, PD or torque, which the engine evaluates at every physics step."""
+
+    physics: Engine
+    """Physics of the environment."""
+    index: RobotIndex
+    """Index tables of the robots."""
+
+    def control(self, values: jax.Array) -> jax.Array:
+        """Returns the engine's control (nu,) from values of all robots (R, 12)."""
+        return jnp.zeros(self.physics.model.nu).at[self.index.actuator].set(values)
+
+    def init_memory(self) -> Any:
+        """Returns the recurrent state after a reset."""
+        return ()
+
+    def step(
+        self,
+        data: mjx.Data,
+        memory: Any,
+        target: jax.Array,
+        fields: Mapping[str, jax.Array],
+        xfrc_applied: jax.Array | None,
+    ) -> tuple[mjx.Data, Any, jax.Array]:
+        """Advances the physics by one environment step under targets (R, 12); other arguments as `Engine.step`.
+
+        Returns:
+            Physics state, recurrent state, and whether any physics step may have dropped contacts () bool.
+        """
+        data, overflow = self.physics.step(data, self.control(target), fields=fields, xfrc_applied=xfrc_applied)
+        return data, memory, overflow
+
+
+ActuatorParams = dict[str, dict[str, jax.Array]]
+
+
+def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
+    """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6), `0.bias`, `2...`, `4...`.
+
+    Raises:
+        InputError: if the file is missing, damaged, or holds other names or shapes.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    file = pathlib.Path(path)
+    if not file.is_file():
+        raise InputError(f"actuator_network: no file {file}")
+    try:
+        flat = load_file(file)
+    except SafetensorError as error:
+        raise InputError(f"actuator_network {file}: not a safetensors file ({error})") from None
+    params: ActuatorParams = {}
+    for layer, (n_in, n_out) in zip(("0", "2", "4"), ((6, 32), (32, 32), (32, 1)), strict=True):
+        for kind, shape in (("weight", (n_out, n_in)), ("bias", (n_out,))):
+            name = f"{layer}.{kind}"
+            found = tuple(flat[name].shape) if name in flat else "nothing"
+            if found != shape:
+                raise InputError(f"actuator_network {file}: {name} has shape {found}; expected {shape}")
+            params.setdefault(layer, {})[kind] = jnp.asarray(flat[name], jnp.float32)
+    return params
+
+
+def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Computes joint torques (...), N m, by the actuator network.
+
+    Args:
+        params: weights of the network.
+        error: joint position minus target at this physics step and the two before (3, ...), rad.
+        velocity: joint velocity likewise (3, ...), rad/s.
+    """
+    x = jnp.moveaxis(jnp.concatenate([error, velocity]), 0, -1)
+    for layer in ("0", "2"):
+        x = jax.nn.soft_sign(jnp.matmul(x, params[layer]["weight"].T, precision="highest") + params[layer]["bias"])
+    return (jnp.matmul(x, params["4"]["weight"].T, precision="highest") + params["4"]["bias"])[..., 0]
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkActuators(Actuators):
+    """An actuator network, which computes torques from joint targets at every physics step.
+
+    Its recurrent state: joint position errors (rad) and velocities (rad/s) of the last two physics steps (2, R, 12).
+    """
+
+    robot: Robot
+    """Robot type."""
+    params: ActuatorParams
+    """Weights of the network."""
+
+    def init_memory(self) -> tuple[jax.Array, jax.Array]:
+        past = jnp.zeros((2, self.index.num_robots, NUM_JOINTS))
+        return past, past
+
+    def step(
+        self,
+        data: mjx.Data,
+        memory: tuple[jax.Array, jax.Array],
+        target: jax.Array,
+        fields: Mapping[str, jax.Array],
+        xfrc_applied: jax.Array | None,
+    ) -> tuple[mjx.Data, Any, jax.Array]:
+        def substep(carry: Any, _: None) -> Any:
+            data, (errors, velocities) = carry
+            errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
+            velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
+            limit = self.robot.torque_limit
+            torque = self.control(jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit))
+            data, overflow = self.physics.step(data, torque, fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
+            return (data, (errors[:2], velocities[:2])), overflow
+
+        (data, memory), overflow = jax.lax.scan(substep, (data, memory), None, self.physics.num_substeps)
+        return data, memory, jnp.any(overflow)

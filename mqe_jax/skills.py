@@ -1,0 +1,147 @@
+"""Skills: low-level policies of one robot, from commands and proprioception to joint targets; their registry.
+
+A skill is a class derived from `Skill` in its own file, registered by `register`. Agents and NPC robots use it alike.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.index import Proprioception
+from mqe_jax.robots.robot import Robot
+
+
+class Command(NamedTuple):
+    """One command of a skill. An action adds gain x action to the default, clipped to +-limit."""
+
+    name: str
+    unit: str
+    default: float | Callable[[Robot], float] = 0.0
+    """Value without an action, or a function of the robot."""
+    gain: float = 0.0
+    """Change per unit of action; 0 if actions cannot set the command."""
+    limit: float = 0.0
+    """Greatest change by an action."""
+    scale: float = 1.0
+    """Factor in the skill's own observation."""
+    mirror: float = 1.0
+    """Sign under reflection of left and right."""
+
+
+class Skill(abc.ABC):
+    """A low-level policy with C commands; functions of one robot, to be batched by `jax.vmap`."""
+
+    name: ClassVar[str]
+    """Name in the registry, and prefix of the recurrent states in exported graphs."""
+    commands: ClassVar[tuple[Command, ...]]
+    """Its commands, in order."""
+    gaits: ClassVar[Mapping[str, Mapping[str, float]]] = {}
+    """Named sets of default commands; the first is the default."""
+    period: ClassVar[float] = 0.02
+    """Environment step, s."""
+    robot: Robot
+    """Robot type."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    # -- defined by each skill ----------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def init_memory(self) -> Any:
+        """Returns the recurrent state after a reset: a dataclass or dictionary of arrays, or () without one."""
+
+    @abc.abstractmethod
+    def targets(
+        self, params: Any, memory: Any, command: jax.Array, proprioception: Proprioception
+    ) -> tuple[jax.Array, Any]:
+        """Returns the joint targets (12,), rad, and the next recurrent state, for commands (C,)."""
+
+    def load_params(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Reads the parameters from a file, or those shipped for the robot; InputError if they cannot be read."""
+        if path is not None:
+            raise InputError(f"skill_weights: {str(path)!r} is not allowed; the skill {self.name!r} has no weights")
+        return ()
+
+    def clock(self, memory: Any) -> jax.Array:
+        """Returns the part of the recurrent state that critics observe, any length."""
+        return jnp.zeros(0)
+
+    # -- common to all skills -----------------------------------------------------------------------------------
+
+    def index(self, names: Sequence[str]) -> np.ndarray:
+        """Returns the positions of commands in the vector of commands; InputError for an unknown name."""
+        known = [command.name for command in self.commands]
+        for name in names:
+            if name not in known:
+                hint = nearest(name, known)
+                raise InputError(f"{self.name} command: unknown name {name!r}{hint}; allowed: {', '.join(known)}")
+        return np.array([known.index(name) for name in names])
+
+    def column(self, field: str, names: Sequence[str]) -> np.ndarray:
+        """Returns a field of `Command`, such as 'gain', of the named commands (n,)."""
+        return np.array([getattr(self.commands[i], field) for i in self.index(names)], np.float32)
+
+    def default_commands(self, gait: str | None = None, **values: float) -> np.ndarray:
+        """Returns the default commands (C,) of a gait, with single values replaced.
+
+        Raises:
+            InputError: for an unknown gait or command.
+        """
+        if gait is not None and gait not in self.gaits:
+            allowed = ", ".join(self.gaits) or f"none with the skill {self.name!r}"
+            raise InputError(f"gait: unknown name {gait!r}{nearest(gait, self.gaits)}; allowed: {allowed}")
+        given = (command.default for command in self.commands)
+        default = np.array([x(self.robot) if callable(x) else x for x in given], np.float32)
+        for name, value in {**self.gaits.get(gait or next(iter(self.gaits), ""), {}), **values}.items():
+            default[self.index([name])] = value
+        return default
+
+    def check_commands(self, names: Sequence[str]) -> None:
+        """Checks the commands that the action sets; the InputError names the allowed ones."""
+        allowed = [command.name for command in self.commands if command.gain]
+        for name in names:
+            if name not in allowed:
+                hint = nearest(name, allowed)
+                raise InputError(f"commands: unknown command {name!r}{hint}; allowed: {', '.join(allowed)}")
+        if not names or len(set(names)) != len(names):
+            raise InputError(f"commands: {tuple(names)} must be one or more distinct commands")
+
+    def check_period(self, timestep: float, num_substeps: int) -> None:
+        """Checks that `num_substeps` physics steps of `timestep` (s) are one period; raises an InputError."""
+        if not math.isclose(timestep * num_substeps, self.period):
+            raise InputError(
+                f"Scene.timestep: {timestep} s x {num_substeps} substeps is {timestep * num_substeps:g} s; "
+                f"the period of the skill {self.name!r} is {self.period} s"
+            )
+
+
+SKILLS: dict[str, type[Skill]] = {}
+"""Skills by name."""
+
+
+def register(skill: type[Skill]) -> type[Skill]:
+    """Registers a class under its `name`, for `make(task, skill=name)`, and returns it.
+
+    Raises:
+        InputError: if another class is registered under it.
+    """
+    if SKILLS.setdefault(skill.name, skill) is not skill:
+        raise InputError(f"skill: the name {skill.name!r} is already registered")
+    return skill
+
+
+def make(name: str, robot: Robot) -> Skill:
+    """Returns a skill of a robot; InputError for an unknown name, with the nearest known one."""
+    if name not in SKILLS:
+        raise InputError(f"skill: unknown name {name!r}{nearest(name, SKILLS)}; allowed: {', '.join(SKILLS)}")
+    return SKILLS[name](robot)
