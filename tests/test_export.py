@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_skills import StandAndLean
 
 from mqe_jax import cli, load_policy, make
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.settings import build
+from mqe_jax.skills import SKILLS
 from mqe_jax.train import networks, nn
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import log_prob
@@ -120,6 +122,14 @@ def test_networks_memories_and_controls_agree(task: str, control: str, network: 
     params = {"position_scale": 2.0} if control == "position" else {}
     env = make(task, impl="c", control=control, num_envs=1, **params)
     assert error_on_random_inputs(new_policy(env, control, **network), env) < 2e-5
+
+
+def test_a_graph_holds_the_skill_of_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SKILLS, "lean", StandAndLean)
+    env = make("go1gate", impl="c", num_envs=1, skill="lean", commands=("roll", "pitch"))
+    policy = new_policy(env, recurrent=False)
+    assert input_shapes(policy, env)["lean_lean"] == (2, 2)
+    assert error_on_random_inputs(policy, env) < 2e-5
 
 
 def stub_env(agents: int) -> Any:
