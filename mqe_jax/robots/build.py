@@ -26,15 +26,12 @@ _GEOM_TYPES = {
 }
 
 
-# Contact settings of the robots' collision geoms, which take precedence over those of the other geom.
+# Contact settings (joint limits share SOLREF) of the robots' collision geoms, which take precedence over those of the other geom.
 # The time constant (s) is the shortest that is stable at a physics step of 0.005 s; the second number is the damping
 # ratio. Contacts begin MARGIN before the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 MARGIN = 0.003  # m
-# Joint limits have the same time constant and begin `JOINT_MARGIN` before the limit, which a joint at its motor's speed
-# limit passes by up to 0.25 rad within a physics step. A stiffer `solimp` needs more solver iterations.
-JOINT_MARGIN = 0.12  # rad
 
 
 def _add_inertial(body: Any, link: Link) -> None:
@@ -129,7 +126,7 @@ def build_robot(
                 axis=axis,
                 limited=True,
                 range=limits,
-                margin=JOINT_MARGIN,
+                margin=robot.joint_margin,
                 solref_limit=SOLREF,
             )
             if joint_mechanics:

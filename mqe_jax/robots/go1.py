@@ -85,6 +85,7 @@ GO1 = Robot(
     rotor_inertia=np.full(12, 0.01),
     joint_damping=np.tile([1.0, 2.0, 2.0], 4),
     friction_loss=np.full(12, 0.2),
+    joint_margin=0.12,
     kp=20.0,
     kd=0.5,
     action_scale=np.tile([0.125, 0.25, 0.25], 4),

@@ -102,6 +102,7 @@ GO2 = Robot(
     rotor_inertia=np.full(12, 0.01),
     joint_damping=np.full(12, 2.0),
     friction_loss=np.full(12, 0.2),
+    joint_margin=0.13,
     kp=30.0,
     kd=0.75,
     action_scale=np.tile([0.125, 0.25, 0.25], 4),

@@ -254,6 +254,9 @@ class Robot:
     """Viscous friction of the joints (12,), N m s/rad; likewise."""
     friction_loss: np.ndarray
     """Dry friction of the joints (12,), N m; likewise."""
+    joint_margin: float
+    """Distance before a joint limit at which its constraint begins, rad: a joint at its motor's speed limit passes the
+    limit by up to 0.25 rad within a physics step. A stiffer constraint needs more solver iterations."""
     kp: float
     """Proportional gain, N m/rad."""
     kd: float
