@@ -26,10 +26,10 @@ _GEOM_TYPES = {
 }
 
 
-# Contact settings of the robots' collision geoms, which take precedence over those of the other geom; joint limits share
-# SOLREF.
-# The time constant (s) is the shortest that is stable at a physics step of 0.005 s; the second number is the damping
-# ratio. Contacts begin MARGIN before the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
+# Contact settings of the robots' collision geoms, which take precedence over those of the other geom. The time constant
+# (s), which joint limits share, is the shortest that is stable at a physics step of 0.005 s; the second number is the
+# damping ratio. Contacts begin MARGIN before the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics
+# step.
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 MARGIN = 0.003  # m
