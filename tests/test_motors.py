@@ -8,8 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mujoco.batch import Batch
 
 from mqe_jax import make, robots
+from mqe_jax.engines import c
+from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.robots.motors import BAND, CLAMP, Motors, leg_response
 from mqe_jax.scene import Scene, compile_scene
@@ -56,6 +59,42 @@ def test_a_slow_leg_has_no_armature_and_its_control_is_unchanged(name: str) -> N
     velocity = np.zeros(12)
     velocity[4] = motors.speed.min()
     np.testing.assert_array_equal(given(motors, 0.0, velocity)[1] > 0, np.repeat([False, True, False, False], 3))
+
+
+@pytest.mark.parametrize("name", ["go1", "go2"])
+def test_idle_motors_keep_their_control_and_have_no_armature(name: str) -> None:
+    motors = motors_of(name)
+    random = np.random.default_rng(0)
+    scale = random.uniform(0.0, 1.2, (2, 4000, 1))
+    shares = (scale * random.uniform(-1.0, 1.0, (2, 4000, 12))).astype(np.float32)
+    asked, velocity = shares[0] * motors.torque, shares[1] * motors.speed
+    arguments = asked, np.zeros_like(asked), velocity, np.ones(12, np.float32), np.zeros((12, 3), np.float32)
+    ctrl, armature = motors.limit(np, *arguments)
+    acts = (ctrl != asked).any(axis=1) | armature.any(axis=1)
+    idle = motors.idle(*arguments)
+    assert not np.any(idle & acts)
+    assert idle.sum() > 0.5 * (~acts).sum() and acts.any()
+    asked[0, 0] = np.nan
+    assert not motors.idle(*arguments)[0]
+
+
+def test_steps_without_limits_are_taken_only_where_limits_have_no_effect(monkeypatch: Any) -> None:
+    """Twenty steps under actions of 0 to 100% are the same when the limits are evaluated in all environments."""
+    params = {"control": "torque", "num_agents": 1, "randomization": {"motor_strength": (0.7, 1.3)}}
+    env: Any = make("go1plane", impl="c", num_envs=32, **params)
+    vector, keys = VectorEnv(env, 32), jax.random.split(jax.random.PRNGKey(1), 20)
+    start, step = jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.jit(vector.step)
+    scale, states, rollouts = jnp.linspace(0.0, 1.0, 32)[:, None, None], [], []
+    rollout = Batch.rollout
+    monkeypatch.setattr(Batch, "rollout", lambda *a, ids, **k: rollouts.append(len(ids)) or rollout(*a, ids=ids, **k))
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(c, "SHARE", share)
+        state = start
+        for key in keys:
+            state = step(state, scale * jax.random.uniform(key, (32, 1, env.action_size), minval=-1.0))
+        states.append(jax.tree.map(np.asarray, state))
+    assert len(rollouts) == 20 and 0 < sum(rollouts) < 20 * 32
+    jax.tree.map(np.testing.assert_array_equal, *states)
 
 
 def test_joint_targets_are_changed_so_that_the_actuators_give_the_motors_torque() -> None:
@@ -111,8 +150,8 @@ def test_engines_agree_where_motors_saturate() -> None:
         step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)[0]))
         states[impl] = step.lower(data, torque).compile(compiler_options=QUICK)(data, torque)
     for field, atol in (("qpos", 1e-4), ("qvel", 0.02)):
-        c, other = (np.asarray(getattr(states[impl], field)) for impl in ("c", "jax"))
-        np.testing.assert_allclose(other, c, atol=atol, err_msg=field)
+        expected, other = (np.asarray(getattr(states[impl], field)) for impl in ("c", "jax"))
+        np.testing.assert_allclose(other, expected, atol=atol, err_msg=field)
     assert np.all(np.asarray(states["c"].ctrl) == np.asarray(torque))  # of the step, not of its last physics step
 
 

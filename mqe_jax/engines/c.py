@@ -19,6 +19,8 @@ from mqe_jax.robots.motors import CLAMP, Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
+SHARE = 0.5  # share of idle environments above which steps without limits are worth trying
+
 
 class CEngine(Engine):
     """MuJoCo's C engine as a pure JAX function; no contact is ever dropped."""
@@ -30,8 +32,8 @@ class CEngine(Engine):
         self._model = model.__copy__()
         # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._batches: dict[tuple[int, tuple[str, ...]], Batch] = {}
-        self._rows: dict[int, Motors | None] = {}
+        self._batches: dict[tuple[int, tuple[str, ...], bool], Batch] = {}
+        self._rows: dict[int, tuple[Motors, np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
         self._sizes = (model.nq, model.nv, model.nv, model.nsensordata)
 
@@ -88,48 +90,101 @@ class CEngine(Engine):
         count = int(np.prod(lead)) if lead else 1
         flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
         with self._lock:
-            batch = self._batches.get((count, names))
+            batch = self._batches.get((count, names, forced))
             if batch is None:
-                batch = self._batches[count, names] = Batch(self._model, nsim=count)
-                self._rows[count] = None if self.motors is None else self.motors.repeated(count)
-            for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"):
-                batch.bind(name)[:] = next(flat)
+                batch = self._batches[count, names, forced] = Batch(self._model, nsim=count)
+                if self.motors is not None:
+                    self._rows[count] = self._repeated(self.motors, count)
+            start = {name: next(flat) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+            for name, values in start.items():
+                batch.bind(name)[:] = values
             if self._model.nmocap:
                 batch.bind("mocap_pos")[:] = next(flat)
                 batch.bind("mocap_quat")[:] = next(flat)
-            batch.bind("xfrc_applied")[:] = next(flat) if forced else 0.0
+            if forced:
+                batch.bind("xfrc_applied")[:] = next(flat)
             batch.bind("time")[:] = 0.0
             for name in names:
                 batch.expand(name)[:] = next(flat)
             sensordata = batch.bind("sensordata")
-            motors = self._rows[count]
-            if motors is None:
+            if self.motors is None:
                 batch.step(nstep=substeps)
             else:
-                self._drive(batch, motors, substeps, names)
+                self._drive(batch, self.motors, substeps, names, start)
             parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
-            row = np.concatenate(parts, axis=1).astype(np.float32)
+            row = np.concatenate(parts, axis=1, dtype=np.float32)
         return row.reshape(*lead, -1)
 
-    def _drive(self, batch: Batch, motors: Motors, substeps: int, names: tuple[str, ...]) -> None:
-        """Steps a batch, with the motors' limits in every physics step; `motors` has a row per environment."""
-        model = self._model
-        gain = batch.expand("actuator_gainprm") if "actuator_gainprm" in names else model.actuator_gainprm
-        bias = batch.expand("actuator_biasprm") if "actuator_biasprm" in names else model.actuator_biasprm
-        gain, bias = gain[..., 0].astype(np.float32), _columns(bias[..., :3])
-        qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-        asked, armature = ctrl.astype(np.float32), batch.expand("dof_armature")
+    def _drive(
+        self, batch: Batch, motors: Motors, substeps: int, names: tuple[str, ...], start: dict[str, np.ndarray]
+    ) -> None:
+        """Steps a batch from `start`, with the motors' limits in every physics step.
+
+        The limits seldom act on robots that walk. So the environments whose motors are idle (`Motors.idle`), unless
+        they are few, make their physics steps in one call without limits. The states between these steps are then
+        checked likewise. The environments that fail a check step from `start` with the limits evaluated in every
+        physics step. The result is that of doing so in all environments, to the last bit.
+        """
         angles, speeds = motors.joint_qpos, motors.joint_qvel
-        base = armature[:, speeds].copy() if "dof_armature" in names else model.dof_armature[speeds]
-        greatest = CLAMP * float(motors.speed.min())
-        for _ in range(substeps):
-            joints = qpos[:, angles].astype(np.float32), qvel[:, speeds].astype(np.float32)
-            ctrl[:], added = motors.limit(np, asked, *joints, gain, bias)
-            armature[:, speeds] = base + added if added.any() else base
-            batch.step(nstep=1)
-            velocity = qvel[:, speeds]
-            if max(velocity.max(), -velocity.min()) > greatest and np.any(np.abs(velocity) > CLAMP * motors.speed):
-                qpos[:, angles], qvel[:, speeds] = motors.clamp(np, qpos[:, angles], velocity)
+        every, gain, bias = self._rows[batch.nsim]
+        if "actuator_gainprm" in names:
+            gain = batch.expand("actuator_gainprm")[..., 0].astype(np.float32)
+        if "actuator_biasprm" in names:
+            bias = _columns(batch.expand("actuator_biasprm")[..., :3])
+        asked, position, velocity = start["ctrl"], start["qpos"][:, angles], start["qvel"][:, speeds]
+        idle = every.idle(asked, position, velocity, gain, bias)
+        if np.count_nonzero(idle) > SHARE * len(idle):
+            ids = np.flatnonzero(idle)
+            path = batch.rollout(substeps, record=("qpos", "qvel"), ids=ids)
+            for step in range(substeps - 1):
+                position[ids], velocity[ids] = path["qpos"][:, step][:, angles], path["qvel"][:, step][:, speeds]
+                idle &= every.idle(asked, position, velocity, gain, bias)
+            # Unlike steps, a rollout ends where the engine warns.
+            idle &= batch.bind("time") > (substeps - 0.5) * motors.timestep
+        else:
+            idle[:] = False
+        ids = np.flatnonzero(~idle)
+        if ids.size:
+            for name, values in start.items():
+                batch.bind(name)[ids] = values[ids]
+            batch.bind("time")[ids] = 0.0
+            if len(ids) < batch.nsim:
+                every, gain, bias = motors.repeated(len(ids)), gain[ids], bias[ids]
+            _step_limited(batch, every, substeps, ids, gain, bias)
+        _clamp(batch, motors, slice(None))
+
+    def _repeated(self, motors: Motors, count: int) -> tuple[Motors, np.ndarray, np.ndarray]:
+        """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each environment."""
+        gain, bias = self._model.actuator_gainprm[:, 0], self._model.actuator_biasprm[:, :3]
+        gain, bias = np.tile(gain.astype(np.float32), (count, 1)), _columns(np.tile(bias, (count, 1, 1)))
+        return motors.repeated(count), gain, bias
+
+
+def _step_limited(
+    batch: Batch, motors: Motors, substeps: int, ids: np.ndarray, gain: np.ndarray, bias: np.ndarray
+) -> None:
+    """Steps the environments `ids` with the limits evaluated in every physics step; `motors` has a row for each."""
+    rows = slice(None) if len(ids) == batch.nsim else ids[:, None]  # numpy is faster with a slice
+    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+    angles, speeds = motors.joint_qpos, motors.joint_qvel
+    asked, armature = ctrl[ids].astype(np.float32), batch.expand("dof_armature")
+    base = armature[rows, speeds]
+    for _ in range(substeps):
+        joints = qpos[rows, angles].astype(np.float32), qvel[rows, speeds].astype(np.float32)
+        ctrl[ids], added = motors.limit(np, asked, *joints, gain, bias)
+        armature[rows, speeds] = base + added if added.any() else base
+        batch.step(ids=ids)
+        _clamp(batch, motors, rows)
+    armature[rows, speeds] = base
+
+
+def _clamp(batch: Batch, motors: Motors, rows: Any) -> None:
+    """Clamps the joint speeds of environments after a physics step; `rows` is their column of ids, or a slice."""
+    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+    angles, speeds = motors.joint_qpos, motors.joint_qvel
+    velocity = qvel[rows, speeds]
+    if np.any(np.abs(velocity) > CLAMP * float(motors.speed.min())):
+        qpos[rows, angles], qvel[rows, speeds] = motors.clamp(np, qpos[rows, angles], velocity)
 
 
 def _columns(bias: np.ndarray) -> np.ndarray:

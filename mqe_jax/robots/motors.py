@@ -30,6 +30,7 @@ SLOW, FAST = 0.85, 1.0  # shares of a leg's lowest speed limit at which its arma
 REACH = 1.25  # share of its speed limit that a joint's torques may carry it to within a physics step without armature
 GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
 CLAMP = 1.09  # greatest share of the speed limit after a physics step
+ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
 
 
 @functools.cache
@@ -97,18 +98,37 @@ class Motors:
         most = xp.minimum(xp.minimum(self._line * below, self._brake * below), self.torque)  # in the direction of v
         most = xp.maximum(most, -self.torque)
         sign = xp.where(velocity < 0, np.float32(-1.0), np.float32(1.0))
-        force = gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity
+        force = _force(ctrl, position, velocity, gain, bias)
         given = sign * xp.minimum(xp.maximum(sign * force, -self.torque), most)
         ctrl = ctrl + (given - force) / xp.where(gain == 0, 1, gain)
         return ctrl, self._armature(xp, pace, xp.abs(given))
+
+    def idle(self, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> np.ndarray:
+        """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no armature (...,) bool.
+
+        This takes less time than `limit`. The torques' magnitudes must be at most L and S (1 - |v| / V), which the
+        bounds of `limit` allow in either direction, and speeds below those at which armature begins, by a margin for
+        rounding. Braking with more than S (1 - |v| / V) has no effect in `limit` either, but fails here. So do numbers
+        that are not finite.
+        """
+        pace = np.abs(velocity)
+        effort = np.abs(_force(ctrl, position, velocity, gain, bias))
+        idle = effort <= np.minimum(self._line * (self.speed - pace), self.torque)
+        idle &= pace <= self._slow
+        pace += self._kick(effort)
+        idle &= pace <= self._near
+        return idle.all(axis=-1)
+
+    def _kick(self, effort: Any) -> Any:
+        """Returns the speeds (..., J), rad/s, that torques of magnitude `effort` can add in a physics step."""
+        return (effort.reshape(-1, len(self.response)) @ (self.timestep * self.response)).reshape(effort.shape)
 
     def _armature(self, xp: Any, pace: Any, effort: Any) -> Any:
         """Returns the armature (..., J), kg m^2, at speeds of magnitude `pace` and torques of magnitude `effort`."""
         size = len(self.response)
         fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
         near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
-        kick = (effort.reshape(-1, size) @ (self.timestep * self.response)).reshape(pace.shape)
-        reach = (pace + kick) / self.speed
+        reach = (pace + self._kick(effort)) / self.speed
         if xp is np and near.max() <= 0.0 and reach.max() <= REACH:
             return np.zeros_like(pace)
         needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH)
@@ -139,6 +159,16 @@ class Motors:
         """Lowest speed limit of each leg (..., J / 3), rad/s."""
         return self.speed.reshape(*self.speed.shape[:-1], -1, len(self.response)).min(axis=-1)
 
+    @functools.cached_property
+    def _slow(self) -> np.ndarray:
+        """Speeds (..., J), rad/s, below which a leg has no armature for its speed."""
+        return np.float32((1.0 - ROUNDING) * SLOW) * np.repeat(self._leg_speed, len(self.response), axis=-1)
+
+    @functools.cached_property
+    def _near(self) -> np.ndarray:
+        """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry it further."""
+        return np.float32((1.0 - ROUNDING) * REACH) * self.speed
+
     def repeated(self, count: int) -> Motors:
         """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""
         rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
@@ -148,3 +178,8 @@ class Motors:
         """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `CLAMP` V."""
         clamped = xp.clip(velocity, -CLAMP * self.speed, CLAMP * self.speed)
         return position - self.timestep * (velocity - clamped), clamped
+
+
+def _force(ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> Any:
+    """Returns the forces (..., J), N m, that actuators give without limits; the arguments are those of `limit`."""
+    return gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity
