@@ -31,13 +31,13 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 system: ## Install the GL libraries for rendering, where possible
-	@bash tools/install_gl.sh
+	@bash tools/install.sh gl
 
 browser: ## Install Debian's Chromium for the test of `mqe view`, where possible
-	@bash tools/install_chromium.sh
+	@bash tools/install.sh chromium
 
 npm: ## Install Debian's npm for the libraries of the page docs/play, where possible
-	@bash tools/install_npm.sh
+	@bash tools/install.sh npm
 
 demo: $(STAMP) system ## Train Narrow Gate on the CPU, evaluate before and after, write to runs/demo
 	JAX_PLATFORMS=cpu $(BIN)/mqe demo

@@ -19,7 +19,7 @@ def open_page(width: int, height: int) -> Iterator[Any]:
     """Opens an empty page of width x height pixels; without Chromium or playwright the test is skipped."""
     program = os.environ.get("MQE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
-        pytest.skip("no Chromium here (tools/install_chromium.sh installs Debian's)")
+        pytest.skip("no Chromium here (tools/install.sh chromium installs Debian's)")
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=FLAGS)

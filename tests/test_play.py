@@ -83,7 +83,7 @@ def run_node(folder: Path, program: str, given: Any) -> Any:
     """Runs a module beside the page's own in Node with a JSON value as `given`; returns what it prints as JSON."""
     node = shutil.which("node")
     if node is None:
-        pytest.skip("no Node here (tools/install_npm.sh installs Debian's)")
+        pytest.skip("no Node here (tools/install.sh npm installs Debian's)")
     for file in PAGE.glob("*.js"):
         shutil.copy(file, folder)
     (folder / "package.json").write_text('{"type": "module"}')
@@ -166,7 +166,7 @@ def page(tmp_path_factory: Any) -> Path:
 
 def test_mujoco_in_webassembly_agrees_with_the_c_engine(page: Path) -> None:
     if shutil.which("node") is None:
-        pytest.skip("no Node here (tools/install_npm.sh installs Debian's)")
+        pytest.skip("no Node here (tools/install.sh npm installs Debian's)")
     import play_agreement
 
     report = play_agreement.measure(page, count=2, episodes=0)

@@ -1,29 +1,27 @@
 """MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
-Generated: one page per task (image, clip, sizes, observation, rewards, parameters) with an overview, and the
+Generated: one page per task (clip, sizes, observation, rewards, parameters) with an overview, and the
 API reference. Links to files outside docs/ become their paths, and LaTeX becomes MathML, so that the built site needs
 neither the repository nor another host.
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
-import itertools
 import re
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
 
 # Module of each page of the reference, and the names shown (all public ones where empty).
 REFERENCE = {
@@ -117,7 +115,7 @@ def overview(tasks: Mapping[str, Any]) -> str:
         env = _make(task)
         kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
         style = '{ style="min-width: 9em" }'
-        image = f"[![{task.title}]({_image(name)}){style}]({name}.md)" if _image(name) else ""
+        image = f"[![{task.title}]({_clip(name)}){style}]({name}.md)" if _clip(name) else ""
         sizes = f"{env.num_agents} | {env.observation_size} | {env.privileged_observation_size}"
         limit = f"{env.params.episode_length:g}"
         kinds[kind].append(f"| [`{name}`]({name}.md) | {task.title} | {sizes} | {limit} | {image} |")
@@ -131,9 +129,8 @@ def task_page(task: Any) -> str:
     """Returns the page of a task."""
     env, name = _make(task), task.name
     body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
-    media = [f"![{task.title}]({_image(name)})"] if _image(name) else []
-    if (DOCS / "clips" / f"{name}.webp").is_file():
-        media.append(f"The scripted policy (`mqe render {name}`):\n\n![clip](../clips/{name}.webp)")
+    clip = f"The scripted policy (`mqe render {name}`):\n\n![{task.title}]({_clip(name)})"
+    media = [clip] if _clip(name) else []
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
         "- action per agent: command 3 (velocities for the walk policy), position 12, torque 12",
@@ -158,40 +155,28 @@ def _make(task: Any) -> Any:
     return task(num_envs=1, impl="c")
 
 
-def _image(name: str) -> str | None:
-    return f"../{name}.png" if (DOCS / f"{name}.png").is_file() else None
+def _clip(name: str) -> str | None:
+    return f"../clips/{name}.webp" if (ROOT / "docs" / "clips" / f"{name}.webp").is_file() else None
 
 
 def _fields(record: type[Any], column: str, skip: tuple[str, ...] = ()) -> str:
     """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give."""
-    meanings: dict[str, str] = {}
-    for cls in reversed(record.__mro__):
-        meanings |= attributes(cls)
-    own = list(attributes(record))
+    classes = [_package()[f"{c.__module__}.{c.__qualname__}"[8:]] for c in record.__mro__ if c is not object]
+    meanings = [{name: x.docstring.value for name, x in c.members.items() if x.docstring} for c in classes]
     values = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
     rows = []
-    for name in sorted(values, key=lambda name: own.index(name) if name in own else len(own)):
-        meaning = meanings.get(name, "").replace("|", "\\|")
+    for name in sorted(values, key=lambda name: name not in meanings[0]):
+        meaning = " ".join(next((own[name] for own in meanings if name in own), "").split()).replace("|", "\\|")
         rows.append(f"| `{name}` | {_shown(values[name])} | {meaning} |")
     return f"| name | {column} | meaning |\n|---|---|---|\n" + "\n".join(rows)
+
+
+@functools.cache
+def _package() -> Any:
+    return griffe.load("mqe_jax", search_paths=[ROOT])
 
 
 def _shown(value: Any) -> str:
     if value is dataclasses.MISSING:
         return ""
     return f"{value:g}" if isinstance(value, float) else f"`{value}`"
-
-
-def attributes(cls: type[Any]) -> dict[str, str]:
-    """Returns the docstrings under a class's own fields by name."""
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-    except (OSError, TypeError):  # a class without source, such as object
-        return {}
-    entries: dict[str, str] = {}
-    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
-    for field, text in itertools.pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-            if isinstance(text.value, ast.Constant) and isinstance(text.value.value, str):
-                entries[field.target.id] = " ".join(text.value.value.split())
-    return entries

@@ -80,7 +80,7 @@ def _pack(package: Package, archive: Path) -> None:
     """Fetches a package's archive with npm."""
     npm = shutil.which("npm")
     if npm is None:
-        raise FetchError("npm is not installed (tools/install_npm.sh installs Debian's)")
+        raise FetchError("npm is not installed (tools/install.sh npm installs Debian's)")
     wanted = f"{package.name}@{package.version}"
     archive.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=archive.parent) as temporary:
