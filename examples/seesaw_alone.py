@@ -6,7 +6,7 @@ import jax
 
 import mqe_jax
 from mqe_jax.envs.autoreset import VectorEnv
-from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
+from mqe_jax.planners.cooperative import plan_seesaw, plan_seesaw_alone
 from mqe_jax.planners.steering import Observation
 from mqe_jax.train.evaluate import evaluate
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.planners.seesaw import plan_seesaw
-from mqe_jax.planners.tug import plan_tug
+from mqe_jax.planners.cooperative import plan_seesaw
+from mqe_jax.planners.matches import plan_tug
 from mqe_jax.walk_policy import COMMANDS
 
 SPEED = COMMANDS[0].gain  # m/s per unit of forward action

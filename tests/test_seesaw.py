@@ -15,7 +15,7 @@ from mqe_jax import objects
 from mqe_jax.envs import State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.objects import Door, Seesaw
-from mqe_jax.planners.seesaw import plan_seesaw, plan_seesaw_alone
+from mqe_jax.planners.cooperative import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
