@@ -234,6 +234,6 @@ def test_two_robots_push_the_box_clearly_faster_than_one() -> None:
     import runpy
     from pathlib import Path
 
-    pushed = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "push_box_alone.py"))["pushed"]
+    pushed = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "alone.py"))["pushed"]
     alone, together = pushed(1, num_envs=8), pushed(2, num_envs=8)
     assert 0.1 < alone < 0.7 * together

@@ -212,7 +212,7 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
 
 
 def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
-    """Through the walk policy, in a few environments; examples/seesaw_alone.py measures many."""
+    """Through the walk policy, in a few environments; examples/alone.py measures many."""
     env, count = make("go1seesaw", impl="c", num_envs=20), 10
     partner = (jnp.arange(2 * count) < count)[:, None, None]
     layout = env.observation_layout

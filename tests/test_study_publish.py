@@ -17,7 +17,8 @@ import yaml
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import override, to_mapping
 from mqe_jax.study import sweep as sweeps
-from mqe_jax.study.runs import REWARD, Cell, Run, table
+from mqe_jax.study.estimates import group
+from mqe_jax.study.runs import REWARD, Cell, Run, load_reference, table
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
@@ -61,7 +62,9 @@ def make_sweep(folder: Path, scores: dict[int, float]) -> Path:
         (run / "config.yaml").write_text(yaml.safe_dump(to_mapping(policy.config)))
         steps = np.arange(1, 101) * end / 100
         terms = {"reward/goal": 0.1 * np.sqrt(steps), "reward/never": np.zeros(100)}
-        (run / "metrics.csv").write_text(table({"env_steps": steps, "fps": steps / 7, REWARD: score * steps, **terms}))
+        columns = {"env_steps": steps, "fps": steps / 7, REWARD: score * steps, **terms}
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        (run / "metrics.csv").write_text(table(rows))
         (run / "evaluations.json").write_text(json.dumps({"evaluations": [point], "absolute": point, "ended_at": end}))
     return folder
 
@@ -158,7 +161,9 @@ def test_measurements_are_kept_by_name(tmp_path: Path) -> None:
 
 def test_the_page_agrees_with_the_committed_tables() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    assert paper_page.filled(text, paper_page.Study(publish.read_tables(RESULTS), RESULTS)) == text
+    reference = load_reference(RESULTS / "reference.yaml")
+    cells = group(publish.read_tables(RESULTS), reference)
+    assert paper_page.filled(text, paper_page.sections(cells, reference, RESULTS)) == text
 
 
 def test_every_published_run_belongs_to_a_sweep() -> None:
@@ -184,8 +189,8 @@ def test_published_policies_are_the_best_of_their_cells(file: Path) -> None:
     [
         (3.2, 3.3, 3.4, 3, "above"),
         (3.0, 3.3, 3.4, 3, "above, within the interval"),
-        (1.0, 2.0, 3.4, 3, "below, within the interval"),
-        (1.0, 2.0, 3.0, 3, "below"),
+        (1.0, 2.0, 3.4, 3, "**below**, within the interval"),
+        (1.0, 2.0, 3.0, 3, "**below**"),
         (1.0, 2.0, 3.0, 2, ""),
         (math.nan, math.nan, math.nan, 3, ""),
     ],

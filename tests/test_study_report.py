@@ -11,9 +11,8 @@ import pytest
 
 from mqe_jax.errors import InputError
 from mqe_jax.study.estimates import band, evaluated, group, score_matrices
-from mqe_jax.study.reference import Reference, load_reference
 from mqe_jax.study.report import report, write_report
-from mqe_jax.study.runs import REWARD, Cell, Run, read_curve
+from mqe_jax.study.runs import REWARD, Cell, Reference, Run, load_reference, read_curve
 
 REFERENCE = Reference(label="theirs", values={"plain": {"go1gate": {"mappo": 2.75}}}, tasks={"go1sheep-hard": "Hard"})
 

@@ -14,7 +14,7 @@ import pytest
 
 from mqe_jax.errors import InputError
 from mqe_jax.study import statistics
-from mqe_jax.study.marl_eval import to_marl_eval
+from mqe_jax.study.report import to_marl_eval
 from mqe_jax.study.runs import Cell, Run
 
 FIXTURE = json.loads((Path(__file__).parent / "data" / "rliable.json").read_text(encoding="utf-8"))
@@ -53,7 +53,7 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
     def interval(scores: Any, statistic: Any, random: Any) -> np.ndarray:
         return np.stack(statistics.bootstrap_interval(scores, statistic, random, samples=samples), axis=-1)
 
-    iqm = interval(x, statistics.interquartile_mean, PackageRandom(x.shape))
+    iqm = interval([x], statistics.interquartile_mean, PackageRandom(x.shape))
     np.testing.assert_allclose(iqm, case["iqm_interval"], rtol=1e-9, atol=1e-12)
     improvement = interval([x, y], statistics.probability_of_improvement, PackageRandom(x.shape, y.shape))
     np.testing.assert_allclose(improvement, case["improvement_interval"], rtol=1e-9, atol=1e-12)
@@ -61,7 +61,7 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
     def profile(scores: np.ndarray) -> np.ndarray:
         return statistics.performance_profile(scores, FIXTURE["thresholds"])
 
-    profiles = interval(x, profile, PackageRandom(x.shape))
+    profiles = interval([x], profile, PackageRandom(x.shape))
     np.testing.assert_allclose(profiles, case["profile_interval"], rtol=1e-9, atol=1e-12)
 
 
@@ -72,15 +72,16 @@ def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
 
 def test_an_interval_holds_its_statistic_and_repeats() -> None:
     x = np.random.default_rng(3).normal(size=(8, 2))
-    ends = [statistics.bootstrap_interval(x, statistics.interquartile_mean, np.random.default_rng(0)) for _ in range(2)]
+    iqm = statistics.interquartile_mean
+    ends = [statistics.bootstrap_interval([x], iqm, np.random.default_rng(0)) for _ in range(2)]
     assert ends[0] == ends[1]
-    assert ends[0][0] < statistics.interquartile_mean(x) < ends[0][1]
+    assert ends[0][0] < iqm(x) < ends[0][1]
 
 
 @pytest.mark.parametrize("scores", [np.zeros(3), np.zeros((0, 2)), np.array([[np.nan]])])
 def test_bad_scores_are_refused(scores: np.ndarray) -> None:
     with pytest.raises(InputError, match="scores"):
-        statistics.bootstrap_interval(scores, statistics.interquartile_mean, np.random.default_rng(0))
+        statistics.bootstrap_interval([scores], statistics.interquartile_mean, np.random.default_rng(0))
 
 
 def test_normalized_scores_are_fractions_of_a_tasks_range() -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import dataclasses
 import fnmatch
 import gzip
 import io
@@ -28,7 +29,7 @@ import paper_page
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import absolute
-from mqe_jax.study.runs import REWARD, Cell, Curve, Run, number, read_runs
+from mqe_jax.study.runs import REWARD, Cell, Curve, Run, number, read_runs, table
 from mqe_jax.train.policy import read_policy, save_policy
 
 ROOT = Path(__file__).parents[1]
@@ -108,22 +109,17 @@ def write_tables(folder: Path, runs: Sequence[Run]) -> None:
     """Writes both tables of a folder where their content changes; the same runs give the same bytes."""
     curves, evaluations = [], []
     for run in runs:
-        identity = dict(zip(IDENTITY, (run.cell.task, run.cell.algorithm, run.cell.variant, run.seed), strict=True))
+        identity = {**dataclasses.asdict(run.cell), "seed": run.seed}
         curve = thin(run.curve)
         curves += [{**identity, **dict(zip(curve, row, strict=True))} for row in zip(*curve.values(), strict=True)]
         for point in run.evaluations:
             evaluations.append({**identity, "kind": "training", **_numbers(point, EVALUATED)})
         if run.absolute is not None:
             evaluations.append({**identity, "kind": "absolute", **_numbers(run.absolute)})
+    folder.mkdir(parents=True, exist_ok=True)
     for name, rows, first in ((CURVES, curves, COLUMNS), (EVALUATIONS, evaluations, ("kind", "env_steps", "episodes"))):
         others = sorted({column for row in rows for column in row} - {*IDENTITY, *first})
-        text = io.StringIO()
-        writer = csv.DictWriter(text, [*IDENTITY, *first, *others], lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: x if isinstance(x, str) else number(x, DIGITS) for k, x in row.items()})
-        folder.mkdir(parents=True, exist_ok=True)
-        content, path = text.getvalue().encode(), folder / name
+        content, path = table(rows, [*IDENTITY, *first, *others], DIGITS).encode(), folder / name
         if not path.is_file() or gzip.decompress(path.read_bytes()) != content:
             write_atomically(path, gzip.compress(content, mtime=0))
 

@@ -16,7 +16,7 @@ from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
-from mqe_jax.study.reference import load_reference
+from mqe_jax.study.runs import load_reference
 from mqe_jax.train.config import TrainConfig
 
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.study import statistics
-from mqe_jax.study.reference import Reference
-from mqe_jax.study.runs import REWARD, Cell, Run, table
+from mqe_jax.study.runs import REWARD, Cell, Reference, Run
 
 Array = NDArray[np.float64]
 Cells = Mapping[Cell, Sequence[Run]]
+Rows = list[dict[str, Any]]
+"""A table, with the same columns in all rows."""
 
 LAST = 0.02
 """Fraction of a training run over which its final reward is averaged."""
@@ -24,27 +25,23 @@ LAST = 0.02
 
 def group(runs: Sequence[Run], reference: Reference) -> dict[Cell, list[Run]]:
     """Returns the runs of each cell, cells in the reference's order: by variant, task and algorithm."""
-    cells: dict[Cell, list[Run]] = {}
-    for run in runs:
-        cells.setdefault(run.cell, []).append(run)
     orders = list(reference.variants), list(reference.tasks), list(reference.algorithms)
 
     def key(cell: Cell) -> list[tuple[int, str]]:
         names = cell.variant, cell.task, cell.algorithm
         return [(o.index(x) if x in o else len(o), x) for x, o in zip(names, orders, strict=True)]
 
-    return {cell: cells[cell] for cell in sorted(cells, key=key)}
+    return {cell: [run for run in runs if run.cell == cell] for cell in sorted({run.cell for run in runs}, key=key)}
 
 
-def _estimate(scores: Array) -> tuple[Array, Array, Array]:
-    """Returns interquartile mean over runs and its interval, per column: (runs, K) -> (K,) each."""
+def estimate(statistic: Callable[..., Array], *scores: Array) -> tuple[Array, Array, Array]:
+    """Returns a statistic of scores (runs, tasks) each, and the bounds of its interval."""
+    return (statistic(*scores), *statistics.bootstrap_interval(scores, statistic, np.random.default_rng(0)))
 
-    def per_column(x: Array) -> Array:
-        return statistics.interquartile_mean(np.moveaxis(x, -1, -2)[..., None])
 
-    middle = per_column(scores)
-    low, high = statistics.bootstrap_interval(scores, per_column, np.random.default_rng(0))
-    return middle, low, high
+def _per_column(scores: Array) -> Array:
+    """Returns the interquartile mean over runs: (..., runs, K) -> (..., K)."""
+    return statistics.interquartile_mean(np.moveaxis(scores, -1, -2)[..., None])
 
 
 def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array, Array]:
@@ -62,7 +59,7 @@ def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array
         for run in runs
     ]
     scores = np.stack([np.interp(steps, r.curve["env_steps"], y) for r, y in zip(runs, curves, strict=True)])
-    return (steps, *_estimate(scores))
+    return (steps, *estimate(_per_column, scores))
 
 
 def final_reward(run: Run) -> float:
@@ -73,66 +70,63 @@ def final_reward(run: Run) -> float:
 
 def absolute(run: Run, name: str) -> float:
     """Returns a number of the absolute metric under sampled actions, NaN if there is none."""
-    metric = run.absolute
-    value = None if metric is None else metric["sampled"].get(name)
+    value = (run.absolute or {"sampled": {}})["sampled"].get(name)
     return math.nan if value is None else float(value)
 
 
-def evaluation_curve(run: Run) -> Run | None:
-    """Returns a run whose curve is that of its evaluations: env_steps, and REWARD under sampled actions.
-
-    Training curves include shaping rewards and assistance; evaluations are always of the unmodified task. None if the
-    run has no evaluations.
-    """
-    points = run.evaluations
-    values = [point["sampled"].get(REWARD) for point in points]
-    if not points or any(value is None for value in values):
-        return None
-    curve = {"env_steps": [point["env_steps"] for point in points], REWARD: values}
-    return dataclasses.replace(run, curve={name: np.array(x, np.float64) for name, x in curve.items()})
-
-
 def evaluated(cells: Cells) -> Cells:
-    """Returns the cells whose runs all have evaluations, with these as curves."""
-    curves = {cell: [evaluation_curve(run) for run in runs] for cell, runs in cells.items()}
-    return {cell: [run for run in runs if run] for cell, runs in curves.items() if all(runs)}
+    """Returns the cells whose runs all have evaluations, with these as curves: env_steps, REWARD under sampled actions.
 
-
-def over_seeds(values: Sequence[float]) -> tuple[float, float, float]:
-    """Returns estimate and interval of one number over seeds, NaN if a seed has no value."""
-    scores = np.array(values)[:, None]
-    if not np.isfinite(scores).all():
-        return math.nan, math.nan, math.nan
-    return tuple(float(x[0]) for x in _estimate(scores))  # type: ignore[return-value]
-
-
-def curves_table(cells: Cells) -> str:
-    """Returns the curves' bands as CSV text."""
-    columns: dict[str, list[Any]] = {name: [] for name in "task algorithm variant env_steps iqm low high".split()}
+    Training curves include shaping rewards and assistance; evaluations are always of the unmodified task.
+    """
+    chosen: dict[Cell, list[Run]] = {}
     for cell, runs in cells.items():
-        for row in zip(*band(runs), strict=True):
-            for name, item in zip(columns, (cell.task, cell.algorithm, cell.variant, *row), strict=True):
-                columns[name].append(item)
-    return table(columns)
+        curves = [
+            {"env_steps": [p["env_steps"] for p in run.evaluations], REWARD: [_reward(p) for p in run.evaluations]}
+            for run in runs
+        ]
+        if all(curve[REWARD] and None not in curve[REWARD] for curve in curves):
+            arrays = [{name: np.array(x, np.float64) for name, x in curve.items()} for curve in curves]
+            chosen[cell] = [dataclasses.replace(run, curve=x) for run, x in zip(runs, arrays, strict=True)]
+    return chosen
 
 
-def final_table(cells: Cells, reference: Reference) -> dict[str, list[Any]]:
-    """Returns the columns of the table of final values, a row for each cell; `reference` only where it has values."""
+def _reward(evaluation: Mapping[str, Any]) -> float | None:
+    return evaluation["sampled"].get(REWARD)
+
+
+def curve_rows(cells: Cells) -> Rows:
+    """Returns the table of the curves' bands."""
+    names = ("env_steps", "iqm", "low", "high")
+    return [
+        {**dataclasses.asdict(cell), **dict(zip(names, values, strict=True))}
+        for cell, runs in cells.items()
+        for values in zip(*band(runs), strict=True)
+    ]
+
+
+def final_rows(cells: Cells, reference: Reference) -> Rows:
+    """Returns the table of final values, a row for each cell; `reference` only where it has values.
+
+    An estimate is NaN if a seed has no value.
+    """
     rows = []
     for cell, runs in cells.items():
-        row: dict[str, Any] = {"task": cell.task, "algorithm": cell.algorithm, "variant": cell.variant}
-        row |= {"seeds": len(runs), "env_steps": min(run.curve["env_steps"][-1] for run in runs)}
+        row: dict[str, Any] = {**dataclasses.asdict(cell), "seeds": len(runs)}
+        row["env_steps"] = min(run.curve["env_steps"][-1] for run in runs)
         for name, values in (
             ("training", [final_reward(run) for run in runs]),
             ("absolute", [absolute(run, REWARD) for run in runs]),
             ("success", [absolute(run, "success_rate") for run in runs]),
         ):
-            row |= dict(zip((name, f"{name}_low", f"{name}_high"), over_seeds(values), strict=True))
+            known = np.isfinite(values).all()
+            three = estimate(_per_column, np.array(values)[:, None]) if known else np.full((3, 1), math.nan)
+            row |= {key: float(x[0]) for key, x in zip((name, f"{name}_low", f"{name}_high"), three, strict=True)}
         if reference.values:
             value = reference.value(cell.variant, cell.task, cell.algorithm)
             row["reference"] = math.nan if value is None else value
         rows.append(row)
-    return {name: [row[name] for row in rows] for name in rows[0]}
+    return rows
 
 
 def score_matrices(cells: Cells, variant: str) -> dict[str, Array]:
@@ -165,27 +159,18 @@ def score_matrices(cells: Cells, variant: str) -> dict[str, Array]:
     return statistics.normalized(scores, everything.min(axis=0), everything.max(axis=0))
 
 
-def aggregate_tables(cells: Cells) -> dict[str, dict[str, list[Any]]]:
-    """Returns the columns of the tables over all tasks: interquartile means and probabilities of improvement."""
-    total: list[tuple[Any, ...]] = []
-    pairs: list[tuple[Any, ...]] = []
+def aggregate_tables(cells: Cells) -> dict[str, Rows]:
+    """Returns the tables over all tasks: interquartile means and probabilities of improvement."""
+    total: Rows = []
+    pairs: Rows = []
     for variant in dict.fromkeys(cell.variant for cell in cells):
         scores = score_matrices(cells, variant)
         for name, values in scores.items():
-            middle = float(statistics.interquartile_mean(values))
-            low, high = statistics.bootstrap_interval(values, statistics.interquartile_mean, np.random.default_rng(0))
-            total.append((variant, name, *values.shape, middle, float(low), float(high)))
+            middle, low, high = map(float, estimate(statistics.interquartile_mean, values))
+            row = {"variant": variant, "algorithm": name, "runs": len(values), "tasks": values.shape[1]}
+            total.append({**row, "iqm": middle, "low": low, "high": high})
         for x, y in itertools.permutations(scores, 2):
-            chance = float(statistics.probability_of_improvement(scores[x], scores[y]))
-            low, high = statistics.bootstrap_interval(
-                [scores[x], scores[y]], statistics.probability_of_improvement, np.random.default_rng(0)
-            )
-            pairs.append((variant, x, y, chance, float(low), float(high)))
-    if not total:
-        return {}
-    total_names = "variant algorithm runs tasks iqm low high".split()
-    pair_names = "variant first second probability low high".split()
-    return {
-        "aggregate": dict(zip(total_names, map(list, zip(*total, strict=True)), strict=True)),
-        "improvement": dict(zip(pair_names, map(list, zip(*pairs, strict=True)), strict=True)),
-    }
+            chance, low, high = map(float, estimate(statistics.probability_of_improvement, scores[x], scores[y]))
+            row = {"variant": variant, "first": x, "second": y}
+            pairs.append({**row, "probability": chance, "low": low, "high": high})
+    return {"aggregate": total, "improvement": pairs} if total else {}

@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mqe_jax.study import statistics
-from mqe_jax.study.estimates import REWARD, Array, Cells, band, evaluated, score_matrices
-from mqe_jax.study.reference import Reference
-from mqe_jax.study.runs import Cell, Run
+from mqe_jax.study.estimates import Array, Cells, band, estimate, evaluated, score_matrices
+from mqe_jax.study.runs import Cell, Reference, Run
+from mqe_jax.study.statistics import performance_profile
 
 _INK, _PALE = "#23252b", "#8a8f99"
-_COLORS = {"jrpo": "#4f86e0", "mat": "#3fae49", "mappo": "#b5316f"}
+_COLORS = {"jrpo": "#4f86e0", "mappo": "#b5316f", "mat": "#3fae49"}
 _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
-_COLORS_OF_TERMS = (_COLORS["jrpo"], _COLORS["mappo"], _COLORS["mat"])
 _DASHES = (0, (4, 3))
 _COLORS_OF_VARIANTS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
 LINES = (*_COLORS_OF_VARIANTS, _PALE)
@@ -25,12 +23,9 @@ LINES = (*_COLORS_OF_VARIANTS, _PALE)
 
 
 def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure((width, height), dpi=105, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure((width, height), dpi=105, layout="constrained")
 
 
 def _png(figure: Any) -> bytes:
@@ -65,7 +60,7 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
             for algorithm in algorithms:
                 runs = cells.get(Cell(task, algorithm, variant))
                 if runs is not None:
-                    _draw_band(axes, runs, REWARD, _color(algorithm, algorithms), algorithm.upper())
+                    _draw_band(axes, runs, _color(algorithm, algorithms), algorithm.upper())
             if not axes.lines:
                 axes.text(0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes)
                 axes.set_xticks([])
@@ -73,7 +68,8 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
             _draw_values(axes, {name: x for name, x in values.items() if name in algorithms})
             _style_axes(axes, reference.tasks.get(task, task))
         block.suptitle(reference.variants.get(variant, variant), color=_INK, fontsize=11)
-    _legend(figure, algorithms, reference.label if reference.values else None)
+    colors = {name.upper(): _color(name, algorithms) for name in algorithms}
+    _key(figure, colors, reference.label if reference.values else None)
     return _png(figure)
 
 
@@ -112,10 +108,10 @@ def draw_evaluations(
             axes.set_axis_off()
             continue
         if task in pale:
-            _draw_band(axes, pale[task], REWARD, _PALE, "")
+            _draw_band(axes, pale[task], _PALE, "")
         drawn = [cell for cell in chosen if cell.task == task]
         for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_VARIANTS)):
-            _draw_band(axes, chosen[cell], REWARD, color, f"{cell.algorithm.upper()}, {cell.variant}")
+            _draw_band(axes, chosen[cell], color, f"{cell.algorithm.upper()}, {cell.variant}")
         if task in best:
             _draw_values(axes, {"best": best[task]})
         _style_axes(axes, reference.tasks.get(task, task))
@@ -128,10 +124,15 @@ def draw_evaluations(
     return _png(figure)
 
 
-def _draw_band(axes: Any, runs: Sequence[Run], column: str, color: str, label: str) -> None:
-    steps, middle, low, high = band(runs, column)
-    axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.15, lw=0)
-    axes.plot(steps / 1e6, middle, color=color, lw=1.5, label=label)
+def _draw_band(axes: Any, runs: Sequence[Run], color: str, label: str) -> None:
+    steps, *values = band(runs)
+    _draw_interval(axes, steps / 1e6, values, color, label)
+
+
+def _draw_interval(axes: Any, x: Array, values: Sequence[Array], color: str, label: str = "") -> None:
+    """Draws a line and its interval: `values` are middle, low and high, each of x's shape."""
+    axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, lw=0)
+    axes.plot(x, values[0], color=color, lw=1.5, label=label)
 
 
 def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> None:
@@ -142,10 +143,6 @@ def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> N
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _legend(figure: Any, algorithms: Sequence[str], dashed: str | None = None) -> None:
-    _key(figure, {name.upper(): _color(name, algorithms) for name in algorithms}, dashed)
 
 
 def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
@@ -164,20 +161,15 @@ def draw_profiles(cells: Cells, reference: Reference) -> bytes:
     algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
     thresholds = np.linspace(0.0, 1.0, 101)
 
-    def profile(scores: Array) -> Array:
-        return statistics.performance_profile(scores, thresholds)
-
     figure = _figure(max(5.0, 4.2 * len(variants)), 3.4)
     for axes, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
         for name, scores in score_matrices(cells, variant).items():
-            low, high = statistics.bootstrap_interval(scores, profile, np.random.default_rng(0))
-            color = _color(name, algorithms)
-            axes.fill_between(thresholds, low, high, color=color, alpha=0.15, lw=0)
-            axes.plot(thresholds, profile(scores), color=color, lw=1.5)
+            values = estimate(lambda x: performance_profile(x, thresholds), scores)
+            _draw_interval(axes, thresholds, values, _color(name, algorithms))
         _style_axes(axes, reference.variants.get(variant, variant), "fraction of runs above")
         axes.set_xlabel("score, fraction of each task's range", fontsize=8)
         axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
-    _legend(figure, algorithms)
+    _key(figure, {name.upper(): _color(name, algorithms) for name in algorithms}, None)
     return _png(figure)
 
 
@@ -185,12 +177,10 @@ def draw_terms(runs: Sequence[Run], terms: Mapping[str, str], title: str, last: 
     """Returns the curves of reward terms, given their labels by column, up to `last` environment steps."""
     figure = _figure(5.2, 3.2)
     axes = figure.add_subplot()
-    for (column, label), color in zip(terms.items(), itertools.cycle(_COLORS_OF_TERMS)):
-        steps, *estimate = band(runs, column)
+    for (column, label), color in zip(terms.items(), itertools.cycle(_COLORS.values())):
+        steps, *values = band(runs, column)
         kept = steps <= last
-        steps, (middle, low, high) = steps[kept], (x[kept] for x in estimate)
-        axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.15, lw=0)
-        axes.plot(steps / 1e6, middle, color=color, lw=1.5, label=label)
+        _draw_interval(axes, steps[kept] / 1e6, [x[kept] for x in values], color, label)
     _style_axes(axes, title, "reward per step")
     axes.legend(frameon=False, fontsize=8)
     return _png(figure)

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mqe_jax.files import write_atomically
-from mqe_jax.study.estimates import LAST, aggregate_tables, curves_table, evaluated, final_table, group
+from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
-from mqe_jax.study.marl_eval import to_marl_eval
-from mqe_jax.study.reference import Reference
-from mqe_jax.study.runs import Run, number, read_runs, table
+from mqe_jax.study.runs import PLAIN, REWARD, Reference, Run, number, read_runs, table
 
 
 def report(folder: Path, reference: Reference | None = None) -> list[Path]:
@@ -31,9 +29,9 @@ def report(folder: Path, reference: Reference | None = None) -> list[Path]:
 def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> list[Path]:
     """Writes the report of runs into a folder; returns the files."""
     cells = group(runs, reference)
-    finals = final_table(cells, reference)
+    finals = final_rows(cells, reference)
     files: dict[str, bytes] = {
-        "curves.csv": curves_table(cells).encode(),
+        "curves.csv": table(curve_rows(cells)).encode(),
         "final.csv": table(finals).encode(),
         "curves.png": draw_curves(cells, reference),
     }
@@ -43,9 +41,9 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
         files["evaluations.png"] = draw_evaluations({cell: cells[cell] for cell in with_evaluations}, reference)
         text += ["![Evaluations during training](evaluations.png)", ""]
     aggregates = aggregate_tables(cells)
-    for name, columns in aggregates.items():
-        files[f"{name}.csv"] = table(columns).encode()
-        text += [f"## {_HEADINGS[name]}", "", markdown(columns), ""]
+    for name, rows in aggregates.items():
+        files[f"{name}.csv"] = table(rows).encode()
+        text += [f"## {_HEADINGS[name]}", "", markdown(rows), ""]
     if aggregates:
         files["profiles.png"] = draw_profiles(cells, reference)
         text += ["![Performance profiles](profiles.png)", ""]
@@ -68,25 +66,53 @@ _HEADINGS = {
 }
 
 
-def markdown(columns: Mapping[str, Sequence[Any]]) -> str:
-    """Returns columns as a Markdown table; NAME, NAME_low and NAME_high (or low and high) share one column."""
-    hidden = {name for name in columns if name in ("low", "high") or name.endswith(("_low", "_high"))}
-    shown = [name for name in columns if name not in hidden]
-    lines = ["| " + " | ".join(shown) + " |", "|" + "---|" * len(shown)]
-    for i in range(len(next(iter(columns.values())))):
-        cells = []
-        for name in shown:
-            item = columns[name][i]
-            text = item if isinstance(item, str) else _short(item)
-            ends = ("low", "high") if name in ("iqm", "probability") else (f"{name}_low", f"{name}_high")
-            if ends[0] in columns and text:
-                text += f" [{_short(columns[ends[0]][i])}, {_short(columns[ends[1]][i])}]"
-            cells.append(text)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def markdown(rows: Rows, names: Mapping[str, str] | None = None) -> str:
+    """Returns rows as a Markdown table of the columns `names`, with these headings; of all columns by default.
+
+    NAME, NAME_low and NAME_high (or low and high) share one column.
+    """
+    ends = [name for name in rows[0] if name in ("low", "high") or name.endswith(("_low", "_high"))]
+    names = names or {name: name for name in rows[0] if name not in ends}
+    lines = [list(names.values()), ["---"] * len(names), *([_shown(row, name) for name in names] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _shown(row: Mapping[str, Any], name: str) -> str:
+    """Returns an entry of a table with its interval; success as percentages, nothing for NaN."""
+    value = row[name]
+    if isinstance(value, str):
+        return value
+    if not math.isfinite(value):
+        return ""
+    low, high = ("low", "high") if name in ("iqm", "probability") else (f"{name}_low", f"{name}_high")
+    three = [f"{x:.1%}" if name == "success" else _short(x) for x in (value, row.get(low, 0.0), row.get(high, 0.0))]
+    return f"{three[0]} [{three[1]}, {three[2]}]" if low in row else three[0]
 
 
 def _short(value: float) -> str:
-    if not math.isfinite(value):
-        return ""
     return number(value) if float(value).is_integer() else f"{value:.3g}"
+
+
+def to_marl_eval(runs: Iterable[Run]) -> dict[str, Any]:
+    """Returns the nested mapping that the package `marl-eval` reads (Gorsane et al. 2022, arXiv 2209.10485).
+
+    Environment -> task -> algorithm -> run -> step_k -> {step_count, metric: [value]}, absolute_metrics. Runs without
+    evaluations are left out; a variant is a task of its own, TASK+VARIANT. Each list holds one value, the mean over the
+    evaluation's episodes under sampled actions; the format allows this instead of one value per episode.
+    """
+    tree: dict[str, Any] = {}
+    for run in runs:
+        if run.absolute is None:
+            continue
+        steps: dict[str, Any] = {
+            f"step_{i}": {"step_count": point["env_steps"], **_metrics(point)}
+            for i, point in enumerate(run.evaluations, start=1)
+        }
+        steps["absolute_metrics"] = _metrics(run.absolute)
+        task = run.cell.task if run.cell.variant == PLAIN else f"{run.cell.task}+{run.cell.variant}"
+        tree.setdefault(task, {}).setdefault(run.cell.algorithm, {})[f"seed_{run.seed}"] = steps
+    return {"mqe": tree}
+
+
+def _metrics(point: Mapping[str, Any]) -> dict[str, list[float]]:
+    return {name: [point["sampled"][name]] for name in (REWARD, "success_rate") if name in point["sampled"]}

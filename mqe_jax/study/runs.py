@@ -1,12 +1,12 @@
-"""Finished runs of a sweep, read from the run folders FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV."""
+"""Finished runs of a sweep, from FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV; reference values."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
+from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import POLICY_FILE
@@ -124,11 +125,43 @@ def number(value: float, digits: int = DIGITS) -> str:
     return str(int(value)) if whole else f"{value:.{digits}g}"
 
 
-def table(columns: Mapping[str, Any], digits: int = DIGITS) -> str:
-    """Returns columns of equal length as CSV text; numbers as `number` writes them."""
+def table(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: int = DIGITS) -> str:
+    """Returns rows as CSV text, of the columns `names` or those of the first row; numbers as `number` writes them."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([item if isinstance(item, str) else number(item, digits) for item in row])
+    writer = csv.DictWriter(text, list(names or rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: x if isinstance(x, str) else number(x, digits) for name, x in row.items()})
     return text.getvalue()
+
+
+@record
+class Reference:
+    """Values that a report compares with, such as a paper's, and the titles and order of its cells."""
+
+    label: str = "reference"
+    """What the values are, in the legend of figures."""
+    values: Mapping[str, Any] = field(default_factory=dict)
+    """Variant -> task -> algorithm -> average step reward."""
+    variants: Mapping[str, Any] = field(default_factory=dict)
+    """Titles of variants, in their order; others follow."""
+    tasks: Mapping[str, Any] = field(default_factory=dict)
+    """Titles of tasks, in their order; others follow."""
+    algorithms: tuple[str, ...] = ()
+    """Algorithms in their order; others follow."""
+
+    def value(self, variant: str, task: str, algorithm: str) -> float | None:
+        """Returns the reference value of a cell, or None."""
+        return self.values.get(variant, {}).get(task, {}).get(algorithm)
+
+
+def load_reference(path: Path) -> Reference:
+    """Reads a YAML file with the fields of `Reference`.
+
+    Raises:
+        InputError: naming the file, for invalid content.
+    """
+    try:
+        return build(Reference, load_yaml(path))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

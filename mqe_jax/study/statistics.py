@@ -52,7 +52,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
 
 
 def bootstrap_interval(
-    scores: Array | Sequence[Array],
+    scores: Sequence[Array],
     statistic: Callable[..., Array],
     random: Random,
     *,
@@ -61,13 +61,13 @@ def bootstrap_interval(
 ) -> tuple[Array, Array]:
     """Returns the bounds of a percentile bootstrap interval; runs are resampled within each task.
 
-    Several score arrays (of one statistic, such as `probability_of_improvement`) are resampled independently.
+    `scores` are the statistic's arguments, resampled independently where there are several.
     Tasks are the strata and stay fixed. With a single run both bounds equal the statistic.
 
     Raises:
         InputError: if scores are not (runs, tasks), or not finite.
     """
-    groups = [np.asarray(group, np.float64) for group in ([scores] if isinstance(scores, np.ndarray) else scores)]
+    groups = [np.asarray(group, np.float64) for group in scores]
     for group in groups:
         if group.ndim != 2 or not group.size:
             raise InputError(f"scores: shape {group.shape} is not allowed; it must be (runs, tasks), both at least 1")

@@ -1,15 +1,18 @@
-"""Measures how far one robot, and two side by side, push the box of Push Box in three seconds."""
+"""Measures what a partner adds: how far one robot and two push the box, and the seesaw with and without a partner."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 import mqe_jax
-from mqe_jax.envs import QuadrupedEnv, State
-from mqe_jax.planners.steering import go_to
+from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
+from mqe_jax.planners.cooperative import plan_seesaw, plan_seesaw_alone
+from mqe_jax.planners.steering import Observation, go_to
+from mqe_jax.train.evaluate import evaluate
 
 NUM_ENVS, SECONDS = 32, 3.0
 
@@ -45,12 +48,21 @@ def pushed(robots: int, num_envs: int = NUM_ENVS) -> float:
     return float(jnp.mean(jax.jit(jax.vmap(way))(jax.random.split(jax.random.PRNGKey(0), num_envs))))
 
 
+def climbed(plan: Callable[[Observation], jax.Array], episodes: int = 200, num_envs: int = 100) -> float:
+    """Returns the fraction of episodes of Climb on Seesaw that end with a robot on the platform."""
+    env = VectorEnv(mqe_jax.make("go1seesaw", num_envs=num_envs), num_envs)
+    layout = env.env.observation_layout
+    act = jax.vmap(lambda obs: plan(layout.split(obs)))
+    result = evaluate(env, lambda obs, memory, _: (act(obs), memory), episodes, jax.random.PRNGKey(0))
+    return result.success_rate
+
+
 def main() -> None:
     """Runs the example."""
     for robots in (1, 2):
-        print(
-            f"{robots} robot(s): {pushed(robots):.2f} m in {SECONDS:g} s, mean of {NUM_ENVS} environments", flush=True
-        )
+        print(f"box, {robots} robot(s): {pushed(robots):.2f} m in {SECONDS:g} s", flush=True)
+    for name, plan in (("with a partner", plan_seesaw), ("alone", plan_seesaw_alone)):
+        print(f"seesaw, {name}: on the platform in {climbed(plan):.1%} of 200 episodes", flush=True)
 
 
 if __name__ == "__main__":
