@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
-from mqe_jax.viz import cameras, clips, geometry, gl, recording, render
+from mqe_jax.viz import cameras, clips, geometry, recording, render
 from tests.states import made, placed
 
 
@@ -140,9 +140,9 @@ def test_clips_land_whole_without_gl(
 
 
 def test_gl_draws_robots_walls_and_floor(env: FakeEnv, episode: recording.Episode) -> None:
-    if gl.gl_backend() is None:
+    if render.gl_backend() is None:
         pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
-    frames = list(render.render_frames(env, episode.every(10), size=(160, 90)))
+    frames = list(render.render_frames(env, episode.cut(slice(None, None, 10)), size=(160, 90)))
     assert len(frames) == 2 and frames[0].shape == (90, 160, 3)
     red, green, blue = np.moveaxis(frames[-1].astype(int), -1, 0)
     assert np.count_nonzero((blue > red + 60) & (blue > green + 60)) > 5
@@ -176,9 +176,9 @@ def test_bad_outputs_are_refused(tmp_path: Path, name: str, said: str) -> None:
 
 
 def test_the_models_own_settings_are_left_alone(env: FakeEnv, episode: recording.Episode) -> None:
-    if gl.gl_backend() is None:
+    if render.gl_backend() is None:
         pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
     before = env.mj_model.vis.global_.offwidth
-    list(render.render_frames(env, episode.every(10), size=(1000, 80)))
+    list(render.render_frames(env, episode.cut(slice(None, None, 10)), size=(1000, 80)))
     assert env.mj_model.vis.global_.offwidth == before
     assert isinstance(env.mj_model, mujoco.MjModel)

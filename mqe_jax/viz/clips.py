@@ -8,8 +8,10 @@ import tempfile
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import replacing
@@ -52,15 +54,8 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     with replacing(path) as temporary:
         if suffix == ".mp4":
             _write_mp4(temporary, frames, fps)
-        elif suffix == ".gif":
-            _write_gif(temporary, list(frames), fps)
-        elif suffix == ".webp":
-            _write_webp(temporary, list(frames), fps)
         else:
-            from PIL import Image
-
-            *_, frame = frames
-            Image.fromarray(frame).save(temporary)
+            _write_images(temporary, [Image.fromarray(frame) for frame in frames], suffix, fps)
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
@@ -85,20 +80,18 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
         raise InputError(f"output: ffmpeg could not write the clip ({' '.join(message.split())})")
 
 
-def _write_gif(path: Path, frames: list[np.ndarray], fps: float) -> None:
-    """Writes a GIF with one palette and no dithering, for small files without flicker."""
-    from PIL import Image
+def _write_images(path: Path, images: list[Image.Image], suffix: str, fps: float) -> None:
+    """Writes the last image as PNG, or all as a GIF or a WebP, which has about 40% of a GIF's size.
 
-    sample = np.concatenate(frames[:: max(1, len(frames) // 6)][:8])
-    palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
-    images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)
-
-
-def _write_webp(path: Path, frames: list[np.ndarray], fps: float) -> None:
-    """Writes an animated WebP, which browsers support and which has about 40% of a GIF's size."""
-    from PIL import Image
-
-    images = [Image.fromarray(frame) for frame in frames]
-    options = {"quality": 30, "method": 6, "minimize_size": True}
+    A GIF has one palette and no dithering, for small files without flicker.
+    """
+    if suffix == ".png":
+        images[-1].save(path)
+        return
+    options: dict[str, Any] = {"quality": 30, "method": 6, "minimize_size": True}
+    if suffix == ".gif":
+        sample = np.concatenate([np.asarray(image) for image in images[:: max(1, len(images) // 6)][:8]])
+        palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
+        images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+        options = {"optimize": True}
     images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, **options)

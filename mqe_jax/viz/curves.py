@@ -26,12 +26,10 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
 
 def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = None) -> None:
     """Plots average step reward (and success) of runs over environment steps, and writes the image atomically."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     tables = [read_curve(run / "metrics.csv") for run in runs]
     figure = Figure((7.2, 4.2), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for table in tables:
         steps, reward = table["env_steps"] / 1e6, table[REWARD]

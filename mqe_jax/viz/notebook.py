@@ -15,36 +15,23 @@ from mqe_jax.viz.recording import Episode, best, record
 from mqe_jax.viz.render import render_episode
 
 
-class Clip:
-    """A clip, displayed inline when a notebook cell returns it."""
+def clip(env: Any, episode: Episode, size: tuple[int, int] = (480, 270), fps: float = 25.0) -> Any:
+    """Returns an episode as inline HTML: H.264 with imageio-ffmpeg (extra `render`), else a GIF."""
+    from IPython.display import HTML
 
-    data: bytes
-    """The file's content."""
-    kind: str
-    """Mp4 or gif."""
-
-    def __init__(self, data: bytes, kind: str) -> None:
-        self.data, self.kind = data, kind
-
-    def _repr_html_(self) -> str:
-        text = base64.b64encode(self.data).decode("ascii")
-        if self.kind == "gif":
-            return f'<img src="data:image/gif;base64,{text}">'
-        return f'<video controls loop autoplay muted src="data:video/mp4;base64,{text}"></video>'
-
-
-def clip(env: Any, episode: Episode, size: tuple[int, int] = (480, 270), fps: float = 25.0) -> Clip:
-    """Returns an episode as an inline clip: H.264 with imageio-ffmpeg (extra `render`), else a GIF."""
     kind = "mp4" if find_spec("imageio_ffmpeg") is not None else "gif"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"clip.{kind}"
         render_episode(env, episode, path, size=size, fps=fps if kind == "mp4" else fps / 2)
-        return Clip(path.read_bytes(), kind)
+        data = base64.b64encode(path.read_bytes()).decode("ascii")
+    if kind == "gif":
+        return HTML(f'<img src="data:image/gif;base64,{data}">')
+    return HTML(f'<video controls loop autoplay muted src="data:video/mp4;base64,{data}"></video>')
 
 
 def play(
     env: Any, act: Act, memory: Any = (), *, episodes: int = 1, seconds: float = 20.0, seed: int = 0, **options: Any
-) -> Clip:
+) -> Any:
     """Runs episodes under a batched policy and returns the best one as an inline clip.
 
     Args:

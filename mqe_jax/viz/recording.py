@@ -1,6 +1,6 @@
 """Recording of episodes as numpy arrays."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -30,16 +30,10 @@ class Episode:
     def __len__(self) -> int:
         return len(self.qpos)
 
-    def every(self, n: int) -> "Episode":
-        """Returns every n-th frame."""
-        kept = slice(None, None, n)
-        return replace(
-            self,
-            qpos=self.qpos[kept],
-            mocap_pos=self.mocap_pos[kept],
-            mocap_quat=self.mocap_quat[kept],
-            dt=self.dt * n,
-        )
+    def cut(self, frames: slice) -> "Episode":
+        """Returns the episode with a part of its frames, such as every n-th."""
+        poses = (x[frames] for x in (self.qpos, self.mocap_pos, self.mocap_quat))
+        return Episode(*poses, self.dt * (frames.step or 1), self.success, self.reward)
 
 
 def record(
@@ -57,7 +51,7 @@ def record(
     """
     reset_key, act_key = jax.random.split(key)
 
-    def frame(state: Any) -> tuple[jax.Array, ...]:
+    def poses(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
@@ -67,29 +61,28 @@ def record(
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))
         success = state.metrics.get("success", jnp.zeros_like(reward))
-        return (state, memory), (*frame(state), done, reward, success)
+        return (state, memory), (*poses(state), done, reward, success)
 
     chunk = jax.jit(lambda carry, keys: jax.lax.scan(one_step, carry, keys))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, episodes))
-    first = [np.asarray(x)[None] for x in frame(state)]
-    rows: list[list[np.ndarray]] = []
+    first = [np.asarray(x)[None] for x in poses(state)]
+    rows: list[Any] = []
     steps, length = max(1, round(seconds / env.dt)), 50
     carry = (state, memory)
     for index in range(-(-steps // length)):
         keys = jax.random.split(jax.random.fold_in(act_key, index), length)
         carry, out = chunk(carry, keys)
-        rows.append([np.asarray(x) for x in out])
+        rows.append(jax.device_get(out))
         if np.concatenate([row[3] for row in rows]).any(0).all():
             break
-    columns = [np.concatenate([row[i] for row in rows])[:steps] for i in range(6)]
-    done, reward, success = columns[3:]
+    *frames, done, reward, success = (np.concatenate(column)[:steps] for column in zip(*rows, strict=True))
+    frames = [np.concatenate(pair) for pair in zip(first, frames, strict=True)]
     recorded = []
     for i in range(episodes):
         last = int(done[:, i].argmax()) if done[:, i].any() else len(done) - 1
-        poses = [np.concatenate([f, c])[: last + 2, i] for f, c in zip(first, columns[:3], strict=True)]
         won = float(success[last, i]) if done[last, i] else 0.0
         mean = float(reward[: last + 1, i].mean())
-        recorded.append(Episode(poses[0], poses[1], poses[2], float(env.dt), won, mean))
+        recorded.append(Episode(*(x[: last + 2, i] for x in frames), float(env.dt), won, mean))
     return recorded
 
 

@@ -1,21 +1,98 @@
-"""Frames, clips and images of an episode."""
+"""Frames, clips and images of an episode: by `mujoco.Renderer` (EGL, then OSMesa), or from above by matplotlib."""
 
+import contextlib
+import os
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
+from mqe_jax.interrupts import child
 from mqe_jax.viz.cameras import Camera, cameras
 from mqe_jax.viz.clips import check_output, write_clip
-from mqe_jax.viz.geometry import rendering_model
-from mqe_jax.viz.gl import draw_gl, gl_backend
+from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.top_view import draw_top
 
 GL_PACKAGES = "libegl1 libgl1-mesa-dri (Debian, Ubuntu)"
+_PROBE = """
+import mujoco
+context = mujoco.GLContext(64, 64)
+context.make_current()
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value).free()
+context.free()
+"""
+
+
+@cache
+def gl_backend() -> str | None:
+    """Returns the name of a working GL library (`egl` or `osmesa`), or None.
+
+    Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
+    `MUJOCO_GL`, where set, is the only candidate.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
+    for name in [chosen] if chosen else ["egl", "osmesa"]:
+        if name not in ("egl", "osmesa", "glfw"):
+            return None
+        environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": name}
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            with child([sys.executable, "-c", _PROBE], env=environment, **quiet) as process:
+                if process.wait(60) == 0:
+                    return name
+    return None
+
+
+def _draw_gl(
+    model: mujoco.MjModel, episode: Episode, cameras: Sequence[Camera], size: tuple[int, int], backend: str
+) -> Iterator[np.ndarray]:
+    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera for each."""
+    vis = model.vis
+    vis.global_.offwidth, vis.global_.offheight = size
+    vis.quality.shadowsize, vis.quality.offsamples = 2048, 4
+    # One directional light and a headlight, together below saturation on a pale floor.
+    vis.headlight.ambient[:] = 0.38
+    vis.headlight.diffuse[:] = 0.22
+    vis.headlight.specular[:] = 0.0
+    # Shadows cover the scene: MuJoCo casts them around the light's position, up to `shadowclip` extents.
+    low, high = extent(model, episode)
+    model.stat.extent = float(np.linalg.norm(high - low) / 2)
+    vis.map.shadowclip = 1.0
+    vis.map.znear, vis.map.zfar = 0.1, 10.0  # extents; a wider range causes z-fighting
+    if model.nlight:
+        # Tilted along one axis only: otherwise the software renderer draws stripes on the floor.
+        model.light_dir[0] = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
+        model.light_pos[0] = (low + high) / 2 - 2 * model.stat.extent * model.light_dir[0]
+        model.light_diffuse[:] = 0.45
+        model.light_specular[:] = 0.05
+    option = mujoco.MjvOption()
+    option.geomgroup[COLLISION_GROUP] = 0
+    option.sitegroup[:] = 0
+    view = mujoco.MjvCamera()
+    view.type = mujoco.mjtCamera.mjCAMERA_FREE
+    data = mujoco.MjData(model)
+    # The backend is chosen here, whatever MUJOCO_GL was at the import of MuJoCo.
+    os.environ["MUJOCO_GL"] = backend
+    if os.environ.get("PYOPENGL_PLATFORM", backend) != backend:
+        del os.environ["PYOPENGL_PLATFORM"]
+    gl_context = import_module("mujoco.rendering.classic.gl_context")
+    gl_context.GLContext = import_module(f"mujoco.{backend}").GLContext  # type: ignore[attr-defined]
+    with mujoco.Renderer(model, size[1], size[0]) as renderer:
+        for index, camera in enumerate(cameras):
+            view.lookat[:] = camera.lookat
+            view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
+            pose(model, data, episode, index)
+            mujoco.mj_camlight(model, data)
+            renderer.update_scene(data, view, option)
+            yield renderer.render()
 
 
 def render_frames(
@@ -32,11 +109,10 @@ def render_frames(
     `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
     model = rendering_model(env.mj_model, episode)
-    if backend == "auto":
-        backend = gl_backend()
+    backend = gl_backend() if backend == "auto" else backend
     if backend is None:
         return draw_top(model, episode, size)
-    return draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
+    return _draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
 
 
 def render_episode(
@@ -60,29 +136,21 @@ def render_episode(
     """
     check_output(path)
     suffix = path.suffix.lower()
-    size = size or {".mp4": (960, 540), ".webp": (480, 270), ".gif": (480, 270), ".png": (1280, 720)}[suffix]
-    fps = fps or {".mp4": 25.0, ".webp": 12.5, ".gif": 12.5, ".png": 1.0}[suffix]
-    if backend == "auto":
-        backend = gl_backend()
+    size = size or {".mp4": (960, 540), ".png": (1280, 720)}.get(suffix, (480, 270))
+    fps = fps or (25.0 if suffix == ".mp4" else 12.5)
+    backend = gl_backend() if backend == "auto" else backend
     if backend is None:
-        print(
-            f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}",
-            file=sys.stderr,
-        )
+        text = f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}"
+        print(text, file=sys.stderr)
     aspect = size[0] / size[1]
     if suffix == ".png":
         views = cameras(rendering_model(env.mj_model, episode), episode, view or "scene", aspect)
         shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
         if backend is not None:
             views = views[shown : shown + 1]
-            episode = replace(
-                episode,
-                qpos=episode.qpos[shown : shown + 1],
-                mocap_pos=episode.mocap_pos[shown : shown + 1],
-                mocap_quat=episode.mocap_quat[shown : shown + 1],
-            )
+            episode = episode.cut(slice(shown, shown + 1))
     else:
-        episode = episode.every(max(1, round(speed / (fps * episode.dt))))
+        episode = episode.cut(slice(None, None, max(1, round(speed / (fps * episode.dt)))))
         fps = speed / episode.dt
         views = cameras(rendering_model(env.mj_model, episode), episode, view or "follow", aspect)
     write_clip(path, render_frames(env, episode, views, size, backend), fps)

@@ -4,27 +4,10 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
-
-
-def _outline(points: np.ndarray) -> np.ndarray:
-    """Returns the convex hull (K, 2) of points (N, 2), counter-clockwise."""
-    ordered = sorted(map(tuple, np.round(points, 6)))
-
-    def half(points: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        chain: list[tuple[float, ...]] = []
-        for p in points:
-            while len(chain) > 1:
-                (ax, ay), (bx, by) = chain[-2], chain[-1]
-                if (bx - ax) * (p[1] - ay) - (by - ay) * (p[0] - ax) > 0:
-                    break
-                chain.pop()
-            chain.append(p)
-        return chain[:-1]
-
-    return np.array(half(ordered) + half(ordered[::-1]))
 
 
 def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
@@ -58,7 +41,8 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     for index in range(len(episode)):
         pose(model, data, episode, index)
         for geom, patch in scenery:
-            patch.set_xy(_outline(box_corners(model, data, geom)[:, :2]))
+            points = box_corners(model, data, geom)[:, :2]
+            patch.set_xy(points[ConvexHull(points).vertices])
         for body, patch, trail, way in robots:
             rotation = data.xmat[body].reshape(3, 3)
             yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
