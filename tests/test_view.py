@@ -73,14 +73,14 @@ def stage() -> Iterator[Any]:
     pytest.importorskip("mjviser")
     import viser
 
-    from mqe_jax.view.session import Frame
     from mqe_jax.view.stage import Stage
+    from mqe_jax.viz.recording import Episode
 
     env = make("go1gate", impl="c", control="position", num_envs=3)
     data = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3)).data
-    frame = Frame(np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat))
+    frame = Episode(np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat), env.dt)
     server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
-    yield SimpleNamespace(env=env, frame=frame, stage=Stage(server, env, frame), server=server)
+    yield SimpleNamespace(env=env, frame=frame, stage=Stage(server, env.mj_model, frame), server=server)
     server.stop()
 
 

@@ -15,8 +15,7 @@ import viser
 from websockets.exceptions import InvalidStatus
 
 from mqe_jax.errors import InputError
-from mqe_jax.view.handshake import authorities, refusal
-from mqe_jax.view.messages import HOLD_RATE
+from mqe_jax.view.messages import HOLD_RATE, authorities, refusal
 from mqe_jax.view.panel import Panel
 from mqe_jax.view.server import open_server
 

@@ -1,4 +1,4 @@
-"""viser's web server, restricted to connections and messages that `handshake` and `messages` accept.
+"""viser's web server, restricted to connections and messages that `messages` accepts.
 
 viser has no setting for this. Written for viser 1.1.1, which starts its server by `websockets.asyncio.server.serve`.
 While viser starts, that name is replaced by a function that adds two documented arguments: `process_request` refuses
@@ -23,8 +23,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mqe_jax.errors import InputError
-from mqe_jax.view.handshake import authorities, refusal
-from mqe_jax.view.messages import MAX_FRAME, RefusedError, UnparsableError, check
+from mqe_jax.view.messages import MAX_FRAME, RefusedError, UnparsableError, authorities, check, refusal
 
 _LINES = 10  # logged per second at most
 _LENGTH = 200  # of a logged line, characters

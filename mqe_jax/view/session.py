@@ -6,26 +6,19 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.train.policy import Policy
+from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")
 """Teleoperation commands: m/s, m/s, rad/s."""
 HOLD_TIME = 0.35
 """Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
-
-
-class Frame(NamedTuple):
-    """Poses of all bodies in N environments, for rendering."""
-
-    qpos: np.ndarray  # (N, nq)
-    mocap_pos: np.ndarray  # (N, n_mocap, 3), m
-    mocap_quat: np.ndarray  # (N, n_mocap, 4) wxyz
 
 
 @dataclass
@@ -128,10 +121,10 @@ class Session:
         self.rewards.append(np.asarray(rewards))
         self.commands.append(np.asarray(commands))
 
-    def frame(self) -> Frame:
-        """Returns the current poses."""
+    def frame(self) -> Episode:
+        """Returns the current poses, those of an environment in each frame."""
         data = self.state.data
-        return Frame(np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat))
+        return Episode(*map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat)), self.env.dt)
 
     def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
         env = self.env

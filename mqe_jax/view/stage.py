@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
-from mqe_jax.view.session import Frame
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
@@ -33,51 +32,62 @@ class Stage:
     bodies: dict[str, int]
     """Ids of the bodies that a camera can follow, by label."""
 
-    def __init__(self, server: Any, env: Any, frame: Frame) -> None:
-        self._server, self._model = server, env.mj_model
+    def __init__(self, server: Any, model: mujoco.MjModel, frame: Episode) -> None:
+        self._server, self._model = server, model
         self._data = mujoco.MjData(self._model)
-        self._count = len(frame.qpos)
-        first = _episode(frame, 0, env.dt)
+        self._count = len(frame)
+        first = frame.cut(slice(1))
         low, high = extent(rendering_model(self._model, first), first)
         self.centre, self.size = (low + high) / 2, high - low
         shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
         self._offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
-        self._dt, self._mocap = env.dt, None
+        self._mocap: np.ndarray | None = None
         self.bodies = followable(self._model)
         self._root = server.scene.add_frame("/world", show_axes=False)
         self._add_floor(low, high)
-        self._fixed, self._moving, self._walls = _sort_geoms(self._model)
-        self._add_fixed()
-        self._batches = [self._add_batch(index, bodies) for index, bodies in enumerate(self._grouped())]
+        fixed, moving, self._walls = _sort_geoms(self._model)
+        still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
+        self._place(still, *self._poses(frame))
+        self._batches = [
+            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in self._grouped(moving)
+        ]
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
 
-    def draw(self, frame: Frame, followed: tuple[int, int] | None = None) -> None:
-        """Renders a frame; `followed` (environment, body) is kept at the origin."""
-        positions = np.zeros((self._count, self._model.nbody, 3))
-        turns = np.zeros((self._count, self._model.nbody, 4))
-        for i in range(self._count):
-            pose(self._model, self._data, _episode(frame, i, self._dt), 0)
-            positions[i], turns[i] = self._data.xpos + self._offset[i], self._data.xquat
+    def draw(self, frame: Episode, followed: tuple[int, int] | None = None) -> None:
+        """Renders the environments' poses; `followed` (environment, body) is kept at the origin."""
+        positions, turns = self._poses(frame)
         with self._server.atomic():
             if followed is not None:
                 x, y, _ = positions[followed]
                 self._root.position = (-x, -y, 0.0)
-            for batch in self._batches:
-                batch.handle.batched_positions = positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
-                batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
+            self._place(self._batches, positions, turns)
             self._draw_walls(frame)
+
+    def _poses(self, frame: Episode) -> tuple[np.ndarray, np.ndarray]:
+        """Returns positions (N, bodies, 3) and quaternions (N, bodies, 4) of all bodies."""
+        positions = np.zeros((self._count, self._model.nbody, 3))
+        turns = np.zeros((self._count, self._model.nbody, 4))
+        for i in range(self._count):
+            pose(self._model, self._data, frame, i)
+            positions[i], turns[i] = self._data.xpos + self._offset[i], self._data.xquat
+        return positions, turns
+
+    def _place(self, batches: list[_Batch], positions: np.ndarray, turns: np.ndarray) -> None:
+        for batch in batches:
+            batch.handle.batched_positions = positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
+            batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
 
     def release(self) -> None:
         """Resets the position of the root frame."""
         self._root.position = (0.0, 0.0, 0.0)
 
-    def _draw_walls(self, frame: Frame) -> None:
+    def _draw_walls(self, frame: Episode) -> None:
         """Renders the moving walls after a change of their poses, clipped at the side walls of the track."""
         if not self._walls or (self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)):
             return
         self._mocap = frame.mocap_pos.copy()
-        boxes = [_wall_boxes(self._model, _episode(frame, i, self._dt), self._walls) for i in range(self._count)]
+        boxes = [_wall_boxes(self._model, frame.cut(slice(i, i + 1)), self._walls) for i in range(self._count)]
         for index, handle in enumerate(self._wall_handles):
             centre, turn, size = (np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3))
             handle.batched_positions = centre + self._offset.astype(np.float32)
@@ -91,31 +101,20 @@ class Stage:
             "/world/floor", color=colour, dimensions=(*side, 0.02), position=(*middle, -0.012), cast_shadow=False
         )
 
-    def _add_fixed(self) -> None:
-        mujoco.mj_kinematics(self._model, self._data)
-        for body, geoms in self._fixed.items():
-            self._server.scene.add_batched_meshes_trimesh(
-                f"/world/fixed/{body}",
-                merge_geoms(self._model, geoms),
-                batched_wxyzs=np.tile(self._data.xquat[body], (self._count, 1)),
-                batched_positions=self._offset + self._data.xpos[body],
-                lod="off",
-            )
-
-    def _grouped(self) -> list[list[int]]:
+    def _grouped(self, moving: dict[int, list[int]]) -> list[list[int]]:
         """Returns the moving bodies, grouped by mesh."""
         groups: dict[bytes, list[int]] = {}
-        for body, geoms in self._moving.items():
+        for body, geoms in moving.items():
             mesh = merge_geoms(self._model, geoms)
             appearance = np.round(mesh.vertices, 5).tobytes() + bytes(mesh.visual.vertex_colors)  # type: ignore[attr-defined]
             groups.setdefault(appearance, []).append(body)
         return list(groups.values())
 
-    def _add_batch(self, index: int, bodies: list[int]) -> _Batch:
+    def _add_batch(self, name: str, geoms: list[int], bodies: list[int]) -> _Batch:
         count = self._count * len(bodies)
         handle = self._server.scene.add_batched_meshes_trimesh(
-            f"/world/moving/{index}",
-            merge_geoms(self._model, self._moving[bodies[0]]),
+            f"/world/{name}",
+            merge_geoms(self._model, geoms),
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             batched_positions=np.zeros((count, 3)),
             lod="off",
@@ -146,11 +145,6 @@ def followable(model: mujoco.MjModel) -> dict[str, int]:
             kind, _, name = model.body(body).name.partition("/")
             labels[f"robot {int(kind[5:]) + 1}" if kind.startswith("robot") else name or kind] = body
     return labels
-
-
-def _episode(frame: Frame, index: int, dt: float) -> Episode:
-    """Returns environment `index` of a frame as an episode of one frame."""
-    return Episode(frame.qpos[index][None], frame.mocap_pos[index][None], frame.mocap_quat[index][None], dt)
 
 
 def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, list[int]], list[int]]:

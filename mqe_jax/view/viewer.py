@@ -37,7 +37,7 @@ class Viewer:
         self.server.gui.configure_theme(
             control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
         )
-        self._stage = Stage(self.server, session.env, session.frame())
+        self._stage = Stage(self.server, session.env.mj_model, session.frame())
         self._panel = Panel(self.server, session, tuple(self._stage.bodies), self._aim)
         camera = self.server.initial_camera
         camera.position, camera.look_at = self._view()
@@ -86,14 +86,10 @@ class Viewer:
 
     def _positions(self) -> np.ndarray:
         """Returns the agents' positions (A, 3), m, in the selected environment."""
-        qpos = self.session.frame().qpos[self._panel.env]
-        return np.stack([qpos[index[:3]] for index in self._bases()])
-
-    def _bases(self) -> np.ndarray:
-        model = self.session.env.mj_model
+        env = self.session.env
         robots = [body for label, body in self._stage.bodies.items() if label.startswith("robot ")]
-        start = model.jnt_qposadr[model.body_jntadr[robots[: self.session.env.num_agents]]]
-        return start[:, None] + np.arange(7)
+        start = env.mj_model.jnt_qposadr[env.mj_model.body_jntadr[robots[: env.num_agents]]]
+        return self.session.frame().qpos[self._panel.env][start[:, None] + np.arange(3)]
 
     def _followed(self) -> tuple[int, int] | None:
         if self._panel.camera == FREE:
