@@ -103,15 +103,12 @@ def reduced(table: dict[str, dict[str, str]]) -> dict[str, set[str]]:
 
 def draw() -> str:
     """Returns the diagram as SVG text: layers as rows, imports as lines from the importing module to the imported."""
-    table, present = reduced(edges()), set(modules())
     width, row, box = 860, 76, 132
-    place: dict[str, tuple[float, float]] = {}
     height = row * len(LAYERS) + 20
-    for level, layer in enumerate(LAYERS):
-        for name in present.intersection(layer):
-            place[name] = (width * ACROSS[name], height - row * (level + 0.5) - 10)
+    levels = {name: level for level, layer in enumerate(LAYERS) for name in layer}
+    place = {n: (width * ACROSS[n], height - row * (levels[n] + 0.5) - 10) for n in modules()}
     lines, boxes = [], []
-    for module, others in sorted(table.items()):
+    for module, others in sorted(reduced(edges()).items()):
         for other in sorted(others):
             (x1, y1), (x2, y2) = place[module], place[other]
             if y1 == y2:
@@ -120,25 +117,20 @@ def draw() -> str:
             else:
                 middle = (y1 + y2) / 2
                 way = f"M{x1:.0f},{y1 + 15:.0f} C{x1:.0f},{middle:.0f} {x2:.0f},{middle:.0f} {x2:.0f},{y2 - 15:.0f}"
-            lines.append(f'<path d="{way}" fill="none" stroke="#8a8f99" stroke-width="1" marker-end="url(#a)"/>')
+            lines.append(f'<path d="{way}" fill="none" stroke="#8a8f99" marker-end="url(#a)"/>')
     for name, (x, y) in sorted(place.items()):
         single = (PACKAGE / f"{name}.py").is_file()
-        label = f"{name}.py" if single else f"{name}/"
-        fill = "#f4f5f7" if single else "#dfeaf8"
+        label, fill = (f"{name}.py", "#f4f5f7") if single else (f"{name}/", "#dfeaf8")
         boxes.append(
             f'<rect x="{x - box / 2:.0f}" y="{y - 15:.0f}" width="{box}" height="30" rx="5" fill="{fill}" '
             f'stroke="#23252b"/><text x="{x:.0f}" y="{y + 5:.0f}" text-anchor="middle">{label}</text>'
         )
-    marker = (
-        '<marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
-        '<path d="M0,0 L8,4 L0,8 z" fill="#8a8f99"/></marker>'
-    )
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        'font-family="monospace" font-size="14" fill="#23252b">'
-    )
-    back = f'<rect width="{width}" height="{height}" fill="white"/>'
-    return "\n".join([head, f"<defs>{marker}</defs>", back, *lines, *boxes, "</svg>"]) + "\n"
+    head = f'''<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" \
+font-family="monospace" font-size="14" fill="#23252b">
+<defs><marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">\
+<path d="M0,0 L8,4 L0,8 z" fill="#8a8f99"/></marker></defs>
+<rect width="{width}" height="{height}" fill="white"/>'''
+    return "\n".join([head, *lines, *boxes, "</svg>"]) + "\n"
 
 
 def main() -> int:

@@ -3,30 +3,30 @@
 `python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE` starts
 one process per checkout and case, waits for compilation, and then times them in turn, so that drifts of the machine's
 speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few
-calls of 50 environment steps, whole step and bare physics. `--pause FILE` stops the process whose id is in FILE while
-it times.
+calls of 50 environment steps, whole step and bare physics.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import csv
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 from statistics import median
-from typing import IO, Any
+from typing import Any
 
 RATES = ("env_steps_per_s", "bare_env_steps_per_s")
 
 
 def work(case: str, steps: int, repeats: int) -> None:
     """Process of one checkout and case: compiles, then answers each line on standard input with one timing."""
+    answer = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever libraries print
+
     import jax
     import jax.numpy as jnp
 
@@ -63,11 +63,6 @@ def work(case: str, steps: int, repeats: int) -> None:
     carry = (jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1))
     data = jax.tree.map(jnp.copy, carry[0].data)
     jax.block_until_ready((whole(carry), bare(data)))
-    answer: IO[str] = (
-        os.fdopen(os.dup(1), "w")
-        if "MQE_BENCH_FD" not in os.environ
-        else os.fdopen(int(os.environ["MQE_BENCH_FD"]), "w")
-    )
     device = jax.devices()[0].device_kind
     print(json.dumps({"ready": mqe_jax.__file__}), file=answer, flush=True)
     for _ in sys.stdin:
@@ -75,105 +70,72 @@ def work(case: str, steps: int, repeats: int) -> None:
         print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=answer, flush=True)
 
 
-class Worker:
-    """A process that times one case in one checkout."""
-
-    def __init__(self, tree: Path, case: str, steps: int, repeats: int) -> None:
-        read, write = os.pipe()
-        path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-        command = [sys.executable, str(Path(__file__).resolve()), "--work", case, str(steps), str(repeats)]
-        self._process = subprocess.Popen(
-            command,
-            cwd=tree,
-            env=os.environ | {"PYTHONPATH": path, "MQE_BENCH_FD": str(write)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            pass_fds=(write,),
-            text=True,
-        )
-        os.close(write)
-        self._answers = os.fdopen(read)
-        self._tree = tree
-
-    def read(self) -> dict[str, Any]:
-        """Waits for the next answer; exits where the process died."""
-        line = self._answers.readline()
-        if not line:
-            raise SystemExit(f"{self._tree}: the benchmark process ended")
-        return json.loads(line)
-
-    def time(self) -> dict[str, Any]:
-        """Times once."""
-        assert self._process.stdin is not None
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
-        return self.read()
-
-    def close(self) -> None:
-        """Ends the process."""
-        self._process.kill()
+def start(tree: Path, case: str, steps: int, repeats: int) -> subprocess.Popen[str]:
+    """Starts the process that times one case in one checkout."""
+    path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    command = [sys.executable, str(Path(__file__).resolve()), "--work", case, str(steps), str(repeats)]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=tree, env=os.environ | {"PYTHONPATH": path}, **pipes)
 
 
-@contextlib.contextmanager
-def paused(file: Path | None) -> Any:
-    """Stops the process whose id is in the file while the block runs."""
-    ids = [int(line) for line in file.read_text().split()] if file is not None and file.is_file() else []
-    for process in ids:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process, signal.SIGSTOP)
-    if ids:
-        time.sleep(2.0)  # until its last kernels are done
-    try:
-        yield
-    finally:
-        for process in ids:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, signal.SIGCONT)
+def read(worker: subprocess.Popen[str]) -> dict[str, Any]:
+    """Waits for the next answer of a process; exits where it died."""
+    assert worker.stdout is not None
+    line = worker.stdout.readline()
+    if not line:
+        raise SystemExit(f"{worker.args}: the benchmark process ended")
+    return json.loads(line)
+
+
+def time_once(worker: subprocess.Popen[str]) -> dict[str, Any]:
+    """Returns one timing."""
+    assert worker.stdin is not None
+    worker.stdin.write("\n")
+    worker.stdin.flush()
+    return read(worker)
 
 
 def main() -> int:
     """Runs the pairs and prints one JSON object per case."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--trees", nargs="+", metavar="NAME=PATH", help="checkouts; ratios are to the first one")
-    parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS", help="with @NAME,NAME: only in those trees")
+    parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS")
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--csv", type=Path)
-    parser.add_argument("--pause", type=Path, metavar="FILE")
     parser.add_argument("--work", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.work:
         work(arguments.work[0], int(arguments.work[1]), int(arguments.work[2]))
         return 0
     trees = dict(pair.split("=", 1) for pair in arguments.trees)
-    workers: dict[tuple[str, str], Worker] = {}
-    for case in arguments.cases:
-        name, _, only = case.partition("@")
-        for tree in only.split(",") if only else trees:
-            workers[name, tree] = Worker(Path(trees[tree]), name, arguments.steps, arguments.repeats)
+    workers = {
+        (case, name): start(Path(tree), case, arguments.steps, arguments.repeats)
+        for case in arguments.cases
+        for name, tree in trees.items()
+    }
     for worker in workers.values():
-        worker.read()
+        read(worker)
     rows: list[dict[str, Any]] = []
-    with paused(arguments.pause):
-        for pair in range(arguments.pairs):
-            for (case, tree), worker in workers.items():
-                rows.append({"case": case, "tree": tree, "pair": pair, **worker.time()})
+    for pair in range(arguments.pairs):
+        for (case, tree), worker in workers.items():
+            rows.append({"case": case, "tree": tree, "pair": pair, **time_once(worker)})
     for worker in workers.values():
-        worker.close()
+        worker.kill()
     if arguments.csv is not None:
         with arguments.csv.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-    for case in dict.fromkeys(row["case"] for row in rows):
+    for case in arguments.cases:
         result: dict[str, Any] = {"case": case}
-        names = [tree for name, tree in workers if name == case]
         for rate in RATES:
-            values = {name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)] for name in names}
+            values = {name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)] for name in trees}
+            first = next(iter(values.values()))
             result[rate] = {name: median(found) for name, found in values.items()}
             result[f"{rate}/ratio"] = {
-                name: round(median(a / b for b, a in zip(values[names[0]], found, strict=True)), 4)
+                name: round(median(a / b for a, b in zip(found, first, strict=True)), 4)
                 for name, found in values.items()
             }
         print(json.dumps(result), flush=True)

@@ -13,25 +13,13 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file
 
-TIMES = {"seconds", "fps"}
 
-
-def columns(run: Path) -> dict[str, list[str]]:
-    """Columns of a run's metrics.csv, as text, without those of times."""
+def content(run: Path) -> dict[str, np.ndarray]:
+    """Returns the columns of a run's metrics.csv, as text, without those of times, and the arrays of its policy."""
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    return {name: [row[name] for row in rows] for name in rows[0] if name not in TIMES}
-
-
-def differences(first: dict[str, list[str]], second: dict[str, list[str]]) -> list[str]:
-    """Returns the columns that differ, with the first differing row."""
-    found = [f"{name}: only in one run" for name in first.keys() ^ second.keys()]
-    for name in first.keys() & second.keys():
-        if len(first[name]) != len(second[name]):
-            found.append(f"{name}: {len(first[name])} and {len(second[name])} rows")
-        pairs = enumerate(zip(first[name], second[name], strict=False))
-        found += [f"{name}: row {row}: {a} and {b}" for row, (a, b) in pairs if a != b][:1]
-    return found
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0] if name not in ("seconds", "fps")}
+    return columns | load_file(run / "policy.safetensors")
 
 
 def main() -> int:
@@ -41,17 +29,17 @@ def main() -> int:
     parser.add_argument("--rename", nargs="*", default=[], metavar="OLD=NEW")
     arguments = parser.parse_args()
     names = dict(pair.split("=", 1) for pair in arguments.rename)
-    tables = [columns(run) for run in arguments.runs]
-    tables[0] = {names.get(name, name): values for name, values in tables[0].items()}
-    found = differences(*tables)
-    policies = [load_file(run / "policy.safetensors") for run in arguments.runs]
-    policies[0] = {names.get(name, name): value for name, value in policies[0].items()}
-    found += [f"policy {name}: only in one run" for name in policies[0].keys() ^ policies[1].keys()]
-    for name in policies[0].keys() & policies[1].keys():
-        if not np.array_equal(policies[0][name], policies[1][name]):
-            found.append(f"policy {name}: differs")
-    rows = len(next(iter(tables[0].values())))
-    print("\n".join(found) or f"equal: {len(tables[0])} metrics x {rows} updates, {len(policies[0])} policy arrays")
+    first, second = map(content, arguments.runs)
+    first = {names.get(name, name): values for name, values in first.items()}
+    found = [f"{name}: only in one run" for name in first.keys() ^ second.keys()]
+    for name in first.keys() & second.keys():
+        a, b = first[name], second[name]
+        if a.shape != b.shape:
+            found.append(f"{name}: {a.shape} and {b.shape}")
+        elif not np.array_equal(a, b):
+            place = tuple(np.argwhere(a != b)[0].tolist())
+            found.append(f"{name}: at {place} {a[place]} and {b[place]}")
+    print("\n".join(found) or f"equal: {len(first)} metrics and arrays of the policy")
     return 1 if found else 0
 
 
