@@ -58,13 +58,9 @@ def thin(curve: Curve) -> Curve:
     thinned: Curve = {}
     for name in [*(name for name in COLUMNS if name in curve), *terms]:
         parts = [curve[name][a:b] for a, b in itertools.pairwise(ends)]
-        thinned[name] = np.array([part[-1] if name == "env_steps" else _mean(part) for part in parts])
-    return thinned
-
-
-def _mean(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else math.nan
+        finite = [part[np.isfinite(part)] for part in parts]
+        thinned[name] = np.array([part.mean() if part.size else math.nan for part in finite])
+    return {**thinned, "env_steps": curve["env_steps"][ends[1:] - 1]}
 
 
 def read_tables(folder: Path) -> list[Run]:
@@ -73,27 +69,22 @@ def read_tables(folder: Path) -> list[Run]:
     Raises:
         InputError: for a table that is missing or damaged.
     """
+    evaluations: dict[Key, dict[str, list[dict[str, Any]]]] = {}
+    for key, row in _read(folder / EVALUATIONS):
+        point: dict[str, Any] = {name: int(row[name]) for name in ("env_steps", "episodes") if row[name]}
+        for mode in MODES:
+            columns = {name.removeprefix(f"{mode}/"): x for name, x in row.items() if name.startswith(mode)}
+            point[mode] = {name: float(x) for name, x in columns.items() if x}
+        evaluations.setdefault(key, {"training": [], "absolute": []})[row["kind"]].append(point)
     curves: dict[Key, list[dict[str, str]]] = {}
     for key, row in _read(folder / CURVES):
         curves.setdefault(key, []).append(row)
-    points: dict[Key, list[dict[str, Any]]] = {}
-    best: dict[Key, dict[str, Any]] = {}
-    for key, row in _read(folder / EVALUATIONS):
-        numbers = {name: int(row[name]) for name in ("env_steps", "episodes") if row[name]}
-        modes = {
-            mode: {name[len(mode) + 1 :]: float(x) for name, x in row.items() if x and name.startswith(f"{mode}/")}
-            for mode in MODES
-        }
-        if row["kind"] == "absolute":
-            best[key] = {**numbers, **modes}
-        else:
-            points.setdefault(key, []).append({**numbers, **modes})
     runs = []
     for key, rows in curves.items():
-        names = [name for name in rows[0] if rows[0][name]]
-        curve = {name: np.array([float(row[name]) for row in rows]) for name in names}
-        runs.append(Run(*key, curve, points.get(key, []), best.get(key)))
-    return sorted(runs, key=lambda run: (run.cell.path.as_posix(), run.seed))
+        curve = {name: np.array([float(row[name]) for row in rows]) for name, x in rows[0].items() if x}
+        own = evaluations.get(key, {"training": [], "absolute": []})
+        runs.append(Run(*key, curve, own["training"], next(iter(own["absolute"]), None)))
+    return sorted(runs, key=_order)
 
 
 def _read(path: Path) -> Iterable[tuple[Key, dict[str, str]]]:
@@ -151,12 +142,12 @@ def publish(sweeps: Sequence[Path], target: Path, policies: Sequence[str]) -> li
                 raise InputError(f"{sweep}: {_name(run)} differs from the one that is published; remove one of them")
             folders[key] = sweep / "runs" / _name(run)
     if folders:
-        write_tables(target, sorted(runs.values(), key=lambda run: (run.cell.path.as_posix(), run.seed)))
+        write_tables(target, sorted(runs.values(), key=_order))
     missing = []
     for cell in dict.fromkeys(cell for cell, _ in folders):
         if not any(fnmatch.fnmatch(cell.path.as_posix(), pattern) for pattern in policies):
             continue
-        best = max((run for run in runs.values() if run.cell == cell), key=lambda run: _score(run))
+        best = max((run for run in runs.values() if run.cell == cell), key=_score)
         folder = folders.get((cell, best.seed))
         if folder is None or best.absolute is None:
             missing.append(_name(best))
@@ -172,9 +163,12 @@ def _name(run: Run) -> str:
     return f"{run.cell.path.as_posix()}/seed{run.seed}"
 
 
+def _order(run: Run) -> tuple[str, int]:
+    return run.cell.path.as_posix(), run.seed
+
+
 def _score(run: Run) -> float:
-    value = absolute(run, REWARD)
-    return -math.inf if math.isnan(value) else value
+    return float(np.nan_to_num(absolute(run, REWARD), nan=-math.inf))
 
 
 def add_measurement(name: str, file: Path, target: Path = MEASUREMENTS) -> None:
@@ -189,8 +183,9 @@ def _entries(entries: Mapping[str, Any]) -> str:
     """Returns JSON with a line for each entry and each of its items."""
     parts = []
     for name, entry in sorted(entries.items()):
-        items = entry.items() if isinstance(entry, dict) else ((None, item) for item in entry)
-        lines = [("" if k is None else f"{json.dumps(k)}: ") + json.dumps(item) for k, item in items]
+        lines = [json.dumps(item) for item in entry]
+        if isinstance(entry, dict):
+            lines = [f"{json.dumps(key)}: {json.dumps(item)}" for key, item in entry.items()]
         opening, closing = "{}" if isinstance(entry, dict) else "[]"
         parts.append(f" {json.dumps(name)}: {opening}\n  " + ",\n  ".join(lines) + f"\n {closing}")
     return "{\n" + ",\n".join(parts) + "\n}\n"
