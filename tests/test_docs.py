@@ -20,7 +20,7 @@ NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # Blocks that are not run, by page and first line, with the reason.
 NOT_RUN = {
-    ("docs/evaluation.md", "import jax"): "needs a run folder",
+    ("docs/training.md", "import jax"): "needs a run folder",
 }
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
 SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
