@@ -1,8 +1,8 @@
 """MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
-Generated: one page per task (clip, sizes, observation, rewards, parameters) with an overview, and the
-API reference. Links to files outside docs/ become their paths, and LaTeX becomes MathML, so that the built site needs
-neither the repository nor another host.
+Generated: one page per task (clip, sizes, observation, rewards, parameters) with an overview, and the pages
+reference/MODULE.md in the navigation of mkdocs.yml. Links to files outside docs/ become their paths, and LaTeX becomes
+MathML, so that the built site needs neither the repository nor another host.
 """
 
 from __future__ import annotations
@@ -23,38 +23,11 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 
-# Module of each page of the reference, and the names shown (all public ones where empty).
-REFERENCE = {
-    "environments": ("mqe_jax.envs", ("make", "tasks", "register_task")),
-    "base": ("mqe_jax.envs.base", ("State", "QuadrupedEnv")),
-    "vector": ("mqe_jax.envs.autoreset", ()),
-    "parameters": ("mqe_jax.envs.params", ("TaskParams",)),
-    "randomization": ("mqe_jax.envs.randomization", ("Randomization",)),
-    "observations": ("mqe_jax.envs.observation", ()),
-    "rewards": ("mqe_jax.envs.reward", ()),
-    "matches": ("mqe_jax.envs.match", ("Match",)),
-    "scenes": ("mqe_jax.scene", ("Scene",)),
-    "terrain": ("mqe_jax.terrain", ()),
-    "objects": ("mqe_jax.objects", ()),
-    "robots": ("mqe_jax.robots.robot", ("Robot",)),
-    "skills": ("mqe_jax.skills", ()),
-    "walk_policy": ("mqe_jax.walk_policy", ()),
-    "planners": ("mqe_jax.planners", ()),
-    "training_settings": ("mqe_jax.train.config", ()),
-    "networks": ("mqe_jax.train.networks", ()),
-    "policies": ("mqe_jax.policies", ("load_policy", "SimplePolicy")),
-    "trained_policies": ("mqe_jax.train.policy", ("Policy", "TrainedPolicy", "save_policy")),
-    "evaluation": ("mqe_jax.train.evaluate", ("EvalResult", "evaluate")),
-    "rendering": ("mqe_jax.viz.render", ()),
-    "recording": ("mqe_jax.viz.recording", ()),
-    "export": ("mqe_jax.export.policy", ()),
-    "export_scene": ("mqe_jax.export.scene", ()),
-}
-
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the generated pages."""
-    for path, content in pages().items():
+    (reference,) = (section["API reference"] for section in config["nav"] if "API reference" in section)
+    for path, content in (pages() | {path: reference_page(path) for path in reference}).items():
         files.append(File.generated(config, path, content=content))
     return files
 
@@ -96,16 +69,13 @@ def pages() -> dict[str, str]:
         from mqe_jax.envs import TASKS
     made = {f"tasks/{name}.md": task_page(task) for name, task in TASKS.items()}
     made["tasks/index.md"] = overview(TASKS)
-    for name, (module, members) in REFERENCE.items():
-        made[f"reference/{name}.md"] = reference_page(module, members)
     return made
 
 
-def reference_page(module: str, members: tuple[str, ...]) -> str:
-    """Returns the page of a module, to be filled by mkdocstrings."""
-    if not members:
-        return f"# {module}\n\n::: {module}\n"
-    return f"# {module}\n\n" + "\n".join(f"::: {module}.{name}\n" for name in members)
+def reference_page(path: str) -> str:
+    """Returns the page reference/MODULE.md of the API reference, to be filled by mkdocstrings."""
+    module = f"mqe_jax.{Path(path).stem}"
+    return f"# {module}\n\n::: {module}\n"
 
 
 def overview(tasks: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ const folder = path.resolve(process.argv[2]);
 const module = (name) => import(pathToFileURL(path.join(folder, name)).href);
 const { default: loadMujoco } = await module('lib/mujoco.js');
 const ort = await module('lib/ort.wasm.min.mjs');
-const { loadEpisode } = await module('loading.js');
+const { loadEpisode } = await module('episode.js');
 
 const input = JSON.parse(fs.readFileSync(0, 'utf8'));
 const read = async (name) => new Uint8Array(fs.readFileSync(path.join(folder, name)));

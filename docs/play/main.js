@@ -1,6 +1,6 @@
 // The page: loads MuJoCo, the scene and the policy, then plays episodes one after another.
 import { through } from './gate.js';
-import { loadEpisode } from './loading.js';
+import { loadEpisode } from './episode.js';
 
 const PAUSE_AFTER = 1.0; // s of page time between two episodes
 const LONGEST_FRAME = 0.1; // s of simulation at most in one frame, so that a slow browser stays responsive
