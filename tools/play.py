@@ -15,40 +15,27 @@ import sys
 import tarfile
 import tempfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "play"
 RUN = ROOT / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned.safetensors"
 
 
-class Package(NamedTuple):
-    """An npm package of the page."""
-
-    name: str
-    version: str
-    sha256: str
-    """Of the package's archive."""
-    files: tuple[str, ...]
-    """Files that the page needs, in the archive."""
-
-
+# npm packages of the page: name and version, SHA-256 of the archive, files in it that the page needs.
 PACKAGES = (
-    Package(
-        "@mujoco/mujoco",
-        "3.14.0",
+    (
+        "@mujoco/mujoco@3.14.0",
         "f845a07ab81303cc6579fec07136818bed21d44a31c1911340f61e06f4d11eee",
         ("mujoco.js", "mujoco.wasm"),
     ),
-    Package(
-        "onnxruntime-web",
-        "1.30.0",
+    (
+        "onnxruntime-web@1.30.0",
         "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71",
         ("dist/ort.wasm.min.mjs", "dist/ort-wasm-simd-threaded.mjs", "dist/ort-wasm-simd-threaded.wasm"),
     ),
-    Package(
-        "three",
-        "0.187.0",
+    (
+        "three@0.187.0",
         "ff540832ded0cfe919764d24a3d88f3e2a05f23303f876423e4f893841e90728",
         ("build/three.module.js", "build/three.core.js", "examples/jsm/controls/OrbitControls.js"),
     ),
@@ -62,37 +49,36 @@ class FetchError(RuntimeError):
 def fetch(folder: Path) -> None:
     """Writes the libraries' files into a folder, from the cache where it has them; FetchError where that fails."""
     folder.mkdir(parents=True, exist_ok=True)
-    for package in PACKAGES:
-        archive = CACHE / f"{package.name.replace('/', '-').lstrip('@')}-{package.version}.tgz"
+    for package, sha256, names in PACKAGES:
+        archive = CACHE / f"{package.lstrip('@').replace('/', '-').replace('@', '-')}.tgz"
         if not archive.is_file():
             _pack(package, archive)
-        if hashlib.sha256(archive.read_bytes()).hexdigest() != package.sha256:
+        if hashlib.sha256(archive.read_bytes()).hexdigest() != sha256:
             archive.unlink()
-            raise FetchError(f"{package.name}@{package.version}: the archive has another SHA-256 than the pinned one")
+            raise FetchError(f"{package}: the archive has another SHA-256 than the pinned one")
         with tarfile.open(archive) as files:
-            for name in package.files:
+            for name in names:
                 content = files.extractfile(f"package/{name}")
                 assert content is not None, name
                 (folder / Path(name).name).write_bytes(content.read())
 
 
-def _pack(package: Package, archive: Path) -> None:
+def _pack(package: str, archive: Path) -> None:
     """Fetches a package's archive with npm."""
     npm = shutil.which("npm")
     if npm is None:
         raise FetchError("npm is not installed (tools/install.sh npm installs Debian's)")
-    wanted = f"{package.name}@{package.version}"
     archive.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=archive.parent) as temporary:
-        command = [npm, "pack", "--loglevel=error", "--fetch-retries=0", "--pack-destination", temporary, wanted]
+        command = [npm, "pack", "--loglevel=error", "--fetch-retries=0", "--pack-destination", temporary, package]
         try:
             done = subprocess.run(command, cwd=temporary, capture_output=True, text=True, timeout=300)
         except subprocess.TimeoutExpired:
-            raise FetchError(f"{wanted}: npm pack took more than 300 s") from None
+            raise FetchError(f"{package}: npm pack took more than 300 s") from None
         found = list(Path(temporary).glob("*.tgz"))
         if done.returncode or not found:
             reason = next((line for line in done.stderr.splitlines() if "error" in line.lower()), "no archive")
-            raise FetchError(f"{wanted}: npm pack failed ({reason.strip()})")
+            raise FetchError(f"{package}: npm pack failed ({reason.strip()})")
         found[0].replace(archive)
 
 

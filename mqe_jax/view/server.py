@@ -13,7 +13,7 @@ import http
 import io
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import viser
@@ -47,16 +47,16 @@ class _Log:
 class _Connection(ServerConnection):
     """A connection from which only acceptable frames are received."""
 
-    def __init__(self, check: Callable[[str | bytes], None], log: _Log, *arguments: Any, **options: Any) -> None:
+    def __init__(self, find: Callable[[str], Any], log: _Log, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._check, self._log = check, log
+        self._find, self._log = find, log
 
     async def recv(self, decode: bool | None = None) -> Any:
         """Returns the next acceptable frame; closes the connection after a frame that is no message."""
         while True:
             frame = await super().recv(decode)
             try:
-                self._check(frame)
+                check(frame, self._find)
                 return frame
             except RefusedError as error:
                 self._log(f"ignored a message: {error}")
@@ -66,69 +66,50 @@ class _Connection(ServerConnection):
                 await self.close(CloseCode.UNSUPPORTED_DATA if text else CloseCode.INVALID_DATA)
 
 
-class _Guard:
-    """What is added to `serve`."""
+def open_server(host: str, port: int, label: str) -> viser.ViserServer:
+    """Returns a running server, without printing viser's banner.
 
-    def __init__(self, host: str) -> None:
-        self.host, self.log = host, _Log()
-        self.server: viser.ViserServer | None = None
-        self.serving = False
+    Raises an InputError for a version of viser in which the restrictions would have no effect.
+    """
+    log, original = _Log(), websockets_server.serve
+    servers: list[viser.ViserServer] = []
+    serving = False
 
-    @contextlib.contextmanager
-    def installed(self) -> Iterator[None]:
-        """Replaces `serve` within the context."""
-        original = websockets_server.serve
+    def find(uuid: str) -> Any:
+        """Returns the widget or command of a uuid, or None."""
+        if not servers:
+            return None
+        gui = servers[0].gui
+        return gui._gui_input_handle_from_uuid.get(uuid) or gui._command_handle_from_uuid.get(uuid)
 
-        def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-            self.serving = True
-            options |= {
-                "max_size": MAX_FRAME,
-                "create_connection": functools.partial(_Connection, self.check, self.log),
-            }
-            return original(*arguments, process_request=functools.partial(self.answer, process_request), **options)
-
-        websockets_server.serve = serve  # type: ignore[misc]
-        try:
-            yield
-        finally:
-            websockets_server.serve = original  # type: ignore[misc]
-
-    def answer(self, page: Any, connection: ServerConnection, request: Request) -> Response | None:
+    def answer(page: Any, connection: ServerConnection, request: Request) -> Response | None:
         """Returns the response to a request, or None if it opens a websocket; `page` serves the files of the page."""
-        address, port = connection.local_address[:2]
+        address, local_port = connection.local_address[:2]
         headers = request.headers
-        reason = refusal(headers.get_all("Host"), headers.get_all("Origin"), authorities(self.host, address, port))
+        reason = refusal(headers.get_all("Host"), headers.get_all("Origin"), authorities(host, address, local_port))
         if reason is not None:
-            self.log(f"refused a connection: {reason}")
+            log(f"refused a connection: {reason}")
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"mqe view: {reason}\n")
         response = page(connection, request) if page is not None else None
         if response is not None:
             response.headers["Content-Security-Policy"] = "frame-ancestors 'none'"
         return response
 
-    def check(self, frame: str | bytes) -> None:
-        """Raises an UnparsableError or a RefusedError unless the frame is an acceptable message."""
-        check(frame, self.find)
+    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        nonlocal serving
+        serving = True
+        options |= {"max_size": MAX_FRAME, "create_connection": functools.partial(_Connection, find, log)}
+        return original(*arguments, process_request=functools.partial(answer, process_request), **options)
 
-    def find(self, uuid: str) -> Any:
-        """Returns the widget or command of a uuid, or None."""
-        if self.server is None:
-            return None
-        gui = self.server.gui
-        return gui._gui_input_handle_from_uuid.get(uuid) or gui._command_handle_from_uuid.get(uuid)
-
-
-def open_server(host: str, port: int, label: str) -> viser.ViserServer:
-    """Returns a running server, without printing viser's banner.
-
-    Raises an InputError for a version of viser in which the restrictions would have no effect.
-    """
-    guard = _Guard(host)
-    with contextlib.redirect_stdout(io.StringIO()), guard.installed():
-        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    websockets_server.serve = serve  # type: ignore[misc]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    finally:
+        websockets_server.serve = original  # type: ignore[misc]
     private = (hasattr(server.gui, name) for name in ("_gui_input_handle_from_uuid", "_command_handle_from_uuid"))
-    if not (guard.serving and all(private)):
+    if not (serving and all(private)):
         server.stop()
         raise InputError(f"view: viser {viser.__version__} cannot be restricted (pip install 'viser==1.1.1' can)")
-    guard.server = server
+    servers.append(server)
     return server
