@@ -105,8 +105,7 @@ def test_observations_and_ends_of_episodes_are_the_tasks(env: Any, settings: Any
     found = run_node(
         tmp_path,
         """
-        import { observe, outcome } from './gate.js';
-        import { readRobots } from './robots.js';
+        import { observe, outcome, readRobots } from './gate.js';
         const { settings, states } = given;
         console.log(JSON.stringify(states.map((state) => {
           const robots = readRobots(settings, state);
