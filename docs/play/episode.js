@@ -156,7 +156,7 @@ export async function loadEpisode(read, loadMujoco, ort) {
 
 const clip = (x, low, high) => Math.max(low, Math.min(high, x));
 
-/** The motors of all robots: `settings.motors` of the scene. */
+/** The motors of all robots, as `mqe_jax/robots/motors.py` computes them: `settings.motors` of the scene. */
 export class Motors {
   constructor(settings) {
     Object.assign(this, settings.motors);

@@ -8,7 +8,7 @@ MARL). Numbers equal those of the `rliable` package (tests/data/rliable.json).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,13 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from mqe_jax.errors import InputError
 
 Array = NDArray[np.float64]
-Statistic = Callable[[Array], Array]
-
-
-class Random(Protocol):
-    """Source of bootstrap indices: a `numpy.random.Generator`, or anything with its `integers`."""
-
-    def integers(self, low: int, high: int, size: tuple[int, ...]) -> NDArray[np.int64]: ...
 
 
 def interquartile_mean(scores: ArrayLike) -> Array:
@@ -54,15 +47,13 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
 def bootstrap_interval(
     scores: Sequence[Array],
     statistic: Callable[..., Array],
-    random: Random,
-    *,
+    random: Any,
     samples: int = 2000,
-    confidence: float = 0.95,
 ) -> tuple[Array, Array]:
-    """Returns the bounds of a percentile bootstrap interval; runs are resampled within each task.
+    """Returns the bounds of a 95% percentile bootstrap interval; runs are resampled within each task.
 
-    `scores` are the statistic's arguments, resampled independently where there are several.
-    Tasks are the strata and stay fixed. With a single run both bounds equal the statistic.
+    `scores` are the statistic's arguments, resampled independently where there are several. Tasks are the strata and
+    stay fixed. `random` is a `numpy.random.Generator`, or has its `integers`. With one run both bounds equal the statistic.
 
     Raises:
         InputError: if scores are not (runs, tasks), or not finite.
@@ -73,14 +64,9 @@ def bootstrap_interval(
             raise InputError(f"scores: shape {group.shape} is not allowed; it must be (runs, tasks), both at least 1")
         if not np.isfinite(group).all():
             raise InputError("scores: not all finite; omit runs without a value")
-    resampled = []
-    for group in groups:
-        runs, tasks = group.shape
-        index = random.integers(0, runs, size=(samples, runs, tasks))
-        resampled.append(group[index, np.arange(tasks)])
-    values = statistic(*resampled)
-    tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(values, [tail, 100.0 - tail], axis=0)
+    draws = [random.integers(0, len(group), size=(samples, *group.shape)) for group in groups]
+    resampled = [group[index, np.arange(group.shape[1])] for group, index in zip(groups, draws, strict=True)]
+    low, high = np.percentile(statistic(*resampled), [2.5, 97.5], axis=0)
     return low, high
 
 

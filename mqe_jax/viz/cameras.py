@@ -71,9 +71,7 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
         return _fitted(model, np.concatenate(chosen), start, aspect, distances)
 
     if view == "near":
-        inside = [
-            boxes[body] for boxes, row in zip(corners, followed, strict=True) for body in np.flatnonzero(row).tolist()
-        ]
+        inside = [corners[index][body] for index, body in np.argwhere(followed).tolist()]
         return [fit(inside, (2.0, 14.0))] * len(episode)
     if view == "side":
         centers = [boxes[robots[0]].mean(axis=0) for boxes in corners]
@@ -82,9 +80,8 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     width = max(1, round(_SMOOTHING / episode.dt))
     views: list[Camera] = []
     for _ in range(_ROUNDS):
-        rows = zip(corners, followed, strict=True)
-        fitted = [fit([boxes[body] for body in np.flatnonzero(row).tolist()], (2.0, 12.0)) for boxes, row in rows]
-        views = _smoothed(fitted, width)
+        chosen = [[boxes[body] for body in boxes if row[body]] for boxes, row in zip(corners, followed, strict=True)]
+        views = _smoothed([fit(boxes, (2.0, 12.0)) for boxes in chosen], width)
         rows = zip(corners, views, strict=True)
         cut = np.array([[_cut(model, boxes[robot], camera, aspect) for robot in robots] for boxes, camera in rows])
         before = followed.copy()
@@ -133,10 +130,8 @@ def _smoothed(fitted: Sequence[Camera], width: int) -> list[Camera]:
     padded = np.concatenate([np.repeat(values[:1], width, 0), values, np.repeat(values[-1:], width, 0)])
     weights = np.minimum(np.arange(1, 2 * width + 2), np.arange(2 * width + 1, 0, -1)) / (width + 1) ** 2
     means = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
-    return [
-        replace(camera, lookat=(float(x), float(y), float(z)), distance=float(distance))
-        for camera, (x, y, z, distance) in zip(fitted, means, strict=True)
-    ]
+    rows = zip(fitted, means.tolist(), strict=True)
+    return [replace(camera, lookat=(x, y, z), distance=distance) for camera, (x, y, z, distance) in rows]
 
 
 def _fitted(
@@ -155,5 +150,4 @@ def _fitted(
         across, along = offset @ right / depth, offset @ up / depth
         shift = distance * ((across.max() + across.min()) * right + (along.max() + along.min()) * up) / 4
         lookat = lookat + shift
-    distance = float(np.clip(1.04 * distance, *distances))
-    return replace(camera, lookat=(float(lookat[0]), float(lookat[1]), float(lookat[2])), distance=distance)
+    return replace(camera, lookat=tuple(lookat.tolist()), distance=float(np.clip(1.04 * distance, *distances)))
