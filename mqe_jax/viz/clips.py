@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -14,27 +13,19 @@ import numpy as np
 from PIL import Image
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import replacing
+from mqe_jax.files import check_folder, replacing
 from mqe_jax.interrupts import child
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
 
 def check_output(path: Path) -> Path:
-    """Returns the path if it can be written; otherwise the InputError names it and what is allowed."""
+    """Returns the path if it can be written, in a folder that it creates; the InputError names what is allowed."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
     if path.is_dir():
         raise InputError(f"output {str(path)!r} is a folder, it must be a file")
-    parent = path.resolve().parent
-    while not parent.exists():
-        parent = parent.parent
-    try:
-        with tempfile.TemporaryFile(dir=parent):
-            pass
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"output {str(path)!r}: {str(parent)!r} cannot be written ({reason})") from None
+    check_folder(path.parent, f"output {str(path)!r}")
     if path.suffix.lower() == ".mp4":
         try:
             import_module("imageio_ffmpeg")
@@ -49,7 +40,6 @@ def check_output(path: Path) -> Path:
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
     path = check_output(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
     with replacing(path) as temporary:
         if suffix == ".mp4":
