@@ -53,7 +53,7 @@ def bootstrap_interval(
     """Returns the bounds of a 95% percentile bootstrap interval; runs are resampled within each task.
 
     `scores` are the statistic's arguments, resampled independently where there are several. Tasks are the strata and
-    stay fixed. `random` is a `numpy.random.Generator` or has its `integers`. With one run both bounds are the statistic.
+    stay fixed. `random` is a `numpy.random.Generator`, or has its `integers`. The bounds of one run are the statistic.
 
     Raises:
         InputError: if scores are not (runs, tasks), or not finite.
