@@ -28,10 +28,15 @@ def group(runs: Sequence[Run], reference: Reference) -> dict[Cell, list[Run]]:
     orders = list(reference.variants), list(reference.tasks), list(reference.algorithms)
 
     def key(cell: Cell) -> list[tuple[int, str]]:
-        names = cell.variant, cell.task, cell.algorithm
-        return [(o.index(x) if x in o else len(o), x) for x, o in zip(names, orders, strict=True)]
+        named = cell.variant, cell.task, cell.algorithm
+        return [(o.index(x) if x in o else len(o), x) for x, o in zip(named, orders, strict=True)]
 
     return {cell: [run for run in runs if run.cell == cell] for cell in sorted({run.cell for run in runs}, key=key)}
+
+
+def names(cells: Cells, field: str) -> list[str]:
+    """Returns the tasks, algorithms or variants of cells, in their order; `field` is that of `Cell`."""
+    return list(dict.fromkeys(getattr(cell, field) for cell in cells))
 
 
 def estimate(statistic: Callable[..., Array], *scores: Array) -> tuple[Array, Array, Array]:
@@ -97,9 +102,9 @@ def _reward(evaluation: Mapping[str, Any]) -> float | None:
 
 def curve_rows(cells: Cells) -> Rows:
     """Returns the table of the curves' bands."""
-    names = ("env_steps", "iqm", "low", "high")
+    columns = ("env_steps", "iqm", "low", "high")
     return [
-        {**dataclasses.asdict(cell), **dict(zip(names, values, strict=True))}
+        {**dataclasses.asdict(cell), **dict(zip(columns, values, strict=True))}
         for cell, runs in cells.items()
         for values in zip(*band(runs), strict=True)
     ]
@@ -137,8 +142,7 @@ def score_matrices(cells: Cells, variant: str) -> dict[str, Array]:
     tasks are common.
     """
     chosen = {cell: runs for cell, runs in cells.items() if cell.variant == variant}
-    algorithms = list(dict.fromkeys(cell.algorithm for cell in chosen))
-    every = list(dict.fromkeys(cell.task for cell in chosen))
+    algorithms, every = names(chosen, "algorithm"), names(chosen, "task")
     tasks = [task for task in every if all(Cell(task, algorithm, variant) in chosen for algorithm in algorithms)]
     if len(algorithms) < 2 or not tasks or 2 * len(tasks) < len(every):
         return {}
@@ -163,7 +167,7 @@ def aggregate_tables(cells: Cells) -> dict[str, Rows]:
     """Returns the tables over all tasks: interquartile means and probabilities of improvement."""
     total: Rows = []
     pairs: Rows = []
-    for variant in dict.fromkeys(cell.variant for cell in cells):
+    for variant in names(cells, "variant"):
         scores = score_matrices(cells, variant)
         for name, values in scores.items():
             middle, low, high = map(float, estimate(statistics.interquartile_mean, values))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from mqe_jax.study.estimates import Array, Cells, band, estimate, evaluated, score_matrices
+from mqe_jax.study.estimates import Array, Cells, band, estimate, evaluated, names, score_matrices
 from mqe_jax.study.runs import Cell, Reference, Run
 from mqe_jax.study.statistics import performance_profile
 
@@ -34,6 +34,16 @@ def _png(figure: Any) -> bytes:
     return content.getvalue()
 
 
+def _panels(parent: Any, tasks: Sequence[str]) -> Iterator[tuple[Any, str]]:
+    """Yields the axes of each task, two per row; the rest is hidden."""
+    across = min(2, len(tasks))
+    for axes, task in itertools.zip_longest(parent.subplots(-(-len(tasks) // 2), across, squeeze=False).ravel(), tasks):
+        if task is None:
+            axes.set_axis_off()
+        else:
+            yield axes, task
+
+
 def _color(algorithm: str, algorithms: Sequence[str]) -> str:
     others = [name for name in algorithms if name not in _COLORS]
     return _COLORS.get(algorithm) or _OTHER_COLORS[others.index(algorithm) % len(_OTHER_COLORS)]
@@ -44,19 +54,11 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
 
     Dashed lines are the reference's values, in the algorithm's colour.
     """
-    variants = list(dict.fromkeys(cell.variant for cell in cells))
-    algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
-    tasks = list(dict.fromkeys(cell.task for cell in cells))
-    across = min(2, len(tasks))
-    rows, columns = -(-len(tasks) // across), across * len(variants)
-    figure = _figure(max(5.0, 3.7 * columns), 2.5 * rows + 0.9)
+    variants, algorithms, tasks = (names(cells, field) for field in ("variant", "algorithm", "task"))
+    figure = _figure(max(5.0, 3.7 * min(2, len(tasks)) * len(variants)), 2.5 * -(-len(tasks) // 2) + 0.9)
     blocks = figure.subfigures(1, len(variants), squeeze=False)[0]
     for block, variant in zip(blocks, variants, strict=True):
-        grid = block.subplots(rows, across, squeeze=False).ravel()
-        for axes, task in itertools.zip_longest(grid, tasks):
-            if task is None:
-                axes.set_axis_off()
-                continue
+        for axes, task in _panels(block, tasks):
             for algorithm in algorithms:
                 runs = cells.get(Cell(task, algorithm, variant))
                 if runs is not None:
@@ -97,16 +99,11 @@ def draw_evaluations(
     the values in `best`, by task.
     """
     background, best = background or {}, best or {}
-    tasks = list(dict.fromkeys(cell.task for cell in cells))
-    across = min(2, len(tasks))
-    rows = -(-len(tasks) // across)
-    figure = _figure(max(5.0, 3.7 * across), 2.7 * rows + 0.6)
+    tasks = names(cells, "task")
+    figure = _figure(max(5.0, 3.7 * min(2, len(tasks))), 2.7 * -(-len(tasks) // 2) + 0.6)
     pale = {cell.task: runs for cell, runs in evaluated(background).items()}
     chosen = evaluated(cells)
-    for axes, task in itertools.zip_longest(figure.subplots(rows, across, squeeze=False).ravel(), tasks):
-        if task is None:
-            axes.set_axis_off()
-            continue
+    for axes, task in _panels(figure, tasks):
         if task in pale:
             _draw_band(axes, pale[task], _PALE, "")
         drawn = [cell for cell in chosen if cell.task == task]
@@ -157,8 +154,8 @@ def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
 
 def draw_profiles(cells: Cells, reference: Reference) -> bytes:
     """Returns performance profiles of each variant: the fraction of runs above each score."""
-    variants = [v for v in dict.fromkeys(cell.variant for cell in cells) if score_matrices(cells, v)]
-    algorithms = list(dict.fromkeys(cell.algorithm for cell in cells))
+    variants = [variant for variant in names(cells, "variant") if score_matrices(cells, variant)]
+    algorithms = names(cells, "algorithm")
     thresholds = np.linspace(0.0, 1.0, 101)
 
     figure = _figure(max(5.0, 4.2 * len(variants)), 3.4)

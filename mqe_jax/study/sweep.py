@@ -136,8 +136,7 @@ def plan(
         fresh = [seed for seed in left if seed not in started]
         size = sweep.seeds_together or len(sweep.seeds)
         for group in (started, fresh):
-            for i in range(0, len(group), size):
-                jobs.append(_job(folder, cell, config, group[i : i + size]))
+            jobs += [_job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)]
     return jobs
 
 
@@ -151,10 +150,9 @@ def _overridden(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> T
 
 def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) -> Job:
     folders = tuple(_run(folder, cell, seed) for seed in seeds)
+    configs = tuple(override(config, {"seed": seed}) for seed in seeds)
     steps = [[int(path.stem.removeprefix("step_")) for path in list_checkpoints(run)] for run in folders]
-    return Job(
-        cell, tuple(override(config, {"seed": seed}) for seed in seeds), folders, min(max(s, default=0) for s in steps)
-    )
+    return Job(cell, configs, folders, min(max(own, default=0) for own in steps))
 
 
 def _run(folder: Path, cell: Cell, seed: int) -> Path:
@@ -168,14 +166,10 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
     """
     speeds: dict[tuple[str, ...], list[float]] = {}
     for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
-        try:
-            curve = read_curve(path)
-        except InputError:
-            continue  # a run that was stopped before its first update
-        if "fps" in curve:
-            fps = float(curve["fps"][len(curve["fps"]) // 2])
+        with contextlib.suppress(InputError, KeyError):  # stopped before the first update, or without fps
+            fps = read_curve(path)["fps"]
             for key in ((), path.parts[-4:-2]):
-                speeds.setdefault(key, []).append(fps)
+                speeds.setdefault(key, []).append(float(fps[len(fps) // 2]))
     seconds = []
     for job in jobs:
         known = speeds.get(job.cell.path.parts) or speeds.get(())
@@ -222,8 +216,7 @@ def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update
             except InUseError:
                 left.append(job)
                 continue
-            if all(map(finished, job.folders)):
-                continue  # finished by another process since the jobs were planned
-            env, eval_env = environments(job.configs[0], len(job.configs))
-            train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
+            if not all(map(finished, job.folders)):  # by another process since the jobs were planned
+                env, eval_env = environments(job.configs[0], len(job.configs))
+                train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
     return left

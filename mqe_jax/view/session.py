@@ -124,7 +124,7 @@ class Session:
     def frame(self) -> Episode:
         """Returns the current poses, those of an environment in each frame."""
         data = self.state.data
-        return Episode(*map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat)), self.env.dt)
+        return Episode(*map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat)), dt=self.env.dt)
 
     def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
         env = self.env

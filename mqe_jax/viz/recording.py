@@ -33,7 +33,7 @@ class Episode:
     def cut(self, frames: slice) -> "Episode":
         """Returns the episode with a part of its frames, such as every n-th."""
         poses = (x[frames] for x in (self.qpos, self.mocap_pos, self.mocap_quat))
-        return Episode(*poses, self.dt * (frames.step or 1), self.success, self.reward)
+        return Episode(*poses, dt=self.dt * (frames.step or 1), success=self.success, reward=self.reward)
 
 
 def record(
@@ -51,7 +51,7 @@ def record(
     """
     reset_key, act_key = jax.random.split(key)
 
-    def poses(state: Any) -> tuple[jax.Array, ...]:
+    def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
@@ -61,11 +61,11 @@ def record(
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))
         success = state.metrics.get("success", jnp.zeros_like(reward))
-        return (state, memory), (*poses(state), done, reward, success)
+        return (state, memory), (*now(state), done, reward, success)
 
     chunk = jax.jit(lambda carry, keys: jax.lax.scan(one_step, carry, keys))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, episodes))
-    first = [np.asarray(x)[None] for x in poses(state)]
+    first = [np.asarray(x)[None] for x in now(state)]
     rows: list[Any] = []
     steps, length = max(1, round(seconds / env.dt)), 50
     carry = (state, memory)
@@ -81,8 +81,8 @@ def record(
     for i in range(episodes):
         last = int(done[:, i].argmax()) if done[:, i].any() else len(done) - 1
         won = float(success[last, i]) if done[last, i] else 0.0
-        mean = float(reward[: last + 1, i].mean())
-        recorded.append(Episode(*(x[: last + 2, i] for x in frames), float(env.dt), won, mean))
+        poses = (x[: last + 2, i] for x in frames)
+        recorded.append(Episode(*poses, dt=float(env.dt), success=won, reward=float(reward[: last + 1, i].mean())))
     return recorded
 
 
