@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 import numpy as np
@@ -42,17 +41,15 @@ class Viewer:
         camera = self.server.initial_camera
         camera.position, camera.look_at = self._view()
         camera.fov = _FIELD_OF_VIEW
-        self._real_time = 0.0
 
-    def run(self, stop: threading.Event | None = None) -> None:
-        """Steps and renders at the session's speed until `stop` is set, or Ctrl-C; then stops the server."""
-        stop = stop or threading.Event()
+    def run(self) -> None:
+        """Steps and renders at the session's speed until an exception; then stops the server."""
         dt = self.session.env.dt
         due = drawn = shown = time.monotonic()
         self.session.advance()  # compiles the step
         due, counted = time.monotonic(), self.session.steps
         try:
-            while not stop.is_set():
+            while True:
                 now = time.monotonic()
                 stepped = self._step_if_due(now, due)
                 if stepped:
@@ -64,9 +61,9 @@ class Viewer:
                     drawn = now
                     self._stage.draw(self.session.frame(), self._followed())
                 if now - shown >= 1 / PANEL_RATE:
-                    self._real_time = (self.session.steps - counted) * dt / (now - shown)
+                    real_time = (self.session.steps - counted) * dt / (now - shown)
                     shown, counted = now, self.session.steps
-                    self._panel.show(self._positions(), self._real_time)
+                    self._panel.show(self._positions(), real_time)
                     self._panel.plot()
                 if not stepped:
                     time.sleep(max(0.001, min(due - now, 0.01)))
@@ -87,9 +84,7 @@ class Viewer:
     def _positions(self) -> np.ndarray:
         """Returns the agents' positions (A, 3), m, in the selected environment."""
         env = self.session.env
-        robots = [body for label, body in self._stage.bodies.items() if label.startswith("robot ")]
-        start = env.mj_model.jnt_qposadr[env.mj_model.body_jntadr[robots[: env.num_agents]]]
-        return self.session.frame().qpos[self._panel.env][start[:, None] + np.arange(3)]
+        return self.session.frame().qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
 
     def _followed(self) -> tuple[int, int] | None:
         if self._panel.camera == FREE:
