@@ -66,25 +66,15 @@ class Panel:
         rows = []
         for agent, (x, y, z) in enumerate(positions):
             vx, vy, turn = commands[agent]
-            driven = (
-                " (driven)"
-                if (session.drive.env, session.drive.robot) == (self.env, agent) and session.drivable
-                else ""
-            )
+            chosen = session.drivable and (session.drive.env, session.drive.robot) == (self.env, agent)
+            driven = " (driven)" if chosen else ""
             rows.append(f"| {agent + 1}{driven} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
         pace = "paused" if session.paused else f"{real_time:.2f} x real time"
         reward = float(session.rewards[-1][self.env, -1]) if session.rewards else 0.0
-        self._state.content = "\n".join(
-            [
-                f"**{session.env.name}** at {session.steps * session.env.dt:.2f} s, {pace}",
-                "",
-                f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step",
-                "",
-                "| robot | x | y | z | vx | vy | turn |",
-                "|---|---|---|---|---|---|---|",
-                *rows,
-            ]
-        )
+        head = f"**{session.env.name}** at {session.steps * session.env.dt:.2f} s, {pace}\n\n"
+        head += f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step\n\n"
+        head += "| robot | x | y | z | vx | vy | turn |\n|---|---|---|---|---|---|---|\n"
+        self._state.content = head + "\n".join(rows)
 
     def plot(self) -> None:
         """Updates the plots with the recent history of the selected environment."""
