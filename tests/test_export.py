@@ -26,6 +26,7 @@ from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.types import NetworkMemory
 
 onnx = pytest.importorskip("onnx")
+pytest.importorskip("jax2onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 from mqe_jax.export import translate  # noqa: E402
@@ -57,7 +58,7 @@ def error_on_random_inputs(policy: TrainedPolicy, env: Any) -> float:
     random, shapes = np.random.default_rng(0), input_shapes(policy, env)
     inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
     step = functools.partial(policy_step, policy, env)
-    expected = jax.device_get(jax.jit(step)(inputs))
+    expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
     found = errors(translate.translate(step, shapes, "test"), inputs, expected)
     assert found.keys() == expected.keys()
     return max(found.values())
@@ -201,10 +202,10 @@ def test_what_cannot_be_exported_is_refused_in_a_line(
     assert "a.txt" in refused(str(GATE), "--onnx", str(tmp_path / "a.txt"))
     assert "none" in refused(str(tmp_path / "none"), "--onnx", file)
     monkeypatch.setattr("mqe_jax.cli.export.STEPS", 2)
-    monkeypatch.setitem(translate.RULES, "max", lambda graph, equation, low, x: x)  # no ReLU
+    monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: x + low)  # no ReLU
     said = refused(str(GATE), "--onnx", file)
     assert "a.onnx is not written" in said and "differs from JAX by" in said and "at most 0.0001" in said
-    monkeypatch.delitem(translate.RULES, "max")
-    assert "the JAX operation 'max' has no translation" in refused(str(GATE), "--onnx", file)
+    monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: jax.lax.nextafter(x, x))
+    assert "jax2onnx cannot translate go1gate (" in refused(str(GATE), "--onnx", file)
     with pytest.raises(InputError, match="was trained on go1gate, not on go1tug"):
         to_onnx(load_policy(GATE), make("go1tug", impl="c", num_envs=1))

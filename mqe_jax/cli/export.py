@@ -19,8 +19,8 @@ LARGEST_ERROR = 1e-4
 
 def export(arguments: Export) -> dict[str, Any]:
     """Writes the ONNX graph of a run if it agrees with JAX; prints a table, or returns the object for `--json`."""
-    if any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxruntime")):
-        raise InputError("export: needs onnx and onnxruntime (pip install 'mqe-jax[export]')")
+    if any(importlib.util.find_spec(name) is None for name in ("jax2onnx", "onnxruntime")):
+        raise InputError("export: needs jax2onnx and onnxruntime (pip install 'mqe-jax[export]')")
     if arguments.onnx.suffix != ".onnx" or arguments.onnx.is_dir():
         raise InputError(f"onnx: {str(arguments.onnx)!r} is not allowed; it must be a file that ends in .onnx")
     policy = load_policy(arguments.run_dir)

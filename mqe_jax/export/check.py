@@ -27,15 +27,15 @@ def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]
         now = env.read(state.data)
         sensed = {"gravity": now.projected_gravity, "joint_position": now.joint_position}
         sensed |= {"joint_velocity": now.joint_velocity, "obs": state.obs}
-        inputs = {name: x[None, : policy.agents] for name, x in sensed.items() if name in shapes} | memory
+        inputs = {name: x[: policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
-        action = jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"][0])
+        action = jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"])
         return inputs, outputs, env.step(state, action)
 
     @jax.jit
     def start(key: jax.Array) -> tuple[Any, Any]:
         sensed = ("obs", "gravity", "joint_position", "joint_velocity")
-        return env.reset(key), {name: jnp.zeros((1, *s)) for name, s in shapes.items() if name not in sensed}
+        return env.reset(key), {name: jnp.zeros(s) for name, s in shapes.items() if name not in sensed}
 
     rows: list[tuple[Any, Any]] = []
     state, memory = start(jax.random.PRNGKey(0))
@@ -45,7 +45,7 @@ def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]
         memory = {name: outputs[f"next_{name}"] for name in memory}
         if state.terminated or state.truncated:
             state, memory = start(jax.random.PRNGKey(i + 1))
-    return jax.tree.map(lambda *x: np.concatenate(x), *rows)
+    return jax.tree.map(lambda *x: np.stack(x), *rows)
 
 
 def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str, float]:
@@ -55,7 +55,9 @@ def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str
     """
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
     found = dict(zip(names, session.run(names, inputs), strict=True))
     differences = {name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names}

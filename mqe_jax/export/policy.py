@@ -28,8 +28,7 @@ import onnx
 
 import mqe_jax
 from mqe_jax.errors import InputError
-from mqe_jax.export.graph import OPSET
-from mqe_jax.export.translate import translate
+from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.files import write_atomically
 from mqe_jax.policies import check_policy
 from mqe_jax.robots.index import Proprioception
@@ -60,7 +59,7 @@ def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
 
 
 def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    """Returns the outputs of one step by name, the function that the graph evaluates."""
+    """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
     action, memory = policy.act(inputs["obs"], _filled("memory", policy.initial_memory(), inputs))
     outputs = {"action": action} | _named("next_memory", memory)
     if env.control == "torque":
@@ -68,9 +67,9 @@ def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]
     if env.control == "position":
         return outputs | {"joint_target": env.robot.joint_targets(action, env.params.position_scale)}
     controller, skill = env.controller, env.controller.skill
-    commands = jax.vmap(controller.skill_commands)(action)
+    commands = controller.skill_commands(action)
     sensed = Proprioception(*(inputs[name] for name in ("gravity", "joint_position", "joint_velocity")))
-    act = jax.vmap(jax.vmap(functools.partial(skill.targets, controller.skill_params)))
+    act = jax.vmap(functools.partial(skill.targets, controller.skill_params))
     target, memory = act(_filled(skill.name, skill.init_memory(), inputs), commands, sensed)
     return outputs | {"commands": commands, "joint_target": target} | _named(f"next_{skill.name}", memory)
 
