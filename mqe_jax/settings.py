@@ -8,7 +8,7 @@ A record is a frozen dataclass whose fields carry their types and bounds once, a
         \"\"\"Half width of the clipping interval of the ratio.\"\"\"
 
 Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and raises a one-line
-`InputError`: `ppo.clip: -1 is not allowed; it must be a number greater than 0`.
+`InputError`: `ppo.clip: -1 is not allowed; it must be greater than 0`.
 
 Numbers are finite unless a field is `AnyFloat`; booleans are rejected as numbers; numpy scalars and strings such as
 "7e-4" (which YAML does not read as a number) are accepted; "none" means None for an optional field.
@@ -19,17 +19,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import re
 import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, NoReturn, TypeVar, dataclass_transform
 
 import pydantic
+import pydantic_core
 import yaml
-from annotated_types import Ge, Gt, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Le, Lt
 from pydantic.dataclasses import dataclass as pydantic_dataclass
-from pydantic_core import ErrorDetails
 
 from mqe_jax.errors import InputError, nearest
 
@@ -38,37 +39,26 @@ T = TypeVar("T")
 _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class Allowed:
-    """Human-readable description of a field's allowed values, where type and bounds alone do not give one."""
-
-    text: str
-
-
 def _not_nan(value: float) -> float:
     if value != value:
-        raise ValueError("NaN")
+        raise ValueError("a number, infinity included")
     return value
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
-        raise ValueError("lowest first")
+        raise ValueError("two numbers (lowest, highest), in this order")
     return value
 
 
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
-AnyFloat = Annotated[
-    float, pydantic.Field(allow_inf_nan=True), pydantic.AfterValidator(_not_nan), Allowed("a number, infinity included")
-]
+AnyFloat = Annotated[float, pydantic.Field(allow_inf_nan=True), pydantic.AfterValidator(_not_nan)]
 PositiveInt = Annotated[int, Gt(0)]
 NonNegativeInt = Annotated[int, Ge(0)]
 Seed = Annotated[int, Ge(0), Lt(2**32)]
-Range = Annotated[
-    tuple[float, float], pydantic.AfterValidator(_ordered), Allowed("two numbers (lowest, highest), in this order")
-]
+Range = Annotated[tuple[float, float], pydantic.AfterValidator(_ordered)]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
@@ -88,7 +78,7 @@ def record(cls: type[T]) -> type[T]:
         try:
             init(self, **values)
         except pydantic.ValidationError as error:
-            raise _one_line(made, values, error) from None
+            raise _one_line(made, error) from None
 
     made.__init__ = checked_init
     return typing.cast(type[T], made)
@@ -133,7 +123,13 @@ def to_mapping(settings: Any) -> dict[str, Any]:
     Raises:
         InputError: for a value in a mapping that is none of these.
     """
-    return {field.name: _plain(field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings)}
+
+    def plain(value: Any) -> Any:
+        if hasattr(value, "tolist"):
+            return value.tolist()
+        fail(type(settings).__name__, value, "a number, a string, true, false, none, or lists and mappings of these")
+
+    return pydantic_core.to_jsonable_python(settings, fallback=plain)
 
 
 class _Loader(yaml.SafeLoader):
@@ -171,59 +167,12 @@ def hints_of(kind: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
-def describe(hint: Any) -> str:
-    """Returns a human-readable description of a field's allowed values, such as 'a number greater than 0'."""
-    metadata: tuple[Any, ...] = ()
-    if typing.get_origin(hint) is Annotated:
-        hint, *rest = typing.get_args(hint)
-        metadata = tuple(rest)
-    for mark in metadata:
-        if isinstance(mark, Allowed):
-            return mark.text
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        kinds = [describe(part) for part in parts if part is not types.NoneType]
-        return " or ".join(kinds) + (", or none" if types.NoneType in parts else "")
-    if origin is Literal:
-        return "one of " + ", ".join(repr(part) for part in parts)
-    if origin is tuple:
-        return _describe_tuple(parts, metadata)
-    if hint in (int, float):
-        bounds = _bounds(metadata)
-        return f"{'an integer' if hint is int else 'a number' if bounds else 'a finite number'}{bounds}"
-    if is_record(hint) or origin in (dict, Mapping):
-        return "a mapping of names to values"
-    return {bool: "true or false", str: "a string"}.get(hint, f"a {getattr(hint, '__name__', hint)}")
-
-
-def _describe_tuple(parts: tuple[Any, ...], metadata: tuple[Any, ...]) -> str:
-    item = describe(parts[0]).removeprefix("an ").removeprefix("a ")
-    for singular in ("finite number", "number", "integer", "string"):
-        item = item.replace(singular, singular + "s", 1) if item.startswith(singular) else item
-    if parts[-1] is not Ellipsis:
-        return f"a list of {len(parts)} {item}"
-    least = next((mark.min_length for mark in metadata if isinstance(mark, MinLen)), 0)
-    return f"a list of {'one or more ' if least == 1 else f'{least} or more ' if least else ''}{item}"
-
-
-def _bounds(metadata: tuple[Any, ...]) -> str:
-    low = next((mark for mark in metadata if isinstance(mark, Gt | Ge)), None)
-    high = next((mark for mark in metadata if isinstance(mark, Lt | Le)), None)
-    if isinstance(low, Ge) and isinstance(high, Le):
-        return f" between {low.ge} and {high.le}"
-    below = "" if low is None else f" greater than {low.gt}" if isinstance(low, Gt) else f" of at least {low.ge}"
-    above = "" if high is None else f" less than {high.lt}" if isinstance(high, Lt) else f" of at most {high.le}"
-    return below + (" and" if below and above else "") + above
-
-
 # -- conversion before pydantic's own validation ---------------------------------------------------------------------
 
 
 def _lenient(hint: Any) -> Any:
-    """Returns an annotated type that also accepts YAML and numpy representations, and rejects booleans as numbers."""
+    """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as numbers."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
-    if origin is ClassVar or hint is ClassVar:
-        return hint
     if origin is Annotated:  # pydantic applies the last validators of an annotation first
         kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
@@ -231,42 +180,29 @@ def _lenient(hint: Any) -> Any:
         union = typing.Union[tuple(_lenient(part) for part in parts)]  # noqa: UP007
         return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
     if origin is tuple:
-        inner = tuple(part if part is Ellipsis else _lenient(part) for part in parts)
-        return Annotated[tuple[inner], pydantic.BeforeValidator(_listed)]  # type: ignore[valid-type]
-    before = {float: _number, int: _integer, bool: _boolean}.get(hint)
-    return hint if before is None else Annotated[hint, pydantic.BeforeValidator(before)]
+        return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
+    if hint in (int, float):
+        return Annotated[hint, pydantic.BeforeValidator(functools.partial(_number, hint))]
+    return Annotated[bool, pydantic.BeforeValidator(_boolean)] if hint is bool else hint
 
 
 def _none(value: Any) -> Any:
     return None if isinstance(value, str) and value.lower() == "none" else value
 
 
-def _listed(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else value
-
-
-def _scalar(value: Any) -> Any:
-    """Returns the Python number of a numpy or JAX scalar, and anything else as it is."""
-    return value.item() if hasattr(value, "item") and not getattr(value, "shape", ()) else value
-
-
-def _number(value: Any) -> Any:
-    value = _scalar(value)
-    if isinstance(value, bool):
-        raise ValueError("a boolean")
-    return float(value) if isinstance(value, str) else value
-
-
-def _integer(value: Any) -> Any:
-    value = _number(value)
-    return int(value) if isinstance(value, float) and value.is_integer() else value
+def _number(kind: type, value: Any) -> Any:
+    if type(value).__name__.startswith("bool"):
+        raise ValueError("a number")
+    try:
+        return float(value) if isinstance(value, str) and kind is int else value
+    except ValueError:
+        return value
 
 
 def _boolean(value: Any) -> bool:
-    value = _scalar(value)
-    if not isinstance(value, bool):
-        raise ValueError("not a boolean")
-    return value
+    if not type(value).__name__.startswith("bool"):  # of Python or numpy
+        raise ValueError("true or false")
+    return bool(value)
 
 
 # -- names and messages ----------------------------------------------------------------------------------------------
@@ -311,54 +247,24 @@ def _merged(settings: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _plain(name: str, value: Any) -> Any:
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if is_record(value):
-        return {key: _plain(f"{name}.{key}", item) for key, item in to_mapping(value).items()}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(f"{name}.{key}", item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(f"{name}[{i}]", item) for i, item in enumerate(value)]
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    fail(name, value, "a number, a string, true, false, none, or lists and mappings of these")
-
-
-def _one_line(kind: Any, values: Any, error: pydantic.ValidationError) -> InputError:
+def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     """Returns the first error of a validation: path, value, and what is allowed."""
-    first: ErrorDetails = error.errors(include_url=False)[0]
-    path, where, value = _locate(kind, values, first)
-    raised = first.get("ctx", {}).get("error")
-    if isinstance(raised, InputError):
-        return InputError(".".join([*path, str(raised)]))
-    name = ".".join(path)
+    first = error.errors(include_url=False)[0]
+    places = [str(part) for part in first["loc"]]
+    value, context = first["input"], first.get("ctx", {})
+    if isinstance(raised := context.get("error"), InputError):
+        return InputError(".".join([*places, str(raised)]))
     if first["type"] == "unexpected_keyword_argument":
-        known = list(hints_of(where))
-        unknown = str(first["loc"][-1])
+        for part in places[:-1]:
+            kind = _record_in(hints_of(kind)[part])
+        known = list(hints_of(kind))
         return InputError(
-            f"{'.'.join([*path, unknown])}: unknown name (value {first['input']!r}){nearest(unknown, known)}; "
-            f"allowed: {', '.join(known)}"
+            f"{'.'.join(places)}: unknown name (value {value!r}){nearest(places[-1], known)}; allowed: {', '.join(known)}"
         )
     if first["type"] == "missing":
-        return InputError(f"{name}: is missing; it must be {describe(where)}")
-    suggestion = nearest(value, typing.get_args(where)) if isinstance(value, str) else ""
-    return InputError(f"{name}: {value!r} is not allowed; it must be {describe(where)}{suggestion}")
-
-
-def _locate(kind: Any, values: Any, error: ErrorDetails) -> tuple[list[str], Any, Any]:
-    """Returns the path of the invalid field, its annotated type, and the given value."""
-    path: list[str] = []
-    where = kind
-    for part in error["loc"]:
-        inner = _record_in(where)
-        if inner is None:
-            break
-        hints = hints_of(inner)
-        if part in hints:
-            path.append(str(part))
-            where = hints[part]
-            values = values.get(part) if isinstance(values, Mapping) else getattr(values, str(part), None)
-        else:
-            where = inner
-    return path, where, values
+        return InputError(f"{'.'.join(places)}: is missing")
+    allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
+    if first["type"].startswith("dataclass"):
+        allowed = "it must be a mapping of names to values"
+    choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", ""))]
+    return InputError(f"{'.'.join(places)}: {value!r} is not allowed; {allowed}{nearest(value, choices)}")

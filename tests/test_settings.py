@@ -19,9 +19,7 @@ from mqe_jax.settings import (
     PositiveInt,
     Range,
     build,
-    describe,
     fail,
-    hints_of,
     load_yaml,
     override,
     record,
@@ -84,25 +82,25 @@ def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"count": 0}, "count: 0 is not allowed; it must be an integer greater than 0"),
-        ({"count": 1.5}, "count: 1.5 is not allowed; it must be an integer"),
-        ({"count": True}, "count: True is not allowed"),
+        ({"count": 0}, "count: 0 is not allowed; it must be greater than 0"),
+        ({"count": 1.5}, "count: 1.5 is not allowed; it must be a valid integer"),
+        ({"count": True}, "count: True is not allowed; it must be a number"),
         ({"flag": 1}, "flag: 1 is not allowed; it must be true or false"),
         ({"plain": float("nan")}, "plain: nan is not allowed; it must be a finite number"),
         ({"plain": "inf"}, "plain: 'inf' is not allowed; it must be a finite number"),
         ({"limit": float("nan")}, "limit: nan is not allowed; it must be a number, infinity included"),
-        ({"sizes": 64}, "sizes: 64 is not allowed; it must be a list of one or more integers greater than 0"),
+        ({"sizes": 64}, "sizes: 64 is not allowed; it must be a valid tuple"),
         ({"sizes": []}, "sizes: [] is not allowed"),
-        ({"sizes": [1, -1]}, "sizes: [1, -1] is not allowed"),
+        ({"sizes": [1, -1]}, "sizes.1: -1 is not allowed; it must be greater than 0"),
         ({"span": (1, 0)}, "span: (1, 0) is not allowed; it must be two numbers (lowest, highest)"),
-        ({"label": 3}, "label: 3 is not allowed; it must be a string, or none"),
-        ({"free": 3}, "free: 3 is not allowed; it must be a mapping"),
+        ({"label": 3}, "label: 3 is not allowed; it must be a valid string"),
+        ({"free": 3}, "free: 3 is not allowed; it must be a valid dictionary"),
         ({"cuont": 3}, "cuont: unknown name (value 3) (did you mean 'count'?); allowed: count, flag"),
         ({"inner": 3}, "inner: 3 is not allowed; it must be a mapping"),
-        ({"inner.clip": "much"}, "inner.clip: 'much' is not allowed; it must be a number greater than 0"),
-        ({"inner.dual": 1}, "inner.dual: 1 is not allowed; it must be a number greater than 1, or none"),
-        ({"inner.gamma": 1.1}, "inner.gamma: 1.1 is not allowed; it must be a number between 0 and 1"),
-        ({"inner.kind": "agnet"}, "inner.kind: 'agnet' is not allowed; it must be one of 'agent', 'joint' (did you"),
+        ({"inner.clip": "much"}, "inner.clip: 'much' is not allowed; it must be a valid number"),
+        ({"inner.dual": 1}, "inner.dual: 1 is not allowed; it must be greater than 1"),
+        ({"inner.gamma": 1.1}, "inner.gamma: 1.1 is not allowed; it must be less than or equal to 1"),
+        ({"inner.kind": "agnet"}, "inner.kind: 'agnet' is not allowed; it must be 'agent' or 'joint' (did you"),
         ({"inner": {"clp": 1}}, "inner.clp: unknown name (value 1) (did you mean 'clip'?)"),
         ({"inner": {"clip": 6, "kind": "joint"}}, "inner.clip: 6.0 is not allowed; it must be at most 5 when"),
     ],
@@ -135,7 +133,7 @@ def test_to_a_mapping_and_back(tmp_path: Path) -> None:
     assert mapping["free"] == {"range": [0, 1.0]}
     assert mapping["inner"] == {"clip": 0.2, "dual": 3.0, "gamma": 0.99, "kind": "agent"}
     assert to_mapping(build(Derived, mapping)) == mapping
-    with pytest.raises(InputError, match=r"^free\.x: <object"):
+    with pytest.raises(InputError, match="Outer: <object"):
         to_mapping(Outer(free={"x": object()}))
 
 
@@ -156,10 +154,3 @@ def test_files(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
     with pytest.raises(InputError, match=r"missing\.yaml: cannot be read"):
         load_yaml(tmp_path / "missing.yaml")
-
-
-def test_descriptions_of_fields() -> None:
-    words = {name: describe(hint) for name, hint in hints_of(Outer).items()}
-    assert words["count"] == "an integer greater than 0"
-    assert words["span"] == "two numbers (lowest, highest), in this order, or none"
-    assert describe(hints_of(Inner)["gamma"]) == "a number between 0 and 1"

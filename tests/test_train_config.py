@@ -34,14 +34,14 @@ def test_there_and_back() -> None:
     ("values", "message"),
     [
         ({"ppo": {"gama": 1.0}}, "ppo.gama: unknown name .*did you mean 'gamma'"),
-        ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be an integer greater than 0"),
+        ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be greater than 0"),
         ({"ppo.ratio": "joint"}, "ppo.value: 'agent' .* 'joint' when ppo.ratio is 'joint'"),
         ({"ppo.dual_clip": 0.5}, "ppo.dual_clip: 0.5 .* greater than 1"),
-        ({"network.hidden_sizes": []}, "network.hidden_sizes: .* one or more integers greater than 0"),
+        ({"network.hidden_sizes": []}, "network.hidden_sizes: .* should have at least 1 item"),
         ({"network.hidden_size": 3}, "network.hidden_size: unknown name .* 'hidden_sizes'"),
         ({"network.name": "actor_crtic"}, "network.name: 'actor_crtic' .* a registered network: .*actor_critic"),
         ({"network.log_std_min": 1.0}, r"network.log_std_init: 0.0 .* at least log_std_min \(1.0\)"),
-        ({"network": 3}, "network: 3 is not allowed; it must be a mapping of a network's settings"),
+        ({"network": 3}, "network: 3 is not allowed; it must be an instance of NetworkSettings"),
     ],
 )
 @pytest.mark.parametrize("way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"])

@@ -13,7 +13,6 @@ from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import (
-    Allowed,
     Fraction,
     NonNegative,
     Positive,
@@ -167,9 +166,7 @@ class TrainConfig:
     """Factor on sampled actions before the environment clips them; log-probabilities are of the unscaled sample."""
     ppo: PPO = PPO()
     optimizer: OptimizerSettings = OptimizerSettings()
-    network: Annotated[
-        NetworkSettings, pydantic.BeforeValidator(network_settings), Allowed("a mapping of a network's settings")
-    ] = ActorCritic()
+    network: Annotated[NetworkSettings, pydantic.BeforeValidator(network_settings)] = ActorCritic()
     curriculum: Curriculum = Curriculum()
     normalization: Normalization = Normalization()
     checkpoint: Checkpointing = Checkpointing()
