@@ -24,7 +24,7 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NoReturn, TypeVar, dataclass_transform
+from typing import Annotated, Any, NoReturn, TypeVar, dataclass_transform
 
 import pydantic
 import pydantic_core
@@ -258,9 +258,8 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
         for part in places[:-1]:
             kind = _record_in(hints_of(kind)[part])
         known = list(hints_of(kind))
-        return InputError(
-            f"{'.'.join(places)}: unknown name (value {value!r}){nearest(places[-1], known)}; allowed: {', '.join(known)}"
-        )
+        hint = f"{nearest(places[-1], known)}; allowed: {', '.join(known)}"
+        return InputError(f"{'.'.join(places)}: unknown name (value {value!r}){hint}")
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")
     allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")

@@ -15,8 +15,8 @@ from fake_env import FakeEnv, FakeVectorEnv
 
 import mqe_jax
 from mqe_jax import cli
-from mqe_jax.cli import arguments, commands, setup, view
-from mqe_jax.cli.train_arguments import parse_train
+from mqe_jax.cli import arguments, bench, commands, setup
+from mqe_jax.cli.train import parse_train, parse_walk_train, runner
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError, NonFiniteError
@@ -25,22 +25,17 @@ from mqe_jax.settings import override
 from mqe_jax.train import checkpoint
 from mqe_jax.train.mat import Mat
 from mqe_jax.train.nn import mlp_init
-from mqe_jax.viz import recording
+from mqe_jax.viz import recording, render
+from mqe_jax.walk.training import WALK
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
-
-
-def replace_make_env(patch: pytest.MonkeyPatch, make_env: Any) -> None:
-    """Replaces the function that makes environments, for training and for the other commands."""
-    for module in (setup, commands, view):
-        patch.setattr(module, "make_env", make_env)
 
 
 @pytest.fixture(autouse=True)
 def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The task `fake` in addition to the real ones, and an empty working folder."""
     monkeypatch.chdir(tmp_path)
-    real = commands.make_env
+    real = setup.make_env
 
     def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
         if task != "fake":
@@ -48,7 +43,7 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         env = FakeEnv()
         return env, FakeVectorEnv(env, num_envs)
 
-    replace_make_env(monkeypatch, make_env)
+    monkeypatch.setattr(setup, "make_env", make_env)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +52,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "fake"
     patch = pytest.MonkeyPatch()
     env = FakeEnv()
-    replace_make_env(patch, lambda task, impl, overrides, n, copies=1: (env, FakeVectorEnv(env, n)))
+    patch.setattr(setup, "make_env", lambda task, impl, overrides, n, copies=1: (env, FakeVectorEnv(env, n)))
     assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     patch.undo()
     return folder
@@ -74,7 +69,7 @@ def test_the_version_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().out == f"mqe {mqe_jax.__version__}\n"
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in arguments.COMMANDS), ["walk", "eval"]])
+@pytest.mark.parametrize("command", [[], *(name.split() for name in arguments.COMMANDS), ["walk"]])
 def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main([*command, "--help"])
@@ -195,7 +190,7 @@ def test_bench_prints_its_figures_and_appends_them(
 def test_a_table_that_cannot_be_appended_to_is_refused_before_measuring(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(commands.benchmark, "bench", lambda *arguments, **settings: pytest.fail("measured"))
+    monkeypatch.setattr(bench, "bench", lambda *arguments, **settings: pytest.fail("measured"))
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     for path, words in (("/proc/none/x.csv", "cannot be written"), ("other.csv", "has other columns"), (".", "read")):
         assert cli.main(["bench", "fake", "--csv", path]) == 2
@@ -225,10 +220,8 @@ def test_the_best_of_several_episodes_is_rendered(
         for n, success, reward in ((6, 0.5, 2.0), (4, 1.0, 0.5), (5, 1.0, 1.0))
     ]
     rendered = []
-    monkeypatch.setattr(commands.recording, "record", lambda *arguments, **named: recorded)
-    monkeypatch.setattr(
-        commands.rendering, "render_episode", lambda env, episode, path, **named: rendered.append(episode) or "egl"
-    )
+    monkeypatch.setattr(recording, "record", lambda *arguments, **named: recorded)
+    monkeypatch.setattr(render, "render_episode", lambda env, episode, path, **named: rendered.append(episode) or "egl")
     assert cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"]) == 0
     (line,) = capfd.readouterr().out.splitlines()
     assert [len(episode) for episode in rendered] == [5]
@@ -255,7 +248,7 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
         played.append((source, deterministic))
         raise InputError("stop")
 
-    monkeypatch.setattr(commands, "load_policy", load)
+    monkeypatch.setattr("mqe_jax.policies.load_policy", load)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)  # for the viewer's packages
     flags = {"render": ["-o", "clip.png"], "view": ["--port", "49876"]}.get(command, [])
     for target in (str(run_folder), "go1gate", "fake"):
@@ -341,10 +334,11 @@ def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: py
     [
         (["bench", "--nope", "3"], ["--nope"]),
         (["eval", "fake", "--episodes", "many"], ["episodes", "many"]),
-        (["train", "fake", "--ppo.gamma", "2"], ["ppo: gamma: 2.0", "between 0 and 1"]),
+        (["train", "fake", "--ppo.gamma", "2"], ["ppo: gamma: 2.0", "less than or equal to 1"]),
         (["train", "fake", "--ppo.clip", "much"], ["ppo.clip", "'much'"]),
-        (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network: hidden_sizes: (8, 0)"]),
+        (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network: hidden_sizes.1: 0"]),
         (["train", "fake", "--network.heads", "2"], ["--network.heads"]),
+        (["walk", "train", "--ppo.clp", "1"], ["--ppo.clp", "Perhaps you meant: --ppo.clip"]),
         (["train", "fake", "--seed", "99999999999999999999"], ["seed: 99999999999999999999", "4294967296"]),
     ],
     ids=str,
@@ -366,6 +360,10 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
     parsed = parse_train(["--network.name", "mat", "--network.heads", "2", "go1gate", "--checkpoint.no-environments"])
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
     assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
+    walk = parse_walk_train(
+        ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--num-envs", "16"]
+    ).settings
+    assert walk == override(WALK, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0, "num_envs": 16})
 
 
 def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -386,7 +384,7 @@ def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch,
     def stop(*arguments: Any, **named: Any) -> None:
         raise NonFiniteError("run: update 3 made loss/value NaN or infinite")
 
-    monkeypatch.setattr(commands.runner, "train_seeds", stop)
+    monkeypatch.setattr(runner, "train_seeds", stop)
     assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 1
     assert capfd.readouterr().err.splitlines()[-1] == "mqe: run: update 3 made loss/value NaN or infinite"
 
@@ -395,7 +393,7 @@ def test_a_file_that_cannot_be_written_ends_with_2(monkeypatch: pytest.MonkeyPat
     def stop(*arguments: Any, **named: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/metrics.csv")
 
-    monkeypatch.setattr(commands.runner, "train_seeds", stop)
+    monkeypatch.setattr(runner, "train_seeds", stop)
     assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 2
     assert capfd.readouterr().err == "mqe: run/metrics.csv: No space left on device\n"
 
@@ -404,7 +402,7 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any)
     def stop(arguments: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "tasks", stop)
+    monkeypatch.setattr(commands.Tasks, "run", stop)
     assert cli.main(["tasks"]) == 130
     assert "Traceback" not in capfd.readouterr().err
 
@@ -420,7 +418,7 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any)
 )
 def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a ValueError that code of the package raises, unless it is an InputError."""
-    monkeypatch.setattr(commands, "make_env", lambda *arguments: defect())
+    monkeypatch.setattr(setup, "make_env", lambda *arguments: defect())
     with pytest.raises(error):
         cli.main(["bench", "fake"])
 

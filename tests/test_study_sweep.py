@@ -12,7 +12,7 @@ import pytest
 from probes import Probe
 
 from mqe_jax import cli
-from mqe_jax.cli import study_commands
+from mqe_jax.cli import setup
 from mqe_jax.errors import InputError
 from mqe_jax.files import locked
 from mqe_jax.settings import build, override
@@ -192,7 +192,7 @@ def test_the_commands_say_what_is_left_and_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     load(tmp_path)
-    monkeypatch.setattr(study_commands, "environments", lambda impl, config, seeds: (PROBE, PROBE))
+    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: (PROBE, PROBE))
     arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]
     assert cli.main([*arguments, "--dry-run"]) == 0
     out = capfd.readouterr().out

@@ -125,7 +125,7 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
 def test_a_run_is_resumed_and_its_weights_walk(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights = str(walk_policy.ASSETS / GO1.walk.weights)
     train = ["walk", "train", "--run-dir", str(tmp_path), "--num-envs", "16", "--impl", "c", "--weights", weights]
-    train += ["--set", "optimizer.learning_rate=1e-5", "--set", "network.log_std_init=-2", "--total-steps"]
+    train += ["--optimizer.learning-rate", "1e-5", "--network.log-std-init", "-2", "--total-steps"]
     assert cli.main([*train, str(16 * 24)]) == 0
     assert cli.main([*train, str(3 * 16 * 24), "--resume"]) == 0
     rows = (tmp_path / "metrics.csv").read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Implementation of `mqe demo`."""
+"""The command `demo`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 import jax
 
 from mqe_jax import interrupts
-from mqe_jax.cli.arguments import Demo
-from mqe_jax.cli.commands import draw
+from mqe_jax.cli.commands import Demo
 from mqe_jax.cli.output import echo
+from mqe_jax.cli.render import draw
 from mqe_jax.cli.setup import base_config, for_task, make_env
 from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError

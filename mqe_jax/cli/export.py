@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
+import tyro
+
+from mqe_jax.cli.options import Json
 from mqe_jax.cli.output import echo, print_table
-from mqe_jax.cli.setup import make_env
-from mqe_jax.cli.view_arguments import Export
 from mqe_jax.errors import InputError
-from mqe_jax.policies import load_policy
 
 STEPS = 100
 """Steps of the episodes on which the graph is compared with JAX."""
@@ -17,34 +19,47 @@ LARGEST_ERROR = 1e-4
 """Largest allowed difference of any output from JAX."""
 
 
-def export(arguments: Export) -> dict[str, Any]:
-    """Writes the ONNX graph of a run if it agrees with JAX; prints a table, or returns the object for `--json`."""
-    if any(importlib.util.find_spec(name) is None for name in ("jax2onnx", "onnxruntime")):
-        raise InputError("export: needs jax2onnx and onnxruntime (pip install 'mqe-jax[export]')")
-    if arguments.onnx.suffix != ".onnx" or arguments.onnx.is_dir():
-        raise InputError(f"onnx: {str(arguments.onnx)!r} is not allowed; it must be a file that ends in .onnx")
-    policy = load_policy(arguments.run_dir)
-    task = policy.config.task
-    if task is None:
-        raise InputError(f"{arguments.run_dir}: its settings have no 'task' entry")
+@dataclass(frozen=True)
+class Export:
+    """Write a trained policy, together with the walk policy, as one ONNX graph."""
 
-    from mqe_jax.export.check import errors, record
-    from mqe_jax.export.policy import save_onnx, shapes, to_onnx
+    run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """Run folder, or policy file."""
+    onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """File to write (.onnx)."""
+    json: Json = False
 
-    env, _ = make_env(task, "c", policy.config.env, 1)
-    model = to_onnx(policy, env)
-    error, output = max((error, name) for name, error in errors(model, *record(policy, env, STEPS)).items())
-    if not error <= LARGEST_ERROR:
-        raise InputError(
-            f"export: {arguments.onnx} is not written, because in {STEPS} steps of {task} the graph's output "
-            f"{output!r} differs from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
-        )
-    save_onnx(model, arguments.onnx)
-    sizes = shapes(model)
-    echo(f"mqe: wrote {arguments.onnx}, {arguments.onnx.stat().st_size / 1e6:.1f} MB")
-    result = {"task": task, "control": env.control, "largest_error": error, **sizes}
-    if not arguments.json:
-        for kind, values in sizes.items():
-            print_table({f"{kind[:-1]} {name}": " x ".join(map(str, shape)) for name, shape in values.items()})
-        print_table({"largest error against JAX": f"{error:.1e}, of {STEPS} steps"})
-    return result
+    def run(self) -> dict[str, Any]:
+        """Writes the graph if it agrees with JAX; prints a table, or returns the object for `--json`."""
+        from mqe_jax.cli.setup import make_env
+        from mqe_jax.policies import load_policy
+
+        if any(importlib.util.find_spec(name) is None for name in ("jax2onnx", "onnxruntime")):
+            raise InputError("export: needs jax2onnx and onnxruntime (pip install 'mqe-jax[export]')")
+        if self.onnx.suffix != ".onnx" or self.onnx.is_dir():
+            raise InputError(f"onnx: {str(self.onnx)!r} is not allowed; it must be a file that ends in .onnx")
+        policy = load_policy(self.run_dir)
+        task = policy.config.task
+        if task is None:
+            raise InputError(f"{self.run_dir}: its settings have no 'task' entry")
+
+        from mqe_jax.export.check import errors, record
+        from mqe_jax.export.policy import save_onnx, shapes, to_onnx
+
+        env, _ = make_env(task, "c", policy.config.env, 1)
+        model = to_onnx(policy, env)
+        error, output = max((error, name) for name, error in errors(model, *record(policy, env, STEPS)).items())
+        if not error <= LARGEST_ERROR:
+            raise InputError(
+                f"export: {self.onnx} is not written, because in {STEPS} steps of {task} the graph's output "
+                f"{output!r} differs from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
+            )
+        save_onnx(model, self.onnx)
+        sizes = shapes(model)
+        echo(f"mqe: wrote {self.onnx}, {self.onnx.stat().st_size / 1e6:.1f} MB")
+        result = {"task": task, "control": env.control, "largest_error": error, **sizes}
+        if not self.json:
+            for kind, values in sizes.items():
+                print_table({f"{kind[:-1]} {name}": " x ".join(map(str, shape)) for name, shape in values.items()})
+            print_table({"largest error against JAX": f"{error:.1e}, of {STEPS} steps"})
+        return result

@@ -13,7 +13,7 @@ from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError, one_line
 
 if TYPE_CHECKING:
-    from mqe_jax.cli.arguments import Command
+    from mqe_jax.cli.options import Command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,9 +71,8 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
 def _run(command: Command) -> None:
     from mqe_jax.cli.output import print_json, standard_output
 
-    action = getattr(command, "action", command)
-    as_json = bool(getattr(action, "json", False))
-    if not 0 <= (seed := getattr(action, "seed", 0)) < 2**32:
+    as_json = bool(getattr(command, "json", False))
+    if not 0 <= (seed := getattr(command, "seed", 0)) < 2**32:
         raise InputError(f"seed: {seed} is not allowed; it must be between 0 and 4294967295")
     with standard_output(reserved=as_json) as out:
         result = command.run()

@@ -1,11 +1,18 @@
-"""Options that several commands share, and the protocol of a command."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import tyro
+
+from mqe_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mqe_jax.train.policy import Policy
 
 Repeated = tyro.conf.UseAppendAction
 
@@ -22,49 +29,10 @@ Impl = Annotated[
     str,
     tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
 ]
-Set = Annotated[
-    list[str],
-    Repeated,
-    tyro.conf.arg(
-        name="set",
-        metavar="KEY=VALUE",
-        help="Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML.",
-    ),
-]
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
 Seed = Annotated[int, tyro.conf.arg(help="Random seed.")]
-Control = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="MODE",
-        help="Action mode: command (velocities for the walk policy), position (joint targets), torque. "
-        "Default: command, or the run's mode.",
-    ),
-]
-PolicyName = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="NAME|RUN|FILE",
-        help="Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half "
-        "speed), a run folder, or a policy file. Default: that of the given run; of a task: scripted if it has one, "
-        "else forward.",
-    ),
-]
-OpponentName = Annotated[
-    str | None,
-    tyro.conf.arg(metavar="NAME|RUN|FILE", help="Policy of team 1 in a match: what --policy accepts. Default: idle."),
-]
-Deterministic = Annotated[
-    bool,
-    tyro.conf.arg(help="Use a trained policy's mean actions; otherwise they are sampled, as in training."),
-]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
-TaskRobot = Annotated[
-    str | None,
-    tyro.conf.arg(metavar="NAME", help="Robot of the task: go1 or go2. Default: go1, or the run's robot."),
-]
-
-
+PolicyName = Annotated[str | None, tyro.conf.arg(metavar="NAME|RUN|FILE")]
 DumpDiverged = Annotated[
     Path | None,
     tyro.conf.arg(
@@ -73,3 +41,63 @@ DumpDiverged = Annotated[
         "Keeps the states of two rollouts in memory.",
     ),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOptions:
+    """Options of a task."""
+
+    impl: Impl = "auto"
+    control: Annotated[str | None, tyro.conf.arg(metavar="MODE")] = None
+    """Action mode: command (velocities for the walk policy), position (joint targets), torque. Default: command, or the
+    run's mode."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Robot of the task: go1 or go2. Default: go1, or the run's robot."""
+    set: Annotated[list[str], Repeated, tyro.conf.arg(metavar="KEY=VALUE")] = field(default_factory=list)
+    """Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML."""
+
+    def overrides(self) -> dict[str, Any]:
+        """Returns the task parameters given by --set, --control and --robot."""
+        from mqe_jax.cli.setup import parse_overrides
+
+        flags = {"control": self.control, "robot": self.robot}
+        return parse_overrides(self.set) | {name: value for name, value in flags.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyOptions(TaskOptions):
+    """Options of a task and its policies."""
+
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
+    """Id of a task, or run folder."""
+    policy: PolicyName = None
+    """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
+    a run folder, or a policy file. Default: that of the given run; of a task: scripted if it has one, else forward."""
+    opponent: PolicyName = None
+    """Policy of team 1 in a match: what --policy accepts. Default: idle."""
+    deterministic: bool = False
+    """Use a trained policy's mean actions; otherwise they are sampled, as in training."""
+    seed: Seed = 0
+
+    def environments(self, num_envs: int) -> tuple[Any, Any, Policy]:
+        """Returns task and vectorised environment as `make_env`, and the policy of all agents.
+
+        A run has its own task, parameters and policy; a task has its scripted policy, or forward if it has none.
+        """
+        from mqe_jax.cli import setup
+        from mqe_jax.envs import ALIASES, PLANNERS
+        from mqe_jax.policies import all_agents, load_policy
+
+        task, params = ALIASES.get(self.target, self.target), self.overrides()
+        name = self.policy or ("scripted" if task in PLANNERS else "forward")
+        if os.sep in self.target or Path(self.target).exists():
+            config = setup.run_config(self.target)
+            task, params, name = config.task, {**config.env, **params}, self.policy or self.target
+        env, vector_env = setup.make_env(task, self.impl, params, num_envs)
+        own, opponent = load_policy(name, env, deterministic=self.deterministic), None
+        if self.opponent is not None:
+            try:
+                opponent = load_policy(self.opponent, env, deterministic=self.deterministic)
+            except InputError as error:
+                raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
+        return env, vector_env, all_agents(env, own, opponent)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mqe_jax.cli.output import echo
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.files import check_folder
 from mqe_jax.opponents import TeamState
@@ -52,6 +53,11 @@ class DivergenceRecorder:
             states: Any = SimpleNamespace(data=SimpleNamespace(**steps.pop("data")), **steps)
             save_recording(self._next_file(), self._env, states, actions[last])
         self._previous = trace
+
+    def report(self) -> None:
+        """Prints how many recordings there are, if any, and how to replay one."""
+        if self.written:
+            echo(f"mqe: recorded {len(self.written)} divergences; replay the first with: mqe replay {self.written[0]}")
 
     def _next_file(self) -> Path:
         taken = {file.name for file in self._folder.glob("diverged_*.npz")}

@@ -14,7 +14,9 @@ from mqe_jax.cli.output import echo
 from mqe_jax.envs import PLANNERS, VectorEnv, make
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.opponents import Mirror, versus
+from mqe_jax.policies import load_policy
 from mqe_jax.settings import fail, override
+from mqe_jax.train import runner
 from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig, load_config
 
@@ -33,6 +35,24 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
         except yaml.YAMLError:
             raise InputError(f"set: the value of {pair!r} cannot be read as YAML") from None
     return values
+
+
+def run_config(target: str) -> Any:
+    """Returns the settings in a run folder or a policy file.
+
+    Raises:
+        InputError: where there are none, or they name no task.
+    """
+    if target.endswith(".safetensors"):
+        return load_policy(target).config
+    if not Path(target).is_dir():
+        raise InputError(f"run: no folder {target!r}; allowed: a run folder, a policy file, or a task's id")
+    if not (Path(target) / runner.CONFIG_FILE).is_file():
+        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder")
+    config = runner.load_run_config(target)
+    if config.task is None:
+        raise InputError(f"{target}: {runner.CONFIG_FILE} has no 'task' entry")
+    return config
 
 
 def make_env(

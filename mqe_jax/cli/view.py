@@ -5,38 +5,46 @@ from __future__ import annotations
 import errno
 import importlib.util
 import socket
+from dataclasses import dataclass
 
-from mqe_jax.cli.commands import task_and_policy, team_policies
+from mqe_jax.cli.options import PolicyOptions
 from mqe_jax.cli.output import echo
-from mqe_jax.cli.setup import make_env
-from mqe_jax.cli.view_arguments import View
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
-def view(arguments: View) -> None:
-    """Shows a task in the browser until Ctrl-C."""
-    if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
-        raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
-    if not 1 <= arguments.num_envs <= 16:
-        fail("num_envs", arguments.num_envs, "between 1 and 16")
-    if not 0 < arguments.port < 65536:
-        fail("port", arguments.port, "between 1 and 65535")
-    _check_address(arguments.host, arguments.port)
-    task, overrides, name = task_and_policy(arguments)
-    env, vector_env = make_env(task, arguments.impl, overrides, arguments.num_envs)
-    policy = team_policies(arguments, name, env)
+@dataclass(frozen=True)
+class View(PolicyOptions):
+    """Show a task or a trained run in the browser, with teleoperation and live plots."""
 
-    from mqe_jax.view.session import Session
-    from mqe_jax.view.viewer import Viewer
+    num_envs: int = 1
+    """Number of environments, side by side: 1 to 16."""
+    host: str = "127.0.0.1"
+    """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
+    port: int = 8080
+    """Port to listen on, or the next free one if it is in use."""
 
-    viewer = Viewer(Session(env, vector_env, policy, arguments.seed), arguments.host, arguments.port)
-    if arguments.host not in _LOCAL:
-        echo(f"mqe: warning: every machine that reaches {arguments.host} can open this page and control the robots")
-    echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
-    viewer.run()
+    def run(self) -> None:
+        """Shows a task in the browser until Ctrl-C."""
+        if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
+            raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
+        if not 1 <= self.num_envs <= 16:
+            fail("num_envs", self.num_envs, "between 1 and 16")
+        if not 0 < self.port < 65536:
+            fail("port", self.port, "between 1 and 65535")
+        _check_address(self.host, self.port)
+        env, vector_env, policy = self.environments(self.num_envs)
+
+        from mqe_jax.view.session import Session
+        from mqe_jax.view.viewer import Viewer
+
+        viewer = Viewer(Session(env, vector_env, policy, self.seed), self.host, self.port)
+        if self.host not in _LOCAL:
+            echo(f"mqe: warning: every machine that reaches {self.host} can open this page and control the robots")
+        echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
+        viewer.run()
 
 
 def _check_address(host: str, port: int) -> None:

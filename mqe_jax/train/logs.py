@@ -220,12 +220,13 @@ class ProgressLog:
             self._bar.stop()
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Shows steps, reward, speed and the remaining time."""
+        """Shows steps, speed and the remaining time, and what there is of reward per step (else return) and success."""
         step = int(row["env_steps"])
-        numbers = f"reward {row.get('average_step_reward', math.nan):.4g}"
-        if math.isfinite(row.get("success", math.nan)):
-            numbers += f", success {row['success']:.0%}"
-        numbers += f", {row['fps']:,.0f} steps/s"
+        known = {name: value for name, value in row.items() if math.isfinite(value)}
+        rewards = {"average_step_reward": "reward", "episode_return": "return"}
+        parts = [f"{word} {known[name]:.4g}" for name, word in rewards.items() if name in known][:1]
+        parts += [f"success {known['success']:.0%}"] if "success" in known else []
+        numbers = ", ".join([*parts, f"{row['fps']:,.0f} steps/s"])
         if self._bar is not None:
             self._bar.update(self._task, completed=step, numbers=numbers)
             return

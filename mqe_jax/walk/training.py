@@ -42,13 +42,13 @@ WALK = TrainConfig(
 """Settings for training walk weights from nothing; the assistance is the curriculum of slopes, forces and pushes."""
 
 
-def train_walk(robot: Robot, run_dir: Path, changes: dict[str, Any], *, impl: str, resume: bool) -> TrainState:
+def train_walk(robot: Robot, run_dir: Path, config: TrainConfig, *, impl: str, resume: bool) -> TrainState:
     """Trains walk weights and writes them to walk.safetensors (float16) in the run folder, at every checkpoint.
 
     Args:
         robot: the robot.
         run_dir: run folder, as that of `mqe_jax.train.runner.train`.
-        changes: settings that differ from `WALK`, as in `mqe_jax.settings.override`.
+        config: settings, such as `WALK`.
         impl: engine.
         resume: continue from the newest checkpoint.
 
@@ -56,7 +56,7 @@ def train_walk(robot: Robot, run_dir: Path, changes: dict[str, Any], *, impl: st
         InputError: as `train`.
         NonFiniteError: as `train`.
     """
-    config = override(WALK, {**changes, "env": {"robot": robot.name}})
+    config = override(config, {"env": {"robot": robot.name}})
     env: Any = WalkEnv(robot, impl=impl, num_envs=config.num_envs)
 
     def save(state: TrainState, row: dict[str, float]) -> None:

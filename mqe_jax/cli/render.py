@@ -1,0 +1,113 @@
+"""The command `render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from mqe_jax.cli.options import Json, PolicyOptions
+from mqe_jax.cli.output import echo
+from mqe_jax.settings import fail
+
+if TYPE_CHECKING:
+    from mqe_jax.train.policy import Policy
+
+
+@dataclass(frozen=True)
+class Render(PolicyOptions):
+    """Render an episode of a task or of a trained run to a .mp4, .webp, .gif or .png file."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
+    """File to write: .mp4, .webp, .gif or .png."""
+    json: Json = False
+    best_of: int = 1
+    """Number of episodes, of which the best is rendered (by success, then reward)."""
+    seconds: float = 20.0
+    """Maximum length of the clip, s."""
+    width: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .webp
+    and .gif, 1280 for .png."""
+    fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Frames per second. Default: 25 for .mp4, 12.5 for .webp and .gif."""
+    view: Literal["follow", "near", "scene", "side"] | None = None
+    """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
+    side (tracks the first robot). Default: follow for a clip, scene for an image."""
+    speed: float = 1.0
+    """Playback speed of a clip; 0.5 is slow motion."""
+    at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Time of an image in the episode, s. Default: its middle."""
+
+    def run(self) -> dict[str, Any]:
+        """Renders an episode to a file; returns the object for `--json`, with all episodes."""
+        from mqe_jax.viz.clips import check_output
+
+        for name in ("best_of", "seconds", "speed"):
+            if not (value := getattr(self, name)) > 0:
+                fail(name, value, "greater than 0")
+        for name, value in (("width", self.width), ("fps", self.fps)):
+            if value is not None and not 0 < value <= 4096:
+                fail(name, value, "between 1 and 4096")
+        if self.at is not None and not self.at >= 0:
+            fail("at", self.at, "at least 0")
+        check_output(self.output)
+        env, _, policy = self.environments(self.best_of)
+        result = draw(
+            env,
+            policy,
+            self.output,
+            seed=self.seed,
+            episodes=self.best_of,
+            seconds=self.seconds,
+            size=None if self.width is None else (self.width, round(self.width * 9 / 32) * 2),
+            fps=self.fps,
+            view=self.view,
+            speed=self.speed,
+            at=self.at,
+        )
+        echo(f"mqe: wrote {self.output} ({result['renderer']})")
+        return {"task": env.name, **result}
+
+
+def draw(
+    env: Any,
+    policy: Policy,
+    path: Path,
+    *,
+    seed: int,
+    episodes: int = 1,
+    seconds: float = 20.0,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    view: str | None = None,
+    speed: float = 1.0,
+    at: float | None = None,
+) -> dict[str, Any]:
+    """Runs `episodes` episodes of a policy of all agents and renders the best one.
+
+    Returns the name of the renderer, the index of the rendered episode, and each episode's success, average step reward
+    and length (s).
+    """
+    import jax
+
+    from mqe_jax.viz import recording
+    from mqe_jax.viz import render as rendering
+
+    memory = policy.initial_memory(episodes)
+    recorded = recording.record(env, policy.act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
+    best = recording.best(recorded)
+    renderer = rendering.render_episode(env, best, path, size=size, fps=fps, view=view, speed=speed, at=at)
+    return {
+        "renderer": renderer,
+        "rendered": next(i for i, episode in enumerate(recorded) if episode is best),
+        "episodes": [
+            {
+                "success": episode.success,
+                "average_step_reward": episode.reward,
+                "seconds": round((len(episode) - 1) * episode.dt, 6),
+            }
+            for episode in recorded
+        ],
+    }

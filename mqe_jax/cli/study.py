@@ -1,0 +1,123 @@
+"""The commands `sweep` and `report`."""
+
+from __future__ import annotations
+
+import functools
+import math
+import shlex
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from mqe_jax import interrupts
+from mqe_jax.cli.options import Impl, Json, Repeated
+from mqe_jax.cli.output import echo
+from mqe_jax.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    from mqe_jax.study import sweep as sweeps
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
+
+    file: tyro.conf.Positional[Path]
+    """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/training.md)."""
+    json: Json = False
+    part: str | None = None
+    """Name of one sweep in a file that maps names to sweeps."""
+    folder: Path | None = None
+    """Folder of the sweep. Default: runs/PART, or runs/NAME of the file."""
+    cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
+    """Train these cells only: TASK/ALGORITHM, followed by +VARIANT in a sweep with variants; may be a pattern such as
+    '*/mat', and may be repeated."""
+    dry_run: bool = False
+    """Print the remaining training runs and their estimated time, without training."""
+    impl: Impl = "auto"
+
+    def run(self) -> dict[str, Any]:
+        """Trains the remaining runs and writes the report, or prints their estimated time."""
+        from mqe_jax.cli.setup import base_config, environments, for_task
+        from mqe_jax.envs import ALIASES, TASKS
+        from mqe_jax.study import report as reports
+        from mqe_jax.study import sweep as sweeps
+
+        settings = sweeps.load_sweep(self.file, self.part)
+        for task in settings.tasks:
+            if task not in TASKS and task not in ALIASES:
+                raise InputError(f"tasks: unknown {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
+        folder = self.folder or Path("runs") / (self.part or self.file.stem)
+
+        def config_of(task: str, algorithm: str) -> Any:
+            name = settings.config and settings.config.replace("{task}", task)
+            return for_task(base_config(task, name, algorithm), task)
+
+        jobs = sweeps.plan(settings, folder, config_of, self.cells)
+        result = _estimate(sweeps.estimate(folder, jobs), jobs)
+        if self.dry_run:
+            if not self.json:
+                _print(result)
+            return result
+        sweeps.prepare(settings, folder)
+        cells = "".join(f" --cells {shlex.quote(cell)}" for cell in self.cells)
+        part = "" if self.part is None else f" --part {shlex.quote(self.part)}"
+        with interrupts.before_exit(lambda: f"resume with: mqe sweep {self.file}{part} --folder {folder}{cells}"):
+            others = sweeps.run(folder, jobs, functools.partial(environments, self.impl))
+        if others:
+            skipped = ", ".join(job.cell.path.as_posix() for job in others)
+            echo(f"mqe: skipped, in use by other processes: {skipped}")
+        files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
+        if files:
+            echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
+        left = sweeps.plan(settings, folder, config_of, self.cells)
+        return {"left": _estimate(sweeps.estimate(folder, left), left), "report": [str(file) for file in files]}
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write figures and tables of a sweep from its finished runs, with reference values."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder of the sweep, with its runs in runs/; the report goes into report/."""
+    reference: Path | None = None
+    """YAML file of reference values, such as the paper's in results/paper/reference.yaml."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any]:
+        """Writes the report of a sweep from its finished runs."""
+        from mqe_jax.study import report as reports
+        from mqe_jax.study.runs import load_reference
+
+        reference = None if self.reference is None else load_reference(self.reference)
+        files = reports.report(self.folder, reference)
+        echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
+        return {"report": [str(file) for file in files]}
+
+
+def _estimate(seconds: list[float], jobs: list[sweeps.Job]) -> dict[str, Any]:
+    """Returns the remaining jobs of a sweep and their estimated times, one row per job, plus totals."""
+    rows = [
+        {
+            "task": job.cell.task,
+            "algorithm": job.cell.algorithm,
+            "variant": job.cell.variant,
+            "seeds": [config.seed for config in job.configs],
+            "steps_left": job.steps_left,
+            "seconds": None if math.isnan(s) else round(s),
+        }
+        for job, s in zip(jobs, seconds, strict=True)
+    ]
+    total = sum(seconds) if seconds else 0.0
+    steps = sum(job.steps_left for job in jobs)
+    return {"jobs": rows, "steps_left": steps, "seconds": None if math.isnan(total) else round(total)}
+
+
+def _print(result: dict[str, Any]) -> None:
+    for row in [*result["jobs"], {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]}]:
+        name = " ".join(str(row[key]) for key in ("task", "algorithm", "variant") if key in row)
+        seeds = " ".join(map(str, row.get("seeds", [])))
+        time = "time unknown" if row["seconds"] is None else f"{row['seconds'] / 3600:.2f} h"
+        print(f"{name:<45} {f'seeds {seeds}' if seeds else '':<20} {row['steps_left'] / 1e6:>9.3g} M steps  {time}")

@@ -1,0 +1,140 @@
+"""The commands `train` and `walk train`, whose flags are the training settings with the values that they would have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from mqe_jax import interrupts, robots, walk_policy
+from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions
+from mqe_jax.cli.output import echo
+from mqe_jax.cli.recorder import DivergenceRecorder
+from mqe_jax.cli.setup import base_config, environments, for_task
+from mqe_jax.envs import tasks
+from mqe_jax.settings import fail, override
+from mqe_jax.train import runner
+from mqe_jax.train.checkpoint import latest
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.viz import curves
+from mqe_jax.walk.training import WALK, train_walk
+
+_HINT = "resume with the same command and --resume; the run is in {}"
+_MARKERS = (tyro.conf.AvoidSubcommands,)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the settings come from that flags then change."""
+
+    config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
+    """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
+    settings of --algorithm if given, else the task's tuned settings, else the paper's MAPPO."""
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """The network whose settings are flags."""
+
+    name: Annotated[str | None, tyro.conf.arg(name="network.name", metavar="NAME")] = None
+    """Registered name of the network."""
+
+
+@dataclass(frozen=True)
+class Train(TaskOptions):
+    """Train a policy on a task, into a run folder.
+
+    Settings are those of a configuration file, changed by the flags below, which show the file's values as defaults.
+    """
+
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    """Id of the task, such as go1gate (see `mqe tasks`)."""
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    """Settings of the training."""
+    source: Annotated[Source, tyro.conf.arg(name="")] = Source()
+    """Where they come from."""
+    run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Run folder. Default: runs/TASK."""
+    resume: bool = False
+    """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
+    num_seeds: int = 1
+    """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
+    --run-dir."""
+    dump_diverged: DumpDiverged = None
+
+    def run(self) -> None:
+        """Trains into the run folder."""
+        config = for_task(self.settings, self.target, self.overrides())
+        if self.num_seeds < 1:
+            fail("num_seeds", self.num_seeds, "at least 1")
+        run_dir = self.run_dir or Path("runs") / self.target
+        configs, folders = [config], [run_dir]
+        if self.num_seeds > 1:
+            configs = [override(config, {"seed": config.seed + i}) for i in range(self.num_seeds)]
+            folders = [run_dir / f"seed{each.seed}" for each in configs]
+        vector_env, eval_env = environments(self.impl, config, len(configs))
+        recorder = None if self.dump_diverged is None else DivergenceRecorder(vector_env.env, self.dump_diverged)
+        if self.resume and not any(map(latest, folders)):
+            echo(f"mqe: {run_dir} has no checkpoint to resume from; starting a new run")
+        with interrupts.before_exit(lambda: _HINT.format(run_dir)):
+            try:
+                runner.train_seeds(vector_env, configs, folders, self.resume, eval_env=eval_env, recorder=recorder)
+            finally:
+                if recorder is not None:
+                    recorder.report()
+        curves.draw_curve(folders, run_dir / "curve.png", self.target)
+        echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
+
+
+@dataclass(frozen=True)
+class WalkTrain:
+    """Train the walk policy's weights, from scratch or from other weights (GPU)."""
+
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    """Settings of the training."""
+    run_dir: Path = Path("runs/walk")
+    """Run folder: walk.safetensors (rounded to float16), metrics.csv, checkpoints."""
+    resume: bool = False
+    """Continue from the newest checkpoint in the run folder, with environments reset."""
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to start from; may be those of another robot. Default: from scratch."""
+    impl: Impl = "auto"
+    robot: Robot = "go1"
+
+    def run(self) -> None:
+        """Trains the walk policy into the run folder."""
+        robot, config = robots.get(self.robot), self.settings
+        if self.weights is not None:
+            walk_policy.load_params(robot, self.weights)
+            config = override(config, {"network.weights": str(self.weights.resolve())})
+        with interrupts.before_exit(lambda: _HINT.format(self.run_dir)):
+            train_walk(robot, self.run_dir, config, impl=self.impl, resume=self.resume)
+        echo(f"mqe: {self.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
+
+
+def parse_train(arguments: Sequence[str]) -> Train:
+    """Parses the arguments of `mqe train`; the settings' file, algorithm and network decide the flags' defaults.
+
+    Raises:
+        InputError: for a file, an algorithm or a network that is not allowed.
+        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
+    """
+    source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
+    network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
+    task = next((word for word in others if word in tasks()), "")
+    settings = base_config(task, source.config, source.algorithm)
+    if network.name is not None and network.name != settings.network.name:
+        settings = override(settings, {"network": {"name": network.name}})
+    default = Train(target=tyro.MISSING, settings=settings, source=source)
+    return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=_MARKERS)
+
+
+def parse_walk_train(arguments: Sequence[str]) -> WalkTrain:
+    """Parses the arguments of `mqe walk train`; SystemExit as in `parse_train`."""
+    default = WalkTrain(settings=WALK)
+    return tyro.cli(WalkTrain, prog="mqe walk train", args=list(arguments), default=default, config=_MARKERS)

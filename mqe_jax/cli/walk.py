@@ -1,0 +1,84 @@
+"""The commands `walk eval` and `walk convert`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed
+from mqe_jax.cli.output import echo, print_table
+from mqe_jax.errors import InputError
+
+
+@dataclass(frozen=True)
+class WalkEval:
+    """Evaluate the walk policy: command tracking and falls."""
+
+    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Weights to evaluate. Default: the shipped ones."""
+    json: Json = False
+    episodes: int = 1000
+    """Number of episodes per scenario, run in parallel."""
+    scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
+    """Scenario, such as flat, pushes or slope_up; may be repeated. Default: all."""
+    impl: Impl = "auto"
+    robot: Robot = "go1"
+    seed: Seed = 0
+
+    def run(self) -> dict[str, Any]:
+        """Evaluates the walk policy; prints a table, or returns the object for `--json`."""
+
+        from mqe_jax import robots, walk_policy
+        from mqe_jax.walk.evaluation import evaluate_walk
+
+        def report(name: str, figures: Mapping[str, float]) -> None:
+            echo(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
+
+        robot = robots.get(self.robot)
+        result = evaluate_walk(
+            robot,
+            walk_policy.load_params(robot, self.weights),
+            impl=self.impl,
+            episodes=self.episodes,
+            seed=self.seed,
+            scenarios=self.scenario or None,
+            report=report,
+        )
+        if not self.json:
+            print_table({name: value for name, value in result.items() if name != "scenarios"})
+        return result
+
+
+@dataclass(frozen=True)
+class WalkConvert:
+    """Convert official TorchScript checkpoints of walk-these-ways to this package's weights."""
+
+    adaptation: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ADAPTATION.jit")]
+    """Adaptation module, such as adaptation_module_latest.jit."""
+    body: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY.jit")]
+    """Policy body, such as body_latest.jit."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
+    """Weights to write (.safetensors)."""
+    float16: bool = False
+    """Round the weights to float16, half the size; they then act slightly differently. Default: float32."""
+    robot: Robot = "go1"
+
+    def run(self) -> None:
+        """Converts official checkpoints."""
+
+        from mqe_jax import robots, walk_policy
+        from mqe_jax.walk import convert
+
+        if self.output.suffix != ".safetensors":
+            raise InputError(f"output: {str(self.output)!r} is not allowed; it must end in .safetensors")
+        for path in (self.adaptation, self.body):
+            if not path.is_file():
+                raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
+        params = convert.convert(self.adaptation, self.body)
+        about = {"robot": robots.get(self.robot).name}
+        walk_policy.save_params(params, self.output, about, half=self.float16)
+        echo(f"mqe: wrote {self.output}")
