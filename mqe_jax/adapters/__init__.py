@@ -6,10 +6,15 @@ extra to install.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from mqe_jax import envs
-from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
 
 
@@ -47,3 +52,21 @@ def task_env(
         raise InputError(f"episode_length: give either this or {limit}, not both")
     dt = envs.make(task, **overrides).dt
     return envs.make(task, **overrides, episode_length=max_steps * dt)
+
+
+def agent_names(env: QuadrupedEnv) -> list[str]:
+    """Returns `robot_0`, `robot_1`, ..."""
+    return [f"robot_{i}" for i in range(env.num_agents)]
+
+
+def team_reward(env: QuadrupedEnv, reward: Any) -> Any:
+    """Returns the mean reward (...) of team 0 from rewards (..., A): of all agents in cooperative tasks."""
+    return reward[..., np.array(env.teams[0])].mean(-1)
+
+
+def select(env: QuadrupedEnv, choose: jax.Array, first: State, second: State, kept: tuple[str, ...] = ()) -> State:
+    """Returns `first` where `choose` () is true, else `second`, whose fields `kept` and shared buffers stay."""
+    names = {field.name for field in dataclasses.fields(State)}.difference(kept, ("data",))
+    fields = {name: (getattr(first, name), getattr(second, name)) for name in names}
+    merged = {n: jax.tree.map(lambda a, b: jnp.where(choose, a, b), *pair) for n, pair in fields.items()}
+    return dataclasses.replace(second, data=env.physics.merge(choose, first.data, second.data), **merged)

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.adapters import missing, task_env
+from mqe_jax.adapters import missing, task_env, team_reward
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
@@ -70,7 +70,7 @@ class Env(BraxEnv):
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=after,
             obs=obs,
-            reward=jnp.mean(after.reward[jnp.array(self.env.teams[0])]),
+            reward=team_reward(self.env, after.reward),
             done=after.terminated.astype(jnp.float32),
             # Wrappers may have added entries.
             metrics={**state.metrics, **after.metrics},

@@ -19,12 +19,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from mqe_jax import envs
-from mqe_jax.adapters import task_env
-from mqe_jax.adapters.host import RENDER_SIZE, HostEnvs, Step
+from mqe_jax.adapters import task_env, team_reward
+from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
-
-RENDER_MODES = ("rgb_array",)
 
 
 def register() -> None:
@@ -63,33 +61,30 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             render_size: width and height, pixels.
             overrides: arguments of `mqe_jax.make`.
         """
-        self.render_mode = _checked_mode(render_mode)
+        self.render_mode = render_mode
         self.env = task_env(task, **overrides)
         self.action_space = self.env.action_space
         self.observation_space = self.env.observation_space
-        self._size = render_size
-        self._host = HostEnvs(self.env, 1)
+        self._host = HostEnvs(self.env, 1, render_mode, render_size)
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode; without a seed the PRNG stream continues."""
         super().reset(seed=seed)
-        if seed is None and self._host.state is None:
-            seed = _sample_seed(self.np_random)
-        return self._host.reset([seed])[0], {}
+        return self._host.reset([seed], self.np_random)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances by one environment step; actions are clipped to [-1, 1]."""
         out = self._host.step(np.asarray(action)[None])
         info: dict[str, Any] = {name: value[0] for name, value in out.metrics.items()}
         info["agent_rewards"] = out.reward[0]
-        reward = float(_team_reward(self.env, out)[0])
+        reward = float(team_reward(self.env, out.reward.astype(float))[0])
         return out.obs[0], reward, bool(out.terminated[0]), bool(out.truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Returns an image (H, W, 3) uint8, or None without a render mode."""
-        return self._host.render(0, self._size) if self.render_mode else None
+        return self._host.render()
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -126,7 +121,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         except ValueError:
             allowed = ", ".join(mode.value for mode in AutoresetMode)
             raise InputError(f"autoreset_mode: {autoreset_mode!r}; allowed: {allowed}") from None
-        self.render_mode = _checked_mode(render_mode)
+        self.render_mode = render_mode
         if not isinstance(task, QuadrupedEnv):
             overrides = {"num_envs": num_envs, **overrides}
         self.env = task_env(task, max_steps=max_episode_steps, limit="max_episode_steps", **overrides)
@@ -136,8 +131,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space = self.env.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._size = render_size
-        self._host = HostEnvs(self.env, num_envs)
+        self._host = HostEnvs(self.env, num_envs, render_mode, render_size)
         self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
 
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -160,22 +154,14 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 raise InputError(f"seed: {len(seeds)} seeds for {self.num_envs} environments")
         else:
             seeds = [None] * self.num_envs
-        if self._host.state is None:
-            seeds = [_sample_seed(self.np_random) if one is None else one for one in seeds]
         self._ended &= ~mask
-        return self._host.reset(seeds, mask), {}
+        return self._host.reset(seeds, self.np_random, mask), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advances all environments by one step; actions are clipped to [-1, 1]."""
-        if self.autoreset_mode is AutoresetMode.DISABLED:
-            if self._ended.any():
-                raise InputError(
-                    f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask"
-                )
-            out = self._host.step(actions)
-        else:
-            same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
-            out = self._host.step_and_reset(actions, same_step=same_step)
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
+            raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask")
+        out = self._host.step(actions, self.autoreset_mode)
         ended = out.terminated | out.truncated
         metrics = {**out.metrics, "agent_rewards": out.reward}
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -189,13 +175,12 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             infos = _masked(metrics, ~self._ended)
         self._ended = ended.copy()
-        return out.obs, _team_reward(self.env, out), out.terminated, out.truncated, infos
+        return out.obs, team_reward(self.env, out.reward.astype(float)), out.terminated, out.truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns an image (H, W, 3) uint8 of each environment, or None without a render mode."""
-        if self.render_mode is None:
-            return None
-        return tuple(self._host.render(i, self._size) for i in range(self.num_envs))
+        images = (self._host.render(i) for i in range(self.num_envs))
+        return tuple(image for image in images if image is not None) or None
 
 
 def _masked(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
@@ -209,20 +194,6 @@ def _masked(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any
         infos[name] = value if everywhere else np.where(keep, value, 0).astype(value.dtype)
         infos[f"_{name}"] = mask.copy()
     return infos
-
-
-def _team_reward(env: QuadrupedEnv, out: Step) -> np.ndarray:
-    return out.reward[:, list(env.teams[0])].mean(-1, dtype=np.float64)
-
-
-def _sample_seed(generator: np.random.Generator) -> int:
-    return int(generator.integers(2**31))
-
-
-def _checked_mode(mode: str | None) -> str | None:
-    if mode is not None and mode not in RENDER_MODES:
-        raise InputError(f"render_mode: {mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
-    return mode
 
 
 def _reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray:

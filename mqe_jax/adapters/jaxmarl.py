@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.adapters import missing, task_env
+from mqe_jax.adapters import agent_names, missing, select, task_env
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
@@ -38,7 +38,7 @@ class Env(MultiAgentEnv):
         """Creates the environment from a task id or an environment; `overrides` are arguments of `mqe_jax.make`."""
         self.env = task_env(task, **overrides)
         super().__init__(self.env.num_agents)
-        self.agents = [f"robot_{i}" for i in range(self.num_agents)]
+        self.agents = agent_names(self.env)
         self.observation_spaces = {a: Box(-jnp.inf, jnp.inf, (self.env.observation_size,)) for a in self.agents}
         self.action_spaces = {a: Box(-1.0, 1.0, (self.env.action_size,)) for a in self.agents}
 
@@ -71,12 +71,7 @@ class Env(MultiAgentEnv):
         if reset_state is None:
             after = autoreset(self.env, after)
         else:
-            done = dones["__all__"]
-            pick = partial(jax.tree.map, lambda a, b: jnp.where(done, a, b))
-            names = [f.name for f in dataclasses.fields(State) if f.name not in ("data", "final_obs")]
-            merged = {name: pick(getattr(reset_state, name), getattr(after, name)) for name in names}
-            data = self.env.physics.merge(done, reset_state.data, after.data)
-            after = dataclasses.replace(after, data=data, **merged)
+            after = select(self.env, dones["__all__"], reset_state, after, kept=("final_obs",))
         return self.get_obs(after), after, rewards, dones, infos
 
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -12,8 +12,8 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from mqe_jax.adapters import missing, task_env
-from mqe_jax.adapters.host import RENDER_SIZE, HostEnvs
+from mqe_jax.adapters import agent_names, missing, task_env
+from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 
@@ -22,8 +22,6 @@ try:
     from pettingzoo.utils import OrderEnforcingWrapper, parallel_to_aec
 except ImportError as error:
     raise missing("pettingzoo", error) from None
-
-RENDER_MODES = ("rgb_array",)
 
 
 def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> QuadrupedParallelEnv:
@@ -75,28 +73,20 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         EzPickle.__init__(
             self, task, max_cycles=max_cycles, render_mode=render_mode, render_size=render_size, **overrides
         )
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise InputError(f"render_mode: {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
         self.task = task_env(task, max_steps=max_cycles, limit="max_cycles", **overrides)
         self.metadata = {**type(self).metadata, "name": self.task.name}
         self.render_mode = render_mode
-        self.possible_agents = [f"robot_{i}" for i in range(self.task.num_agents)]
+        self.possible_agents = agent_names(self.task)
         self.agents: list[str] = []
         self.teams = tuple(tuple(self.possible_agents[i] for i in team) for team in self.task.teams)
         box = gymnasium.spaces.Box
-        joint_obs, joint_action = self.task.observation_space, self.task.action_space
-        self._observation_spaces = {
-            agent: box(joint_obs.low[i], joint_obs.high[i], dtype=np.float32)
-            for i, agent in enumerate(self.possible_agents)
-        }
-        self._action_spaces = {
-            agent: box(joint_action.low[i], joint_action.high[i], dtype=np.float32)
-            for i, agent in enumerate(self.possible_agents)
-        }
+        self._observation_spaces, self._action_spaces = (
+            {a: box(*x, dtype=np.float32) for a, *x in zip(self.possible_agents, space.low, space.high, strict=True)}
+            for space in (self.task.observation_space, self.task.action_space)
+        )
         self.state_space = box(-np.inf, np.inf, (self.task.privileged_observation_size,), np.float32)
-        self._size = render_size
         self._generator = np.random.default_rng()
-        self._host = HostEnvs(self.task, 1)
+        self._host = HostEnvs(self.task, 1, render_mode, render_size)
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Box:
         """Returns the space of an agent's observation (O,)."""
@@ -110,9 +100,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Starts an episode; without a seed the PRNG stream continues."""
-        if seed is None and self._host.state is None:
-            seed = int(self._generator.integers(2**31))
-        obs = self._host.reset([seed])[0]
+        obs = self._host.reset([seed], self._generator)[0]
         self.agents = list(self.possible_agents)
         return self._by_agent(obs), {agent: {} for agent in self.agents}
 
@@ -149,7 +137,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
 
     def render(self) -> np.ndarray | None:
         """Returns an image (H, W, 3) uint8, or None without a render mode."""
-        return self._host.render(0, self._size) if self.render_mode else None
+        return self._host.render()
 
     def close(self) -> None:
         """No-op: no resources are held."""
