@@ -85,7 +85,7 @@ def _pack(package: str, archive: Path) -> None:
 def export(run: Path, folder: Path) -> None:
     """Writes scene.xml, scene.json and policy.onnx of a run into a folder."""
     from mqe_jax.cli.setup import make_env
-    from mqe_jax.export.policy import save_onnx, shapes, to_onnx
+    from mqe_jax.export.policy import shapes, to_onnx
     from mqe_jax.export.scene import scene_settings, scene_xml
     from mqe_jax.policies import load_policy
 
@@ -95,7 +95,7 @@ def export(run: Path, folder: Path) -> None:
     env, _ = make_env(task, "c", policy.config.env, 1)
     model = to_onnx(policy, env)
     folder.mkdir(parents=True, exist_ok=True)
-    save_onnx(model, folder / "policy.onnx")
+    (folder / "policy.onnx").write_bytes(model.SerializeToString())
     (folder / "scene.xml").write_text(scene_xml(env), encoding="utf-8")
     settings: dict[str, Any] = {**scene_settings(env), "policy": shapes(model)}
     (folder / "scene.json").write_text(json.dumps(settings), encoding="utf-8")

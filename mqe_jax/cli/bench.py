@@ -14,8 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, write_atomically
+from mqe_jax.errors import InputError, one_line
+from mqe_jax.files import append, check_folder
 from mqe_jax.settings import fail
 
 COLUMNS: tuple[str, ...] = (
@@ -111,30 +111,22 @@ def device_name() -> str:
     return f"{cores} CPU cores"
 
 
-def read_csv(path: Path) -> list[dict[str, Any]]:
-    """Returns the rows of a table of measurements, none where the file does not exist, and creates its folder.
-
-    Raises:
-        InputError: if the folder cannot be written, or the file cannot be read or has other columns.
-    """
+def check_csv(path: Path) -> None:
+    """Creates the folder of a table of measurements, and raises an InputError where the table has other columns."""
     check_folder(path.parent, "csv")
-    if not path.exists():
-        return []
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != COLUMNS:
-                raise InputError(f"csv: {path} has other columns; it must have {', '.join(COLUMNS)}")
-            return list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"csv: {path} cannot be read ({getattr(error, 'strerror', None) or error})") from None
+        head = path.read_text(encoding="utf-8").partition("\n")[0] if path.exists() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"csv: {path} cannot be read ({one_line(error)})") from None
+    if head not in ("", ",".join(COLUMNS)):
+        raise InputError(f"csv: {path} has other columns; it must have {', '.join(COLUMNS)}")
 
 
 def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a CSV file, written atomically; errors as in `read_csv`."""
-    rows = read_csv(path)
+    """Appends a row to a table of measurements."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows([*rows, row])
-    write_atomically(path, text.getvalue().encode())
+    if not path.exists() or not path.stat().st_size:
+        writer.writeheader()
+    writer.writerow(row)
+    append(path, text.getvalue().encode())

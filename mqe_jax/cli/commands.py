@@ -163,7 +163,7 @@ class Bench(TaskOptions):
         from mqe_jax.cli import bench, setup
 
         if self.csv is not None:
-            bench.read_csv(self.csv)  # before the measurement, which would be lost
+            bench.check_csv(self.csv)  # before the measurement, which would be lost
         env, vector_env = setup.make_env(self.task, self.impl, self.overrides(), self.num_envs)
         key = jax.random.PRNGKey(self.seed)
         result = bench.bench(env, vector_env, key, steps=self.steps, repeats=self.repeats)

@@ -12,6 +12,7 @@ import tyro
 from mqe_jax.cli.options import Json
 from mqe_jax.cli.output import echo, print_table
 from mqe_jax.errors import InputError
+from mqe_jax.files import check_folder, write_atomically
 
 STEPS = 100
 """Steps of the episodes on which the graph is compared with JAX."""
@@ -44,7 +45,7 @@ class Export:
             raise InputError(f"{self.run_dir}: its settings have no 'task' entry")
 
         from mqe_jax.export.check import errors, record
-        from mqe_jax.export.policy import save_onnx, shapes, to_onnx
+        from mqe_jax.export.policy import shapes, to_onnx
 
         env, _ = make_env(task, "c", policy.config.env, 1)
         model = to_onnx(policy, env)
@@ -54,7 +55,8 @@ class Export:
                 f"export: {self.onnx} is not written, because in {STEPS} steps of {task} the graph's output "
                 f"{output!r} differs from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
             )
-        save_onnx(model, self.onnx)
+        check_folder(self.onnx.parent, "onnx")
+        write_atomically(self.onnx, model.SerializeToString())
         sizes = shapes(model)
         echo(f"mqe: wrote {self.onnx}, {self.onnx.stat().st_size / 1e6:.1f} MB")
         result = {"task": task, "control": env.control, "largest_error": error, **sizes}

@@ -72,20 +72,9 @@ class Render(PolicyOptions):
 
 
 def draw(
-    env: Any,
-    policy: Policy,
-    path: Path,
-    *,
-    seed: int,
-    episodes: int = 1,
-    seconds: float = 20.0,
-    size: tuple[int, int] | None = None,
-    fps: float | None = None,
-    view: str | None = None,
-    speed: float = 1.0,
-    at: float | None = None,
+    env: Any, policy: Policy, path: Path, *, seed: int, episodes: int = 1, seconds: float = 20.0, **options: Any
 ) -> dict[str, Any]:
-    """Runs `episodes` episodes of a policy of all agents and renders the best one.
+    """Runs `episodes` episodes of a policy of all agents and renders the best one, with options of `render_episode`.
 
     Returns the name of the renderer, the index of the rendered episode, and each episode's success, average step reward
     and length (s).
@@ -98,7 +87,7 @@ def draw(
     memory = policy.initial_memory(episodes)
     recorded = recording.record(env, policy.act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
     best = recording.best(recorded)
-    renderer = rendering.render_episode(env, best, path, size=size, fps=fps, view=view, speed=speed, at=at)
+    renderer = rendering.render_episode(env, best, path, **options)
     return {
         "renderer": renderer,
         "rendered": next(i for i, episode in enumerate(recorded) if episode is best),

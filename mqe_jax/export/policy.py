@@ -20,16 +20,13 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 import onnx
 
 import mqe_jax
-from mqe_jax.errors import InputError
 from mqe_jax.export.translate import OPSET, translate
-from mqe_jax.files import write_atomically
 from mqe_jax.policies import check_policy
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS
@@ -83,15 +80,6 @@ def _named(prefix: str, memory: Any) -> dict[str, Any]:
 def _filled(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
     """Returns a recurrent state of the structure of `memory` with the arrays of the inputs."""
     return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in _named(prefix, memory)])
-
-
-def save_onnx(model: onnx.ModelProto, path: Path) -> None:
-    """Writes a model atomically; InputError if the file cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, model.SerializeToString())
-    except OSError as error:
-        raise InputError(f"onnx: cannot write {path} ({error.strerror})") from None
 
 
 def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
