@@ -127,8 +127,6 @@ def test_cameras_follow_robots_and_the_ball() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--num-envs", "0"], ("num_envs", "0", "between 1 and 16")),
-        (["--port", "99999"], ("port", "99999", "65535")),
         (["--host", "192.0.2.1"], ("host", "192.0.2.1", "an address of this machine")),
         (["--host", "no such host"], ("host", "no such host", "an address of this machine")),
         (["--policy", "scriptd"], ("policy", "scriptd", "scripted")),

@@ -8,7 +8,6 @@ from typing import Any
 import tyro
 
 from mqe_jax.cli import commands, export, render, study, view, walk
-from mqe_jax.cli.options import Command
 from mqe_jax.errors import InputError, nearest
 
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
@@ -49,8 +48,8 @@ def overview(group: str = "") -> str:
     return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 
 
-def parse(arguments: Sequence[str]) -> Command:
-    """Parses the command line, whose first word or two are the command.
+def parse(arguments: Sequence[str]) -> Any:
+    """Returns the record of the command that the first word or two name; its `run` returns the object of `--json`.
 
     Raises:
         InputError: for an unknown command.

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import InputError, one_line
 from mqe_jax.files import append, check_folder
-from mqe_jax.settings import fail
 
 COLUMNS: tuple[str, ...] = (
     "task",
@@ -60,9 +59,6 @@ def bench(
     and resets. `compile_s` is the first call minus the median call. `overflow` counts the environment steps of one call
     in which the engine may have dropped contacts or constraints.
     """
-    for name, value in (("steps", steps), ("repeats", repeats)):
-        if value < 1:
-            fail(name, value, "at least 1")
     count, agents, width = vector_env.num_envs, env.num_agents, env.action_size
 
     @jax.jit

@@ -5,7 +5,6 @@ Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,10 +12,10 @@ import tyro
 
 from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions
 from mqe_jax.cli.output import echo, print_table
-from mqe_jax.settings import fail
+from mqe_jax.settings import PositiveInt, record
 
 
-@dataclass(frozen=True)
+@record
 class Tasks:
     """List the tasks with their agents, observation and action sizes, and time limits."""
 
@@ -50,14 +49,14 @@ class Tasks:
         return {"tasks": rows}
 
 
-@dataclass(frozen=True)
+@record
 class Eval(PolicyOptions):
     """Evaluate a trained run, or a task's scripted policy, over complete episodes from fresh resets."""
 
     json: Json = False
-    episodes: int = 512
+    episodes: PositiveInt = 512
     """Number of evaluation episodes, split evenly over environments."""
-    num_envs: int = 128
+    num_envs: PositiveInt = 128
     """Number of parallel environments."""
     dump_diverged: DumpDiverged = None
 
@@ -68,8 +67,6 @@ class Eval(PolicyOptions):
         from mqe_jax.cli.recorder import DivergenceRecorder
         from mqe_jax.train import evaluate as evaluation
 
-        if self.episodes < 1:
-            fail("episodes", self.episodes, "at least 1")
         num_envs = min(self.num_envs, self.episodes)
         env, vector_env, policy = self.environments(num_envs)
         recorder = None if self.dump_diverged is None else DivergenceRecorder(env, self.dump_diverged)
@@ -93,7 +90,7 @@ class Eval(PolicyOptions):
         return result.to_dict()
 
 
-@dataclass(frozen=True)
+@record
 class Replay:
     """Replay a recording of diverged physics, and render it with --output."""
 
@@ -139,18 +136,18 @@ class Replay:
         return result
 
 
-@dataclass(frozen=True)
+@record
 class Bench(TaskOptions):
     """Measure throughput in environment steps per second: with walk policy and resets, and for physics alone."""
 
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""
     json: Json = False
-    num_envs: int = 256
+    num_envs: PositiveInt = 256
     """Number of parallel environments."""
-    steps: int = 50
+    steps: PositiveInt = 50
     """Environment steps per timed call."""
-    repeats: int = 5
+    repeats: PositiveInt = 5
     """Number of timed calls; the median is reported."""
     seed: Seed = 0
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -174,7 +171,7 @@ class Bench(TaskOptions):
         return result
 
 
-@dataclass(frozen=True)
+@record
 class Demo:
     """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and video."""
 
@@ -182,7 +179,7 @@ class Demo:
     """Run folder; an interrupted demo resumes from it."""
     config: str = "demo"
     """Settings, as in `mqe train --config`."""
-    episodes: int = 256
+    episodes: PositiveInt = 256
     """Number of episodes per evaluation."""
     impl: Impl = "auto"
 

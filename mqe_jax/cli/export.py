@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +12,7 @@ from mqe_jax.cli.options import Json
 from mqe_jax.cli.output import echo, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
+from mqe_jax.settings import record
 
 STEPS = 100
 """Steps of the episodes on which the graph is compared with JAX."""
@@ -20,7 +20,7 @@ LARGEST_ERROR = 1e-4
 """Largest allowed difference of any output from JAX."""
 
 
-@dataclass(frozen=True)
+@record
 class Export:
     """Write a trained policy, together with the walk policy, as one ONNX graph."""
 

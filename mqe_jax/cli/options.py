@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from mqe_jax import settings
 from mqe_jax.errors import InputError
+from mqe_jax.settings import record
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
 
 Repeated = tyro.conf.UseAppendAction
-
-
-class Command(Protocol):
-    """A subcommand: a record of arguments that can be run."""
-
-    def run(self) -> dict[str, Any] | None:
-        """Runs the command; returns the object that `--json` prints, if any."""
-        ...
-
-
 Impl = Annotated[
     str,
     tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
 ]
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
-Seed = Annotated[int, tyro.conf.arg(help="Random seed.")]
+Seed = Annotated[settings.Seed, tyro.conf.arg(help="Random seed.")]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
 PolicyName = Annotated[str | None, tyro.conf.arg(metavar="NAME|RUN|FILE")]
 DumpDiverged = Annotated[
@@ -43,7 +35,7 @@ DumpDiverged = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class TaskOptions:
     """Options of a task."""
 
@@ -64,7 +56,7 @@ class TaskOptions:
         return parse_overrides(self.set) | {name: value for name, value in flags.items() if value is not None}
 
 
-@dataclass(frozen=True, kw_only=True)
+@record
 class PolicyOptions(TaskOptions):
     """Options of a task and its policies."""
 

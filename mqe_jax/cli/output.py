@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -22,11 +21,6 @@ def print_table(values: Mapping[str, Any]) -> None:
         flat.update({f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value})
     for name, value in flat.items():
         print(f"{name:<28} {value:.4g}" if isinstance(value, float) else f"{name:<28} {value}")
-
-
-def print_json(result: Mapping[str, Any], file: TextIO) -> None:
-    """Prints the object of `--json` as one line."""
-    print(json.dumps(result, allow_nan=True), file=file, flush=True)
 
 
 @contextlib.contextmanager

@@ -2,71 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+from annotated_types import Gt, Le
 
 from mqe_jax.cli.options import Json, PolicyOptions
 from mqe_jax.cli.output import echo
-from mqe_jax.settings import fail
+from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
 
 
-@dataclass(frozen=True)
+@record
 class Render(PolicyOptions):
     """Render an episode of a task or of a trained run to a .mp4, .webp, .gif or .png file."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .webp, .gif or .png."""
     json: Json = False
-    best_of: int = 1
+    best_of: PositiveInt = 1
     """Number of episodes, of which the best is rendered (by success, then reward)."""
-    seconds: float = 20.0
+    seconds: Positive = 20.0
     """Maximum length of the clip, s."""
-    width: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    width: Annotated[Annotated[int, Gt(0), Le(4096)] | None, tyro.conf.arg(metavar="INT")] = None
     """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .webp
     and .gif, 1280 for .png."""
-    fps: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    fps: Annotated[Annotated[float, Gt(0), Le(4096)] | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Frames per second. Default: 25 for .mp4, 12.5 for .webp and .gif."""
     view: Literal["follow", "near", "scene", "side"] | None = None
     """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
     side (tracks the first robot). Default: follow for a clip, scene for an image."""
-    speed: float = 1.0
+    speed: Positive = 1.0
     """Playback speed of a clip; 0.5 is slow motion."""
-    at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    at: Annotated[NonNegative | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time of an image in the episode, s. Default: its middle."""
 
     def run(self) -> dict[str, Any]:
         """Renders an episode to a file; returns the object for `--json`, with all episodes."""
         from mqe_jax.viz.clips import check_output
 
-        for name in ("best_of", "seconds", "speed"):
-            if not (value := getattr(self, name)) > 0:
-                fail(name, value, "greater than 0")
-        for name, value in (("width", self.width), ("fps", self.fps)):
-            if value is not None and not 0 < value <= 4096:
-                fail(name, value, "between 1 and 4096")
-        if self.at is not None and not self.at >= 0:
-            fail("at", self.at, "at least 0")
         check_output(self.output)
         env, _, policy = self.environments(self.best_of)
-        result = draw(
-            env,
-            policy,
-            self.output,
-            seed=self.seed,
-            episodes=self.best_of,
-            seconds=self.seconds,
-            size=None if self.width is None else (self.width, round(self.width * 9 / 32) * 2),
-            fps=self.fps,
-            view=self.view,
-            speed=self.speed,
-            at=self.at,
-        )
+        options = {name: getattr(self, name) for name in ("seed", "seconds", "fps", "view", "speed", "at")}
+        size = None if self.width is None else (self.width, round(self.width * 9 / 32) * 2)
+        result = draw(env, policy, self.output, episodes=self.best_of, size=size, **options)
         echo(f"mqe: wrote {self.output} ({result['renderer']})")
         return {"task": env.name, **result}
 

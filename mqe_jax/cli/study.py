@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import shlex
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,12 +15,13 @@ from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated
 from mqe_jax.cli.output import echo
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.settings import record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
 
 
-@dataclass(frozen=True)
+@record
 class Sweep:
     """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
 
@@ -76,7 +77,7 @@ class Sweep:
         return {"left": _estimate(sweeps.estimate(folder, left), left), "report": [str(file) for file in files]}
 
 
-@dataclass(frozen=True)
+@record
 class Report:
     """Write figures and tables of a sweep from its finished runs, with reference values."""
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import pydantic
 import tyro
 
 from mqe_jax import interrupts, robots, walk_policy
@@ -15,7 +15,7 @@ from mqe_jax.cli.output import echo
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import tasks
-from mqe_jax.settings import fail, override
+from mqe_jax.settings import PositiveInt, override, record
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
@@ -26,7 +26,7 @@ _HINT = "resume with the same command and --resume; the run is in {}"
 _MARKERS = (tyro.conf.AvoidSubcommands,)
 
 
-@dataclass(frozen=True)
+@record
 class Source:
     """Where the settings come from that flags then change."""
 
@@ -37,7 +37,7 @@ class Source:
     """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
 
 
-@dataclass(frozen=True)
+@record
 class Network:
     """The network whose settings are flags."""
 
@@ -45,14 +45,15 @@ class Network:
     """Registered name of the network."""
 
 
-@dataclass(frozen=True)
+@record
 class Train(TaskOptions):
     """Train a policy on a task, into a run folder.
 
     Settings are those of a configuration file, changed by the flags below, which show the file's values as defaults.
     """
 
-    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    # `parse_train` fills the record with tyro.MISSING here.
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK"), pydantic.SkipValidation()]  # pyright: ignore[reportCallIssue]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
@@ -62,7 +63,7 @@ class Train(TaskOptions):
     """Run folder. Default: runs/TASK."""
     resume: bool = False
     """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
-    num_seeds: int = 1
+    num_seeds: PositiveInt = 1
     """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
     --run-dir."""
     dump_diverged: DumpDiverged = None
@@ -70,8 +71,6 @@ class Train(TaskOptions):
     def run(self) -> None:
         """Trains into the run folder."""
         config = for_task(self.settings, self.target, self.overrides())
-        if self.num_seeds < 1:
-            fail("num_seeds", self.num_seeds, "at least 1")
         run_dir = self.run_dir or Path("runs") / self.target
         configs, folders = [config], [run_dir]
         if self.num_seeds > 1:
@@ -91,7 +90,7 @@ class Train(TaskOptions):
         echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 
 
-@dataclass(frozen=True)
+@record
 class WalkTrain:
     """Train the walk policy's weights, from scratch or from other weights (GPU)."""
 

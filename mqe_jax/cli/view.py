@@ -5,35 +5,33 @@ from __future__ import annotations
 import errno
 import importlib.util
 import socket
-from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.cli.options import PolicyOptions
 from mqe_jax.cli.output import echo
 from mqe_jax.errors import InputError
-from mqe_jax.settings import fail
+from mqe_jax.settings import fail, record
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
-@dataclass(frozen=True)
+@record
 class View(PolicyOptions):
     """Show a task or a trained run in the browser, with teleoperation and live plots."""
 
-    num_envs: int = 1
+    num_envs: Annotated[int, Ge(1), Le(16)] = 1
     """Number of environments, side by side: 1 to 16."""
     host: str = "127.0.0.1"
     """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
-    port: int = 8080
+    port: Annotated[int, Gt(0), Lt(65536)] = 8080
     """Port to listen on, or the next free one if it is in use."""
 
     def run(self) -> None:
         """Shows a task in the browser until Ctrl-C."""
         if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
             raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
-        if not 1 <= self.num_envs <= 16:
-            fail("num_envs", self.num_envs, "between 1 and 16")
-        if not 0 < self.port < 65536:
-            fail("port", self.port, "between 1 and 65535")
         _check_address(self.host, self.port)
         env, vector_env, policy = self.environments(self.num_envs)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,16 +12,17 @@ import tyro
 from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed
 from mqe_jax.cli.output import echo, print_table
 from mqe_jax.errors import InputError
+from mqe_jax.settings import PositiveInt, record
 
 
-@dataclass(frozen=True)
+@record
 class WalkEval:
     """Evaluate the walk policy: command tracking and falls."""
 
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Weights to evaluate. Default: the shipped ones."""
     json: Json = False
-    episodes: int = 1000
+    episodes: PositiveInt = 1000
     """Number of episodes per scenario, run in parallel."""
     scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
     """Scenario, such as flat, pushes or slope_up; may be repeated. Default: all."""
@@ -53,7 +54,7 @@ class WalkEval:
         return result
 
 
-@dataclass(frozen=True)
+@record
 class WalkConvert:
     """Convert official TorchScript checkpoints of walk-these-ways to this package's weights."""
 
