@@ -1,4 +1,4 @@
-"""The multi-agent transformer: sequential acting, parallel evaluation, teams, deviation."""
+"""The multi-agent transformer: sequential acting, parallel evaluation, deviation."""
 
 from __future__ import annotations
 
@@ -10,26 +10,24 @@ import numpy as np
 import pytest
 
 from mqe_jax.errors import InputError
-from mqe_jax.train.mat import Mat, log_std_of, order_of
+from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.types import NetworkMemory, Params
 
 KEY = jax.random.PRNGKey(0)
 NO_MEMORY = NetworkMemory((), ())
-ONE_TEAM = ((0, 1, 2),)
 
 
-def dims(teams: tuple[tuple[int, ...], ...]) -> EnvDims:
+def dims(agents: int) -> EnvDims:
     """Sizes with 5 observations and 2 actions per agent."""
-    agents = sum(map(len, teams))
-    return EnvDims(agents=agents, observation=5, privileged=1, action=2, teams=teams, values=agents)
+    return EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents)
 
 
-def made(teams: tuple[tuple[int, ...], ...], **settings: Any) -> tuple[Network, Params, jax.Array]:
+def made(agents: int, **settings: Any) -> tuple[Network, Params, jax.Array]:
     """A network with strong weights, so that every path counts, and observations (4, A, 5)."""
-    network = Mat(gain=1.0, width=8, **settings).build(dims(teams))
+    network = Mat(gain=1.0, width=8, **settings).build(dims(agents))
     network = network._replace(init=jax.jit(network.init), act=jax.jit(network.act), evaluate=jax.jit(network.evaluate))
-    return network, network.init(KEY), jax.random.normal(KEY, (4, sum(map(len, teams)), 5))
+    return network, network.init(KEY), jax.random.normal(KEY, (4, agents, 5))
 
 
 def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Array) -> np.ndarray:
@@ -39,11 +37,10 @@ def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Arra
 
 
 @pytest.mark.parametrize(
-    ("teams", "settings"),
-    [(ONE_TEAM, {}), (((0, 1), (2, 3)), {"blocks": 2, "heads": 4, "deviation": "free"}), (((2,), (1, 0)), {})],
+    ("agents", "settings"), [(3, {}), (4, {"blocks": 2, "heads": 4, "deviation": "free"}), (1, {})]
 )
-def test_parallel_log_probabilities_equal_sequential_ones(teams: tuple, settings: dict) -> None:
-    network, params, obs = made(teams, **settings)
+def test_parallel_log_probabilities_equal_sequential_ones(agents: int, settings: dict) -> None:
+    network, params, obs = made(agents, **settings)
     action, sequential, _ = network.act(network.policy_params(params), (), obs, KEY)
     np.testing.assert_allclose(log_probs(network, params, obs, action), sequential, atol=1e-5)
     assert float(jnp.std(action)) > 0.1
@@ -52,7 +49,7 @@ def test_parallel_log_probabilities_equal_sequential_ones(teams: tuple, settings
 
 
 def test_later_actions_change_no_earlier_log_probability() -> None:
-    network, params, obs = made(ONE_TEAM)
+    network, params, obs = made(3)
     action = jax.random.normal(KEY, (4, 3, 2))
     before = log_probs(network, params, obs, action)
     later = log_probs(network, params, obs, action.at[:, 2].set(action[::-1, 2]))
@@ -61,40 +58,12 @@ def test_later_actions_change_no_earlier_log_probability() -> None:
     assert np.abs(earlier[:, 1:] - before[:, 1:]).max() > 1e-3
 
 
-def test_actions_and_observations_of_the_other_team_have_no_effect() -> None:
-    network, params, obs = made(((0, 1), (2, 3)))
-    action = jax.random.normal(KEY, (4, 4, 2))
-    before = log_probs(network, params, obs, action)
-    for own, other in ((slice(0, 2), slice(2, 4)), (slice(2, 4), slice(0, 2))):
-        changed = obs.at[:, other].set(obs[::-1, other]), action.at[:, other].set(action[::-1, other])
-        np.testing.assert_allclose(log_probs(network, params, *changed)[:, own], before[:, own], atol=1e-6)
-    teammates = log_probs(network, params, obs.at[:, 1].set(obs[::-1, 1]), action)
-    assert np.abs(teammates[:, 0] - before[:, 0]).max() > 1e-3
-
-
-def test_both_teams_have_the_same_weights() -> None:
-    network, params, obs = made(((0, 1), (2, 3)))
-    obs = obs.at[:, 2:].set(obs[:, :2])
-    action, _, _ = network.act(network.policy_params(params), (), obs, None)
-    np.testing.assert_allclose(action[:, :2], action[:, 2:], atol=1e-6)
-    values, _ = network.value(params, (), jnp.zeros((4,), bool), obs, obs[..., 0, :1])
-    assert values.shape == (4, 4)
-    np.testing.assert_allclose(values[:, :2], values[:, 2:], atol=1e-6)
-
-
-def test_the_order_of_uneven_teams() -> None:
-    order = order_of(((2,), (1, 0)))
-    np.testing.assert_array_equal(order.rank, [1, 0, 0])
-    np.testing.assert_array_equal(order.previous, [1, 1, 2])
-    np.testing.assert_array_equal(order.causal, [[1, 1, 0], [0, 1, 0], [0, 0, 1]])
-
-
 def test_the_deviation_starts_as_openrl_has_it_or_free() -> None:
     for settings, deviation in (
         ({}, 0.5 / (1 + np.exp(-1))),
         ({"deviation": "free", "log_std_init": -1.0}, np.exp(-1)),
     ):
-        network, params, obs = made(ONE_TEAM, **settings)
+        network, params, obs = made(3, **settings)
         mean, density, _ = network.act(network.policy_params(params), (), obs, None)
         np.testing.assert_allclose(density, -np.log(deviation * np.sqrt(2 * np.pi)), rtol=1e-5)
         assert mean.shape == (4, 3, 2)
@@ -115,7 +84,7 @@ def test_a_free_deviation_beyond_its_bounds_gets_the_gradient_that_leads_back() 
 
 
 def test_actions_start_small_and_acting_needs_no_value_head() -> None:
-    network = Mat().build(dims(ONE_TEAM))
+    network = Mat().build(dims(3))
     params = jax.jit(network.init)(KEY)
     mean, _, _ = jax.jit(network.act)(network.policy_params(params), (), jax.random.normal(KEY, (4, 3, 5)), None)
     assert float(jnp.abs(mean).max()) < 0.1
@@ -126,4 +95,4 @@ def test_settings_that_do_not_fit_are_named() -> None:
     with pytest.raises(InputError, match="heads: 3"):
         Mat(heads=3)
     with pytest.raises(InputError, match=r"ppo\.value"):
-        Mat().build(dims(ONE_TEAM)._replace(values=1))
+        Mat().build(dims(3)._replace(values=1))

@@ -31,7 +31,7 @@ import publish  # noqa: E402
 
 RESULTS, PAGE = ROOT / "results" / "paper", ROOT / "docs" / "results" / "paper.md"
 CELL = Cell("go1gate", "mappo", "tuned")
-DIMS = EnvDims(agents=2, observation=16, privileged=93, action=3, teams=((0, 1),), values=2)
+DIMS = EnvDims(agents=2, observation=16, privileged=93, action=3, values=2)
 
 
 def policy_of(seed: int, **network: Any) -> TrainedPolicy:

@@ -86,13 +86,9 @@ def test_gaussian_density_entropy_and_divergence() -> None:
 def test_ratio_functions_by_hand() -> None:
     new = jnp.array([[0.1, 0.2], [0.3, 0.4]])  # 2 agents, 2 dimensions
     old = jnp.zeros((2, 2))
-    both, rivals = ((0, 1),), ((1,), (0,))
-    np.testing.assert_allclose(loss.ratio_per_agent(new, old, both), [[0.3], [0.7]], rtol=1e-6)
-    np.testing.assert_allclose(loss.ratio_per_dimension(new, old, both), new)
-    np.testing.assert_allclose(loss.ratio_joint(new, old, both), [[1.0]], rtol=1e-6)
-    np.testing.assert_allclose(loss.ratio_joint(new, old, rivals), [[0.7], [0.3]], rtol=1e-6)
-    np.testing.assert_allclose(loss.team_mean(new[:, 0], both), [0.2], rtol=1e-6)
-    np.testing.assert_allclose(loss.team_mean(new[:, 0], rivals), [0.3, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
+    np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
+    np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:
@@ -189,7 +185,7 @@ def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
     settings = ActorCritic(
         recurrent=False, hidden_sizes=(4,), log_std_init=-2.0, log_std_max=-1.0, log_std_min=-3.0, critic_input="own"
     )
-    dims = EnvDims(agents=1, observation=2, privileged=0, action=3, teams=((0,),), values=1)
+    dims = EnvDims(agents=1, observation=2, privileged=0, action=3, values=1)
     network = settings.build(dims)
     params = network.init(KEY)
     obs, first, action = jnp.zeros((1, 1, 1, 2)), jnp.zeros((1, 1), bool), jnp.zeros((1, 1, 1, 3))
@@ -221,7 +217,7 @@ def test_normalised_layers_by_hand(recurrent: bool) -> None:
     settings = ActorCritic(
         layer_norm=True, hidden_sizes=(5,), recurrent=recurrent, gru_size=4, critic_input="own", action_gain=1.0
     )
-    dims = EnvDims(agents=2, observation=3, privileged=0, action=2, teams=((0, 1),), values=2)
+    dims = EnvDims(agents=2, observation=3, privileged=0, action=2, values=2)
     network = settings.build(dims)
     obs = jax.random.normal(KEY, (6, 2, 3))
     params = jax.tree.map(lambda x: x + 0.1, network.init(KEY))

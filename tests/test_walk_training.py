@@ -22,7 +22,7 @@ from mqe_jax.walk.network import WalkNetwork, windows
 from mqe_jax.walk.training import WALK
 from tests.probes import Probe
 
-DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, teams=((0,),), values=1)
+DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
 
 
 def test_windows_are_the_histories_kept_step_by_step() -> None:

@@ -37,9 +37,9 @@ class PPO:
     minibatches: PositiveInt = 1
     """Minibatches per epoch."""
     ratio: Literal["agent", "dimension", "joint"] = "agent"
-    """Probability ratio that is clipped: per agent, per action dimension (OpenRL), or joint per team (JRPO)."""
+    """Probability ratio that is clipped: per agent, per action dimension (OpenRL), or joint of the team (JRPO)."""
     value: Literal["agent", "joint"] = "agent"
-    """One value per agent, or one per team, of the team's mean reward."""
+    """One value per agent, or one of the team, of its mean reward."""
     clip: Positive = 0.2
     """Half width of the clipping interval of the ratio."""
     dual_clip: Annotated[float, Gt(1)] | None = None

@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, clipped_surrogate, team_mean, value_loss
+from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
     ValueStatistics,
@@ -31,7 +30,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, Teams, TraceStep, Transition, VectorEnv, replace_fields, teams_of
+from mqe_jax.train.types import Batch, Params, TraceStep, Transition, VectorEnv, replace_fields, teams_of
 
 Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -69,15 +68,12 @@ class Learner(NamedTuple):
 
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     """Returns the sizes from which a network is built."""
-    agents = env.num_agents
-    teams = teams_of(env)
     return EnvDims(
-        agents=agents,
+        agents=env.num_agents,
         observation=env.observation_size,
         privileged=env.privileged_observation_size,
         action=env.action_size,
-        teams=teams,
-        values=len(teams) if config.ppo.value == "joint" else agents,
+        values=1 if config.ppo.value == "joint" else env.num_agents,
     )
 
 
@@ -140,9 +136,9 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
             action_scale=config.action_scale,
             trace_step=trace_step,
         )
-        batch, value_normalizer, batch_metrics = _prepare(network, config, dims.teams, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(network, config, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
-            network, optimizer, config, dims.teams, state, value_normalizer, batch, epoch_key
+            network, optimizer, config, state, value_normalizer, batch, epoch_key
         )
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
@@ -226,7 +222,7 @@ def _strongly_typed(state: TrainState) -> TrainState:
 
 
 def _prepare(
-    network: Network, config: TrainConfig, teams: Teams, state: TrainState, transitions: Transition
+    network: Network, config: TrainConfig, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
@@ -253,7 +249,7 @@ def _prepare(
     value, next_value = value_denormalize(value_normalizer, pair)
     reward = transitions.reward
     if config.ppo.value == "joint":
-        reward = team_mean(reward, teams)
+        reward = jnp.mean(reward, axis=-1, keepdims=True)
     progress = state.updates.astype(jnp.float32) / config.num_updates
     curriculum = config.curriculum
     kept = curriculum.failure_bootstrap * jnp.maximum(1.0 - progress / curriculum.failure_bootstrap_until, 0.0)
@@ -311,7 +307,6 @@ def _loss(
     params: Params,
     network: Network,
     config: TrainConfig,
-    teams: Teams,
     value_normalizer: ValueStatistics,
     entropy_coef: jax.Array,
     actor_coef: jax.Array | float,
@@ -320,16 +315,13 @@ def _loss(
     """Returns the PPO loss () of a minibatch and its parts; `actor_coef` weights all but the critic's."""
     ppo = config.ppo
     now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
-    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob, teams)
-    advantage = batch.advantage
-    if ppo.value == "joint" and ppo.ratio != "joint":  # each agent's ratio with its team's advantage
-        advantage = advantage[..., _team_of(teams)]
-    surrogate = clipped_surrogate(log_ratio, advantage[..., None], ppo.clip, ppo.dual_clip)
+    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
+    surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
     critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
     mean_entropy = jnp.mean(now.entropy)
-    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob, teams)
+    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
     metrics = {
         "loss/policy": policy_loss,
         "loss/value": critic_loss,
@@ -342,12 +334,6 @@ def _loss(
     return actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
 
 
-def _team_of(teams: Teams) -> np.ndarray:
-    """Returns the index of each agent's team (A,)."""
-    team_of = {agent: index for index, team in enumerate(teams) for agent in team}
-    return np.array([team_of[agent] for agent in range(len(team_of))])
-
-
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
     """Returns a smaller learning rate where the KL divergence exceeds the target, a larger one where it is below."""
     factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
@@ -358,7 +344,6 @@ def _learn(
     network: Network,
     optimizer: Optimizer,
     config: TrainConfig,
-    teams: Teams,
     state: TrainState,
     value_normalizer: ValueStatistics,
     batch: Batch,
@@ -378,7 +363,7 @@ def _learn(
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
         gradient, metrics = jax.grad(_loss, has_aux=True)(
-            params, network, config, teams, value_normalizer, entropy_coef, actor_coef, minibatch
+            params, network, config, value_normalizer, entropy_coef, actor_coef, minibatch
         )
         if config.optimizer.target_kl is not None:
             adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)

@@ -7,9 +7,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-
-from mqe_jax.train.types import Teams
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -77,7 +74,7 @@ def value_loss(
     return jnp.maximum(unclipped, loss(clipped - target))
 
 
-def ratio_per_agent(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
+def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
     """Returns one log-ratio per agent from log-densities per dimension: (..., A, D) -> (..., A, 1).
 
     Source: MAPPO, Yu et al., arXiv 2103.01955.
@@ -85,28 +82,22 @@ def ratio_per_agent(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
     return jnp.sum(new - old, axis=-1, keepdims=True)
 
 
-def ratio_per_dimension(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
+def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
     """Returns one log-ratio per action dimension, as OpenRL does: (..., A, D) -> (..., A, D)."""
     return new - old
 
 
-def ratio_joint(new: jax.Array, old: jax.Array, teams: Teams) -> jax.Array:
-    """Returns the log of the product of the ratios of each team's agents: (..., A, D) -> (..., teams, 1).
+def ratio_joint(new: jax.Array, old: jax.Array) -> jax.Array:
+    """Returns the log of the product of the agents' ratios: (..., A, D) -> (..., 1, 1).
 
     Source: JRPO, PPO on the joint policy of a team.
     """
-    per_agent = jnp.sum(new - old, axis=-1)
-    return jnp.stack([jnp.sum(per_agent[..., np.array(team)], axis=-1) for team in teams], axis=-1)[..., None]
+    return jnp.sum(ratio_per_agent(new, old), axis=-2, keepdims=True)
 
 
-RATIOS: dict[str, Callable[[jax.Array, jax.Array, Teams], jax.Array]] = {
+RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
     "agent": ratio_per_agent,
     "dimension": ratio_per_dimension,
     "joint": ratio_joint,
 }
 """Log-ratio functions by the name of `ppo.ratio`."""
-
-
-def team_mean(x: jax.Array, teams: Teams) -> jax.Array:
-    """Returns the mean over each team's agents: (..., A) -> (..., teams)."""
-    return jnp.stack([jnp.mean(x[..., np.array(team)], axis=-1) for team in teams], axis=-1)

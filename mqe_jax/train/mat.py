@@ -1,8 +1,8 @@
 """The network `mat`: a transformer over agents that act sequentially, conditioned on their predecessors' actions.
 
-An encoder attends over the observations of a team and outputs each agent's value; a decoder attends over the actions of
-preceding agents. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
-log-probabilities. In a match each team is a separate sequence; the weights are shared.
+An encoder attends over the observations of all agents and outputs each agent's value; a decoder attends over the
+actions of preceding agents. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
+log-probabilities.
 
 Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as in OpenRL.
 """
@@ -10,7 +10,7 @@ Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, ga
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -51,36 +51,13 @@ class Mat(GaussianSettings):
         return _build(self, dims)
 
 
-class Order(NamedTuple):
-    """Attention masks and sequence positions within teams; the sequence is the order of agents in `teams`."""
-
-    team: np.ndarray
-    """Encoder mask (A, A) bool: query agent i attends to key agents j of its own team."""
-    causal: np.ndarray
-    """Decoder mask (A, A) bool: query agent i attends to key agents j of its own team up to and including itself."""
-    rank: np.ndarray
-    """Position in the team's sequence (A,)."""
-    previous: np.ndarray
-    """Index of the preceding agent, or of the agent itself if it is first (A,)."""
-
-
-def order_of(teams: tuple[tuple[int, ...], ...]) -> Order:
-    """Returns the order of acting within teams."""
-    agents = sum(len(team) for team in teams)
-    team, rank, previous = np.zeros(agents, int), np.zeros(agents, int), np.arange(agents)
-    for number, members in enumerate(teams):
-        for place, agent in enumerate(members):
-            team[agent], rank[agent] = number, place
-            previous[agent] = members[max(place - 1, 0)]
-    same = team[:, None] == team
-    return Order(same, same & (rank <= rank[:, None]), rank, previous)
-
-
 # -- layers ----------------------------------------------------------------------------------------------------------
 
 
-def attention(params: Params, query: jax.Array, context: jax.Array, mask: np.ndarray, heads: int) -> jax.Array:
-    """Multi-head attention of `query` to `context` under `mask` (A, A): (..., A, W), (..., A, W) -> (..., A, W).
+def attention(params: Params, query: jax.Array, context: jax.Array, heads: int, *, causal: bool) -> jax.Array:
+    """Multi-head attention of `query` to `context`: (..., A, W), (..., A, W) -> (..., A, W).
+
+    With `causal`, an agent attends to none after itself.
 
     Source: Vaswani et al., arXiv 1706.03762, equation 1.
     """
@@ -91,7 +68,9 @@ def attention(params: Params, query: jax.Array, context: jax.Array, mask: np.nda
 
     q, k, v = split("query", query), split("key", context), split("value", context)
     weight = jnp.matmul(q, jnp.swapaxes(k, -1, -2), precision=nn.PRECISION) / math.sqrt(q.shape[-1])
-    weight = jax.nn.softmax(jnp.where(mask, weight, -jnp.inf), axis=-1)
+    if causal:
+        weight = jnp.where(np.tri(weight.shape[-1], dtype=bool), weight, -jnp.inf)
+    weight = jax.nn.softmax(weight, axis=-1)
     mixed = jnp.moveaxis(jnp.matmul(weight, v, precision=nn.PRECISION), -3, -2)
     return nn.dense(params["projection"], mixed.reshape(*mixed.shape[:-2], -1))
 
@@ -152,25 +131,26 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
     }
 
 
-def encode(params: Params, obs: jax.Array, order: Order, heads: int) -> jax.Array:
-    """Returns features of each agent from the observations of its team: (..., A, O) -> (..., A, W)."""
+def encode(params: Params, obs: jax.Array, heads: int) -> jax.Array:
+    """Returns features of each agent from the observations of all: (..., A, O) -> (..., A, W)."""
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs))))
     for block in params["blocks"]:
-        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.team, heads))
+        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, causal=False))
         x = nn.layer_norm(block["norm1"], x + nn.mlp(block["mlp"], x, _gelu))
     return x
 
 
-def decode(params: Params, features: jax.Array, action: jax.Array, order: Order, heads: int) -> jax.Array:
+def decode(params: Params, features: jax.Array, action: jax.Array, heads: int) -> jax.Array:
     """Returns mean actions given the actions of preceding agents: (..., A, W), (..., A, D) -> (..., A, D).
 
     An agent's own and later actions have no effect on its mean; the first agent's token is zero.
     """
-    token = jnp.where((order.rank > 0)[:, None], action[..., order.previous, :], 0.0)
+    token = jnp.concatenate([jnp.zeros_like(action[..., :1, :]), action[..., :-1, :]], axis=-2)
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
     for block in params["blocks"]:
-        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, order.causal, heads))
-        x = nn.layer_norm(block["norm1"], features + attention(block["attention1"], features, x, order.causal, heads))
+        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, causal=True))
+        mixed = attention(block["attention1"], features, x, heads, causal=True)
+        x = nn.layer_norm(block["norm1"], features + mixed)
         x = nn.layer_norm(block["norm2"], x + nn.mlp(block["mlp"], x, _gelu))
     return _head(params["head"], x)
 
@@ -186,30 +166,30 @@ def log_std_of(params: Params, settings: Mat) -> jax.Array:
 def _build(settings: Mat, dims: EnvDims) -> Network:
     if dims.values != dims.agents:
         fail("ppo.value", "joint", "'agent' with the network 'mat', which has one value per agent")
-    order, heads = order_of(dims.teams), settings.heads
+    heads = settings.heads
 
     def act(
         params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, Memory]:
-        features = encode(params["encoder"], obs, order, heads)
+        features = encode(params["encoder"], obs, heads)
         shape = (*obs.shape[:-1], dims.action)
         log_std = jnp.broadcast_to(log_std_of(params, settings), shape)
         noise = 0.0 if key is None else jnp.exp(log_std) * jax.random.normal(key, shape, obs.dtype)
 
-        def act_at(rank: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def act_at(agent: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             action, mean = carry
-            now = (order.rank == rank)[:, None]
-            mean = jnp.where(now, decode(params["decoder"], features, action, order, heads), mean)
+            now = (jnp.arange(dims.agents) == agent)[:, None]
+            mean = jnp.where(now, decode(params["decoder"], features, action, heads), mean)
             return jnp.where(now, mean + noise, action), mean
 
         zero = jnp.zeros(shape, obs.dtype)
-        action, mean = jax.lax.fori_loop(0, int(order.rank.max()) + 1, act_at, (zero, zero))
+        action, mean = jax.lax.fori_loop(0, dims.agents, act_at, (zero, zero))
         return action, log_prob(action, mean, log_std), memory
 
     def value(
         params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
     ) -> tuple[jax.Array, Memory]:
-        return _head(params["value_head"], encode(params["encoder"], obs, order, heads))[..., 0], memory
+        return _head(params["value_head"], encode(params["encoder"], obs, heads))[..., 0], memory
 
     def evaluate(
         params: Params,
@@ -219,8 +199,8 @@ def _build(settings: Mat, dims: EnvDims) -> Network:
         privileged: jax.Array,
         action: jax.Array,
     ) -> Evaluation:
-        features = encode(params["encoder"], obs, order, heads)
-        mean = decode(params["decoder"], features, action, order, heads)
+        features = encode(params["encoder"], obs, heads)
+        mean = decode(params["decoder"], features, action, heads)
         log_std = jnp.broadcast_to(log_std_of(params, settings), mean.shape)
         values = _head(params["value_head"], features)[..., 0]
         return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)

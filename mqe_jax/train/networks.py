@@ -23,20 +23,18 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import nearest
 from mqe_jax.settings import build, fail, record
-from mqe_jax.train.types import Memory, NetworkMemory, Params, Teams
+from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 
 class EnvDims(NamedTuple):
-    """Sizes given by the environment and by `ppo.value`."""
+    """Sizes of the environment of one team and of its values (`ppo.value`)."""
 
     agents: int
     observation: int
     privileged: int
     action: int
-    teams: Teams
-    """Agents of each team; one team where all cooperate."""
     values: int
-    """Number of values V: one per agent, or one per team."""
+    """Number of values V: one per agent, or one of the team."""
 
 
 class Evaluation(NamedTuple):

@@ -171,7 +171,6 @@ def read_policy(run: str | Path) -> TrainedPolicy:
     metadata = read_metadata(path, kind="policy")
     try:
         dims = EnvDims(**metadata.pop("dims"))
-        dims = dims._replace(teams=tuple(tuple(team) for team in dims.teams))
         config = build(TrainConfig, metadata.pop("config"))
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
@@ -17,7 +16,6 @@ from mqe_jax.train.types import (
     Transition,
     VectorEnv,
     is_outcome,
-    teams_of,
 )
 
 
@@ -31,7 +29,7 @@ class RolloutState(NamedTuple):
     episode_steps: jax.Array
     """Steps in this episode (N,) int32."""
     episode_return: jax.Array
-    """Sum of rewards in this episode, mean over the agents of team 0 (N,)."""
+    """Sum of rewards in this episode, mean over agents (N,)."""
 
 
 class ObservationNormalizer(NamedTuple):
@@ -72,7 +70,6 @@ def rollout(
     episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold
     `trace`, a `Trace` of all steps.
     """
-    own = np.array(teams_of(env)[0])
 
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
         before = state.env_state
@@ -99,7 +96,7 @@ def rollout(
             done=done,
         )
         episode_steps = state.episode_steps + 1
-        episode_return = state.episode_return + jnp.mean(after.reward[:, own], axis=-1)
+        episode_return = state.episode_return + jnp.mean(after.reward, axis=-1)
         of_episodes = {"episode_length": episode_steps.astype(jnp.float32), "episode_return": episode_return}
         sums = _sums({**after.metrics, **of_episodes}, done)
         state = RolloutState(

@@ -54,8 +54,8 @@ class VectorEnv(Protocol):
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with the fields
     of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to its range.
 
-    Optional attributes: `teams` (tuple of tuples of agents; one team by default): joint ratios and joint values are
-    per team. `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
+    Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
+    `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
     which `curriculum.assistance` sets (see `replace_fields`).
     """
 
