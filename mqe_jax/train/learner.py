@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import InputError
-from mqe_jax.settings import fail
 from mqe_jax.train.advantage import gae
+from mqe_jax.train.checks import check_divisible, check_environment
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
 from mqe_jax.train.networks import EnvDims, Network
@@ -30,7 +29,8 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.types import Batch, Params, TraceStep, Transition, VectorEnv, replace_fields, teams_of
+from mqe_jax.train.schedules import Scheduled, scheduled
+from mqe_jax.train.types import Batch, Params, TraceStep, Transition, VectorEnv, replace_fields
 
 Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -85,10 +85,10 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
     Raises:
         InputError: if the settings do not fit the environment.
     """
-    _check_environment(env, config)
+    check_environment(env, config)
     dims = env_dims(env, config)
     network = config.network.build(dims)
-    _check_divisible(config, network)
+    check_divisible(config, network)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
     def init(key: jax.Array) -> TrainState:
@@ -120,25 +120,22 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
 
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
-        progress = state.updates.astype(jnp.float32) / config.num_updates
-        assistance = config.curriculum.assistance * jnp.maximum(
-            1.0 - progress / config.curriculum.assistance_until, 0.0
-        )
+        now = scheduled(config, state.updates)
         rollout_state, transitions, metrics = rollout(
             env,
             network,
             state.params,
             state.obs_normalizer,
-            _assisted(state.rollout, assistance) if config.curriculum.assistance else state.rollout,
+            _assisted(state.rollout, now.assistance) if config.curriculum.assistance else state.rollout,
             rollout_key,
             config.rollout_steps,
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
             trace_step=trace_step,
         )
-        batch, value_normalizer, batch_metrics = _prepare(network, config, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(network, config, now, state, transitions)
         params, optimizer_state, learning_rate, loss_metrics = _learn(
-            network, optimizer, config, state, value_normalizer, batch, epoch_key
+            network, optimizer, config, now, state, value_normalizer, batch, epoch_key
         )
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
@@ -156,51 +153,10 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
             key=key,
             updates=state.updates + 1,
         )
-        metrics["assistance"] = assistance
+        metrics |= {"assistance": now.assistance, "entropy_coef": now.entropy_coef}
         return _strongly_typed(new_state), {**metrics, **batch_metrics, **loss_metrics}
 
     return Learner(init, update, network)
-
-
-def _check_environment(env: VectorEnv, config: TrainConfig) -> None:
-    """Checks the shapes of the environment's state, and the fields that the settings require."""
-    if len(teams_of(env)) > 1:
-        raise InputError(
-            f"env: {env.name} has {len(teams_of(env))} teams; give one: versus(env, opponents) or Mirror(env)"
-        )
-    if env.num_envs != config.num_envs:
-        fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
-    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
-    expected = {
-        "obs": (count, agents, env.observation_size),
-        "final_obs": (count, agents, env.observation_size),
-        "privileged_obs": (count, privileged),
-        "final_privileged_obs": (count, privileged),
-        "reward": (count, agents),
-        "terminated": (count,),
-        "truncated": (count,),
-    }
-    for name, shape in expected.items():
-        found = getattr(state, name).shape
-        if found != shape:
-            raise InputError(f"env: {name} of {env.name} has shape {found}; expected {shape}")
-    assistance = config.curriculum.assistance
-    if assistance and not hasattr(state, "assistance"):
-        fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
-    if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
-        fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
-
-
-def _check_divisible(config: TrainConfig, network: Network) -> None:
-    """Checks that rollouts split into chunks, and these into minibatches."""
-    if config.rollout_steps % network.chunk_length:
-        fail(
-            "rollout_steps", config.rollout_steps, f"a multiple of the network's chunk_length ({network.chunk_length})"
-        )
-    chunks = config.steps_per_update // network.chunk_length
-    if chunks % config.ppo.minibatches:
-        fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")
 
 
 def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
@@ -222,7 +178,7 @@ def _strongly_typed(state: TrainState) -> TrainState:
 
 
 def _prepare(
-    network: Network, config: TrainConfig, state: TrainState, transitions: Transition
+    network: Network, config: TrainConfig, now: Scheduled, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
@@ -250,14 +206,11 @@ def _prepare(
     reward = transitions.reward
     if config.ppo.value == "joint":
         reward = jnp.mean(reward, axis=-1, keepdims=True)
-    progress = state.updates.astype(jnp.float32) / config.num_updates
-    curriculum = config.curriculum
-    kept = curriculum.failure_bootstrap * jnp.maximum(1.0 - progress / curriculum.failure_bootstrap_until, 0.0)
     advantage, target = gae(
         reward,
         value,
         next_value,
-        transitions.terminated * (1.0 - kept),
+        transitions.terminated * (1.0 - now.failure_bootstrap),
         transitions.done,
         gamma=config.ppo.gamma,
         gae_lambda=config.ppo.gae_lambda,
@@ -268,8 +221,7 @@ def _prepare(
     metrics = {"value_mean": jnp.mean(value), "explained_variance": 1.0 - unexplained}
     if config.ppo.advantage_clip is not None:
         scale = jnp.median(jnp.abs(advantage)) + 1e-8
-        bound = jnp.where(progress < config.ppo.advantage_clip_until, config.ppo.advantage_clip, jnp.inf)
-        advantage = jnp.clip(advantage / scale, -bound, bound)
+        advantage = jnp.clip(advantage / scale, -now.advantage_clip, now.advantage_clip)
     if config.normalization.advantages:
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 
@@ -307,21 +259,20 @@ def _loss(
     params: Params,
     network: Network,
     config: TrainConfig,
+    now: Scheduled,
     value_normalizer: ValueStatistics,
-    entropy_coef: jax.Array,
-    actor_coef: jax.Array | float,
     batch: Batch,
 ) -> tuple[jax.Array, Metrics]:
-    """Returns the PPO loss () of a minibatch and its parts; `actor_coef` weights all but the critic's."""
+    """Returns the PPO loss () of a minibatch and its parts."""
     ppo = config.ppo
-    now = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
-    log_ratio = RATIOS[ppo.ratio](now.log_prob, batch.log_prob)
+    new = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
+    log_ratio = RATIOS[ppo.ratio](new.log_prob, batch.log_prob)
     surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
     policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
     target = value_normalize(value_normalizer, batch.target)
-    critic_loss = jnp.mean(value_loss(now.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
-    mean_entropy = jnp.mean(now.entropy)
-    per_agent = RATIOS["agent"](now.log_prob, batch.log_prob)
+    critic_loss = jnp.mean(value_loss(new.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
+    mean_entropy = jnp.mean(new.entropy)
+    per_agent = RATIOS["agent"](new.log_prob, batch.log_prob)
     metrics = {
         "loss/policy": policy_loss,
         "loss/value": critic_loss,
@@ -329,9 +280,9 @@ def _loss(
         "approx_kl": jnp.mean(jnp.exp(per_agent) - 1.0 - per_agent),
         "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32)),
     }
-    metrics |= {f"loss/{name}": value for name, value in now.losses.items()}
-    actor_loss = policy_loss - entropy_coef * mean_entropy + sum(now.losses.values())
-    return actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
+    metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
+    actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
+    return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
 
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
@@ -344,33 +295,24 @@ def _learn(
     network: Network,
     optimizer: Optimizer,
     config: TrainConfig,
+    now: Scheduled,
     state: TrainState,
     value_normalizer: ValueStatistics,
     batch: Batch,
     key: jax.Array,
 ) -> tuple[Params, AdamState, jax.Array, Metrics]:
     """Runs the epochs over the batch; returns parameters, optimiser state, learning rate and mean metrics."""
-    progress = state.updates.astype(jnp.float32) / config.num_updates
-    schedule = jnp.float32(1.0)
-    if config.optimizer.schedule == "linear":
-        schedule = jnp.clip((1.0 - progress) / config.optimizer.anneal, 0.0, 1.0)
-    actor_coef = (progress >= config.ppo.critic_warmup).astype(jnp.float32) if config.ppo.critic_warmup else 1.0
-    entropy_coef = jnp.float32(config.ppo.entropy_coef)
-    if config.ppo.entropy_coef_final is not None:
-        entropy_coef += jnp.minimum(progress, 1.0) * (config.ppo.entropy_coef_final - config.ppo.entropy_coef)
     chunks = batch.is_first.shape[1]
 
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
-        gradient, metrics = jax.grad(_loss, has_aux=True)(
-            params, network, config, value_normalizer, entropy_coef, actor_coef, minibatch
-        )
+        gradient, metrics = jax.grad(_loss, has_aux=True)(params, network, config, now, value_normalizer, minibatch)
         if config.optimizer.target_kl is not None:
             adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
-            falls_only = (schedule < 1.0) | (jnp.float32(actor_coef) < 1.0)
+            falls_only = (now.learning_rate_factor < 1.0) | (jnp.float32(now.actor_coef) < 1.0)
             learning_rate = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
         params, optimizer_state, grad_norm = optimizer.update(
-            gradient, optimizer_state, params, learning_rate * schedule
+            gradient, optimizer_state, params, learning_rate * now.learning_rate_factor
         )
         return (params, optimizer_state, learning_rate), {**metrics, "grad_norm": grad_norm}
 
@@ -385,6 +327,5 @@ def _learn(
     carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.ppo.epochs))
     params, optimizer_state, learning_rate = carry
     metrics = jax.tree.map(jnp.mean, metrics)
-    metrics["learning_rate"] = learning_rate * schedule
-    metrics["entropy_coef"] = entropy_coef
+    metrics["learning_rate"] = learning_rate * now.learning_rate_factor
     return params, optimizer_state, learning_rate, metrics

@@ -1,0 +1,52 @@
+"""Checks that training settings fit the environment and the network."""
+
+from __future__ import annotations
+
+import jax
+
+from mqe_jax.errors import InputError
+from mqe_jax.settings import fail
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.networks import Network
+from mqe_jax.train.types import VectorEnv, teams_of
+
+
+def check_environment(env: VectorEnv, config: TrainConfig) -> None:
+    """Checks the shapes of the environment's state, and the fields that the settings require."""
+    if len(teams_of(env)) > 1:
+        raise InputError(
+            f"env: {env.name} has {len(teams_of(env))} teams; give one: versus(env, opponents) or Mirror(env)"
+        )
+    if env.num_envs != config.num_envs:
+        fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
+    expected = {
+        "obs": (count, agents, env.observation_size),
+        "final_obs": (count, agents, env.observation_size),
+        "privileged_obs": (count, privileged),
+        "final_privileged_obs": (count, privileged),
+        "reward": (count, agents),
+        "terminated": (count,),
+        "truncated": (count,),
+    }
+    for name, shape in expected.items():
+        found = getattr(state, name).shape
+        if found != shape:
+            raise InputError(f"env: {name} of {env.name} has shape {found}; expected {shape}")
+    assistance = config.curriculum.assistance
+    if assistance and not hasattr(state, "assistance"):
+        fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
+    if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
+        fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
+
+
+def check_divisible(config: TrainConfig, network: Network) -> None:
+    """Checks that rollouts split into chunks, and these into minibatches."""
+    if config.rollout_steps % network.chunk_length:
+        fail(
+            "rollout_steps", config.rollout_steps, f"a multiple of the network's chunk_length ({network.chunk_length})"
+        )
+    chunks = config.steps_per_update // network.chunk_length
+    if chunks % config.ppo.minibatches:
+        fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")

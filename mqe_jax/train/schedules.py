@@ -1,0 +1,52 @@
+"""The settings that change during training, as functions of the number of updates done."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.train.config import TrainConfig
+
+
+class Scheduled(NamedTuple):
+    """Values of the scheduled settings in one update, () float32 each."""
+
+    assistance: jax.Array
+    """`curriculum.assistance`."""
+    failure_bootstrap: jax.Array
+    """`curriculum.failure_bootstrap`."""
+    advantage_clip: jax.Array
+    """`ppo.advantage_clip`; infinite where it does not apply."""
+    entropy_coef: jax.Array
+    """`ppo.entropy_coef`."""
+    actor_coef: jax.Array | float
+    """Weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1."""
+    learning_rate_factor: jax.Array
+    """Factor of `optimizer.schedule` on the learning rate."""
+
+
+def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
+    """Returns the values of the scheduled settings after a number of updates ()."""
+    ppo, optimizer, curriculum = config.ppo, config.optimizer, config.curriculum
+    progress = updates.astype(jnp.float32) / config.num_updates
+
+    def falling(start: float, until: float) -> jax.Array:
+        return start * jnp.maximum(1.0 - progress / until, 0.0)
+
+    clip = jnp.inf if ppo.advantage_clip is None else ppo.advantage_clip
+    entropy_coef = jnp.float32(ppo.entropy_coef)
+    if ppo.entropy_coef_final is not None:
+        entropy_coef += jnp.minimum(progress, 1.0) * (ppo.entropy_coef_final - ppo.entropy_coef)
+    factor = jnp.float32(1.0)
+    if optimizer.schedule == "linear":
+        factor = jnp.clip((1.0 - progress) / optimizer.anneal, 0.0, 1.0)
+    return Scheduled(
+        assistance=falling(curriculum.assistance, curriculum.assistance_until),
+        failure_bootstrap=falling(curriculum.failure_bootstrap, curriculum.failure_bootstrap_until),
+        advantage_clip=jnp.where(progress < ppo.advantage_clip_until, clip, jnp.inf),
+        entropy_coef=entropy_coef,
+        actor_coef=(progress >= ppo.critic_warmup).astype(jnp.float32) if ppo.critic_warmup else 1.0,
+        learning_rate_factor=factor,
+    )
