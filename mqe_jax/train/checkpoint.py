@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, write_atomically
+from mqe_jax.files import write_atomically
 
 FORMAT = "mqe_jax.train"
 VERSION = 2
@@ -151,8 +151,8 @@ def latest(run_dir: str | Path) -> Path | None:
     return next(reversed(list_checkpoints(run_dir)), None)
 
 
-def prepare_folder(run_dir: Path, resume: bool, files: Sequence[str]) -> Path | None:
-    """Creates a run folder and returns the checkpoint to resume from, or None for a new run.
+def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
+    """Checks that a folder holds no run, or with `resume` one that can be resumed.
 
     Args:
         run_dir: the folder.
@@ -160,10 +160,8 @@ def prepare_folder(run_dir: Path, resume: bool, files: Sequence[str]) -> Path | 
         files: names of a run's files, besides its checkpoints.
 
     Raises:
-        InputError: if the folder cannot be written, holds a run that is not to be resumed, or one without a
-            checkpoint. Nothing in it is changed.
+        InputError: if it holds a run that is not to be resumed, or one without a checkpoint.
     """
-    check_folder(run_dir)
     checkpoint = latest(run_dir)
     found = [name for name in files if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
     if found and not resume:
@@ -174,7 +172,6 @@ def prepare_folder(run_dir: Path, resume: bool, files: Sequence[str]) -> Path | 
         raise InputError(
             f"run_dir: {run_dir} holds {', '.join(found)} but no checkpoint to resume from; name another folder"
         )
-    return checkpoint
 
 
 def nonfinite(tree: Any) -> list[str]:

@@ -20,11 +20,11 @@ from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import fail, to_mapping
 from mqe_jax.train.checkpoint import (
+    check_run,
     checkpoint_step,
     latest,
     list_checkpoints,
     nonfinite,
-    prepare_folder,
     save_checkpoint,
 )
 from mqe_jax.train.config import TrainConfig, load_config
@@ -32,7 +32,7 @@ from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
-from mqe_jax.train.seeds import shared_leaves, stack, take, without_shared
+from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
 from mqe_jax.train.types import Recorder, VectorEnv, join_traces
 
@@ -97,8 +97,9 @@ def train_seeds(
         for folder in folders:
             check_folder(folder)
             locks.enter_context(locked(folder))
-        newest = [prepare_folder(folder, resume, run_files) for folder in folders]
-        checkpoints = newest if len(folders) == 1 else _common_checkpoints(folders)
+        for folder in folders:
+            check_run(folder, resume, run_files)
+        checkpoints = _common_checkpoints(folders)
         return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update)
 
 
@@ -120,7 +121,7 @@ def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
 
 
 class _Training:
-    """A training run of S seeds in checked and locked folders. The states of several seeds are stacked."""
+    """A training run of S seeds, with their states stacked, in checked and locked folders."""
 
     def __init__(
         self,
@@ -134,13 +135,11 @@ class _Training:
     ) -> None:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
         self._config = configs[0]
-        self._shared = shared = shared_leaves(learner.init)
-        first = [first_state(env, learner, c, path, shared) for c, path in zip(configs, checkpoints, strict=True)]
-        states = [state for state, _ in first]
-        self._single = len(configs) == 1
-        self._state = states[0] if self._single else stack(states, shared)
-        self._update = jax.jit(learner.update if self._single else jax.vmap(learner.update))
-        self._env_steps = int(states[0].updates) * self._config.steps_per_update
+        self._seeds = seeds = Seeds(learner.init, len(configs))
+        first = [first_state(env, learner, c, path, seeds.shared) for c, path in zip(configs, checkpoints, strict=True)]
+        self._state = seeds.stack([state for state, _ in first])
+        self._update = seeds.map(learner.update)
+        self._env_steps = int(first[0][0].updates) * self._config.steps_per_update
         self._saved = -1 if checkpoints[0] is None else self._env_steps
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
@@ -176,7 +175,7 @@ class _Training:
                     progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                     if on_update is not None:
                         for i, row in enumerate(rows):
-                            on_update(self._seed(i), row)
+                            on_update(self._seeds.take(self._state, i), row)
                     if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
                         self._save()
                 self._save()
@@ -186,7 +185,7 @@ class _Training:
                     raise
                 self._save()
                 raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
-        return [self._seed(i) for i in range(len(self._configs))]
+        return [self._seeds.take(self._state, i) for i in range(len(self._configs))]
 
     def _end(self) -> None:
         """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
@@ -199,23 +198,17 @@ class _Training:
         finally:
             self._logs.close()
 
-    def _seed(self, i: int, state: TrainState | None = None) -> TrainState:
-        """Returns one seed's state from the current states, or from `state` if given."""
-        states = self._state if state is None else state
-        return states if self._single else take(states, self._shared, i)
-
     def _step(self, files: Sequence[Sequence[MetricsLog]]) -> list[dict[str, float]]:
         """Performs and logs one update of every seed; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)
         if self._recorder is not None:
-            trace = metrics.pop("trace")
-            self._recorder.add(trace if self._single else join_traces(trace))
+            self._recorder.add(join_traces(metrics.pop("trace")))
         metrics = jax.device_get(metrics)
         rows = []
         for i, folder in enumerate(self._folders):
-            own = metrics if self._single else {name: value[i] for name, value in metrics.items()}
-            state = self._seed(i, after)
+            state = self._seeds.take(after, i)
+            own = {name: value[i] for name, value in metrics.items()}
             row = _row(state, own, self._config, self._start_time, began)
             row["fps"] *= len(self._folders)
             _check_finite(state, row, folder)
@@ -231,7 +224,7 @@ class _Training:
     def _policies(self) -> list[TrainedPolicy]:
         dims = env_dims(self._env, self._config)
         return [
-            policy_of(self._seed(i), dims, config, task=self._env.name, env_steps=self._env_steps)
+            policy_of(self._seeds.take(self._state, i), dims, config, task=self._env.name, env_steps=self._env_steps)
             for i, config in enumerate(self._configs)
         ]
 
@@ -241,13 +234,14 @@ class _Training:
             if self._saved == self._env_steps:
                 return
             seconds = time.perf_counter() - self._start_time
-            kept = self._config.checkpoint.kept if self._single else max(self._config.checkpoint.kept, 2)
+            # A process killed between two seeds' checkpoints has the older one in common.
+            kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
             for i, (config, folder) in enumerate(zip(self._configs, self._folders, strict=True)):
                 metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
                 metadata["environments"] = config.checkpoint.environments
-                state = self._seed(i)
+                state = self._seeds.take(self._state, i)
                 whole = config.checkpoint.environments
-                tree = without_shared(state, self._shared) if whole else without_environments(state)
+                tree = without_shared(state, self._seeds.shared) if whole else without_environments(state)
                 save_checkpoint(folder, tree, self._env_steps, metadata, kept)
             self._save_policies()
             self._saved = self._env_steps

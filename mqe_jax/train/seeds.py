@@ -1,4 +1,4 @@
-"""States of several seeds in one pytree, as `jax.vmap` batches them.
+"""States of several seeds in one pytree: where seeds become a `jax.vmap`.
 
 Warp keeps contacts of all environments in shared buffers, which `vmap` leaves unbatched. They are
 overwritten in every physics step, so one copy suffices for all seeds, and checkpoints omit them.
@@ -15,22 +15,36 @@ import jax.numpy as jnp
 from mqe_jax.train.types import PyTree
 
 
-def shared_leaves(init: Callable[[jax.Array], PyTree]) -> PyTree:
-    """Returns for each leaf of `init(key)` whether it is unbatched under `vmap`."""
-    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
-    keys = jax.ShapeDtypeStruct((2, 2), jnp.uint32)
-    alone, batched = jax.eval_shape(init, key), jax.eval_shape(jax.vmap(init), keys)
-    return jax.tree.map(lambda one, many: one.shape == many.shape, alone, batched)
+class Seeds:
+    """S states of `init(key)`, with a leading axis S on all leaves but the shared ones."""
 
+    def __init__(self, init: Callable[[jax.Array], PyTree], count: int) -> None:
+        key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+        keys = jax.ShapeDtypeStruct((2, 2), jnp.uint32)
+        alone, batched = jax.eval_shape(init, key), jax.eval_shape(jax.vmap(init), keys)
+        self.count = count
+        self.shared = jax.tree.map(lambda one, many: one.shape == many.shape, alone, batched)
+        """Whether each leaf of a state is unbatched under `vmap`."""
 
-def stack(states: Sequence[Any], shared: PyTree) -> Any:
-    """Returns states of S seeds as one, with a leading axis S on all leaves but the shared ones."""
-    return jax.tree.map(lambda once, *x: x[0] if once else jnp.stack(x), shared, *states)
+    def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
+        """Returns the compiled `update(state) -> (state, metrics)` of all seeds; metrics gain a leading axis S.
 
+        A single seed is computed without a batch axis, and thus bit for bit as outside of `Seeds`.
+        """
 
-def take(state: Any, shared: PyTree, seed: int) -> Any:
-    """Returns one seed's state from those of several."""
-    return jax.tree.map(lambda once, x: x if once else x[seed], shared, state)
+        def alone(states: PyTree) -> tuple[PyTree, PyTree]:
+            state, metrics = update(self.take(states, 0))
+            return self.stack([state]), jax.tree.map(lambda x: x[None], metrics)
+
+        return jax.jit(alone if self.count == 1 else jax.vmap(update))
+
+    def stack(self, states: Sequence[Any]) -> Any:
+        """Returns the states of all seeds as one."""
+        return jax.tree.map(lambda once, *x: x[0] if once else jnp.stack(x), self.shared, *states)
+
+    def take(self, states: Any, seed: int) -> Any:
+        """Returns one seed's state."""
+        return jax.tree.map(lambda once, x: x if once else x[seed], self.shared, states)
 
 
 def without_shared(state: Any, shared: PyTree) -> Any:

@@ -30,7 +30,7 @@ def initial_key(config: TrainConfig) -> jax.Array:
 def first_state(
     env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
 ) -> tuple[TrainState, float]:
-    """Returns the initial or restored state and the seconds already spent; `shared` from `shared_leaves`."""
+    """Returns the initial or restored state and the seconds already spent; `shared` as in `Seeds`."""
     if checkpoint is None:
         return jax.jit(learner.init)(initial_key(config)), 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
