@@ -6,7 +6,7 @@ docs/new_task.md explains the steps; `python examples/new_task.py` evaluates the
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import mujoco
 from mujoco import mjx
 
 from mqe_jax.collision import OBJECT_BIT, WALL_BIT
-from mqe_jax.envs import QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
+from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object
 from mqe_jax.planners import scripted_policy
@@ -103,15 +103,6 @@ class CatchParams(TaskParams):
     """Weights of the reward terms."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class CatchState:
-    """The task's own state."""
-
-    distance: jax.Array
-    """Distance of the robot to the mouse after the last step (), m."""
-
-
 class Go1Catch(QuadrupedEnv):
     """Catch a mouse.
 
@@ -136,17 +127,14 @@ class Go1Catch(QuadrupedEnv):
         place = jnp.array([3.8, 0.0]) + jax.random.uniform(key, (2,), minval=-0.5, maxval=0.5)
         return qpos.at[self.objects["mouse"].qpos].set(place), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> CatchState:
-        return CatchState(self.distance(robot_state, data))
-
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Sets the mouse's velocity."""
         velocity = flee(self.object_pose(data, "mouse"), robot_state.position_w[0, :2], self.params.mouse_speed)
         return data.replace(qvel=data.qvel.at[self.objects["mouse"].qvel].set(velocity))
 
-    def distance(self, robot_state: RobotState, data: mjx.Data) -> jax.Array:
+    def distance(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns the horizontal distance of the robot to the mouse (), m."""
-        return jnp.linalg.norm(self.object_pose(data, "mouse") - robot_state.position_w[0, :2])
+        return jnp.linalg.norm(self.object_pose(state.data, "mouse") - robot_state.position_w[0, :2])
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -155,14 +143,13 @@ class Go1Catch(QuadrupedEnv):
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         return {"base": robot_state.base_info, "mouse": self.object_pose(state.data, "mouse")[None]}
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        distance = self.distance(robot_state, state.data)
-        terms = {"approach": state.task.distance - distance, "caught": distance < self.params.reach}
-        return terms, CatchState(distance)
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        distance = self.distance(*after)
+        return {"approach": self.distance(*before) - distance, "caught": distance < self.params.reach}
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends when the mouse is caught."""
-        return self.distance(robot_state, state.data) < self.params.reach
+        return self.distance(state, robot_state) < self.params.reach
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the mouse is caught."""

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs import QuadrupedEnv, State, make
+from mqe_jax.envs import Moment, QuadrupedEnv, State, make
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
@@ -95,11 +95,16 @@ def observation(env: QuadrupedEnv, state: State) -> np.ndarray:
     return np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
 
 
-def terms_of(env: QuadrupedEnv, state: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The unweighted terms and the agents' rewards (A,) of a state after a step."""
+def moment(env: QuadrupedEnv, state: State) -> Moment:
+    """A state with its robots' states."""
+    return Moment(state, env.read(state.data))
+
+
+def terms_of(env: QuadrupedEnv, before: State, after: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The unweighted terms and the agents' rewards (A,) of a step without collision."""
     from mqe_jax.envs.reward import weigh
 
-    terms, _ = env.rewards(state, env.read(state.data), jnp.array(False))
+    terms = env.rewards(moment(env, before), moment(env, after), jnp.array(False))
     reward, _ = weigh(terms, env.params.rewards, env.num_agents)
     return {name: np.asarray(value) for name, value in terms.items()}, np.asarray(reward)
 

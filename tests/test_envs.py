@@ -15,7 +15,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax.engines import Engine
-from mqe_jax.envs import TASKS, QuadrupedEnv, Randomization, State, VectorEnv, make, replay
+from mqe_jax.envs import TASKS, Moment, QuadrupedEnv, Randomization, State, VectorEnv, make, replay
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
@@ -187,17 +187,17 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, fresh: St
 
     before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
     # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
-    task = gate.reset_task(jax.random.PRNGKey(0), before, state.data, state.anchors)
-    state = dataclasses.replace(state, anchors=jnp.array([[3.5, 0.0]]), task=task)
+    state = dataclasses.replace(state, anchors=jnp.array([[3.5, 0.0]]))
     after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
-    terms, _ = gate.rewards(state, after, jnp.array(True))
+    terms = gate.rewards(Moment(state, before), Moment(state, after), jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
     assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
     # hypot(0.3, 0.43) = 0.524 m apart, which is not closer than 0.5 m
     assert float(terms["crowding"]) == 0
     reward, logged = weigh(terms, gate.params.rewards, 2)
     np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
-    near, _ = gate.rewards(state, robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]]), jnp.array(False))
+    close = robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]])
+    near = gate.rewards(Moment(state, after), Moment(state, close), jnp.array(False))
     assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
     assert float(near["collision"]) == 0
     assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import QuadrupedEnv, State, make
-from mqe_jax.envs.reward import weigh
 from mqe_jax.npc import defend
 from mqe_jax.planners import scripted_policy
-from tests.states import initial, made, observation, placed, stepper, still, with_object
+from tests.states import initial, made, observation, placed, stepper, still, terms_of, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -224,22 +223,17 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
     env = envs["go1football-2vs2"]
     state = fresh[env.name]
     before = with_ball(env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0))
-    task = env.reset_task(jax.random.PRNGKey(0), env.read(before.data), before.data, before.anchors)
-    np.testing.assert_allclose(task.goal, [5, 5], atol=1e-5)
-    np.testing.assert_allclose(task.robot, [2, 3], atol=1e-5)
+    goals, robots = env.distances(before, env.read(before.data))
+    np.testing.assert_allclose(goals, [5, 5], atol=1e-5)
+    np.testing.assert_allclose(robots, [2, 3], atol=1e-5)
     # The ball at (8, 0): 4 m from team 0's goal (+1), 6 m from team 1's (-1): 1 - (-1) = 2.
     # Team 0's nearest robot, now at (6.5, 0), is 1.5 m away (+0.5), team 1's 2 m (+1): 0.5 - 1 = -0.5.
     after = with_ball(env, standing(env, state, [(4, -2, 0), (6.5, 0, 0), (10, 0, 0), (10, -4, 0)]), (8.0, 0.0))
-    after = dataclasses.replace(after, task=task)
-    terms, moved = env.rewards(after, env.read(after.data), NO)
-    reward, _ = weigh(terms, env.params.rewards, 4)
+    reward = terms_of(env, before, after)[1]
     np.testing.assert_allclose(reward, np.array([1, 1, -1, -1]) * (0.3 * 2 - 0.1 * 0.5), atol=1e-4)
-    np.testing.assert_allclose(moved.goal, [4, 6], atol=1e-5)
-    np.testing.assert_allclose(moved.robot, [1.5, 2], atol=1e-5)
     # A goal of team 1: the ball at (1.9, 0), 10.1 m from the far goal (-6.1), 0.1 m from the near one (+5.9).
     # Nearest robots: team 0's (4, -2) at hypot(2.1, 2) = 2.9 m (-1.4), team 1's at 8.1 m (-6.1).
-    goal = dataclasses.replace(with_ball(env, after, (1.9, 0.0)), task=moved)
-    reward, _ = weigh(env.rewards(goal, env.read(goal.data), NO)[0], env.params.rewards, 4)
+    reward = terms_of(env, after, with_ball(env, after, (1.9, 0.0)))[1]
     expected = -10 + 0.3 * (-6.1 - 5.9) + 0.1 * (-1.4 + 6.1)
     np.testing.assert_allclose(reward, np.array([1, 1, -1, -1]) * expected, atol=1e-4)
     assert abs(expected + 10) < 5  # the goal is most of it
@@ -266,13 +260,12 @@ def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
 
 def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -> None:
     state = standing(attack, fresh[attack.name], [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
-    robots = attack.read(state.data)
     for ball, expected in (((9.0, 0.0), 3 * np.exp(-1)), ((12.3, 0.4), 10 + 3 * np.exp(-0.5 / 3))):
-        reward, _ = weigh(attack.rewards(with_ball(attack, state, ball), robots, NO)[0], attack.params.rewards, 2)
+        reward = terms_of(attack, state, with_ball(attack, state, ball))[1]
         np.testing.assert_allclose(reward, [expected] * 2, atol=1e-4)
     # The agents' own goal is none.
     own = with_ball(attack, state, (1.9, 0.0))
-    assert float(attack.rewards(own, robots, NO)[0]["goal"]) == 0
+    assert terms_of(attack, state, own)[0]["goal"] == 0
     # A goal counts until the end of the episode, also when the ball comes out again.
     scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), still(attack))
     assert float(scored.metrics["success"]) == 1 and not scored.terminated

@@ -95,13 +95,11 @@ def test_actions_are_mirrored_where_left_and_right_are_swapped() -> None:
 # ---------------------------------------------------------------- Push Cylinder
 
 
-def tug_state(env: Any, y: float) -> Any:
+def tug_state(env: Any, y: float, ends: tuple[float, float] = (-1.3, 1.63)) -> Any:
     """Robot 0 is 1.43 m and robot 1 1.5 m from the axis when the cylinder is at 0.13."""
-    state = placed(env, [[1.6, -1.3, 0.3], [1.6, 1.63, 0.3]], [[0, 0, PI / 2], [0, 0, -PI / 2]], {"cylinder": [y]})
-    task = dataclasses.replace(
-        state.task, y=jnp.float32(0.1), previous_y=jnp.float32(0.08), distance=jnp.array([1.5, 1.4])
-    )
-    return dataclasses.replace(state, task=task)
+    position = [[1.6, end, 0.3] for end in ends]
+    state = placed(env, position, [[0, 0, PI / 2], [0, 0, -PI / 2]], {"cylinder": [y]})
+    return dataclasses.replace(state, task=dataclasses.replace(state.task, previous_y=jnp.float32(0.08)))
 
 
 def test_tug_observation_and_rewards() -> None:
@@ -110,15 +108,16 @@ def test_tug_observation_and_rewards() -> None:
     obs = observation(env, state)
     np.testing.assert_allclose(obs[0], [1.6, -1.3, 0.3, 0, 0, PI / 2, 0.13, 0, 1.43, 0.08], atol=1e-5)
     np.testing.assert_allclose(obs[1], [1.6, -1.63, 0.3, 0, 0, PI / 2, -0.13, 0, 1.5, -0.08], atol=1e-5)
-    terms, reward = terms_of(env, state)
+    before = tug_state(env, 0.1, ends=(-1.4, 1.5))
+    terms, reward = terms_of(env, before, state)
     # Own terms: the cylinder is 0.13 m on robot 1's half, and moved on; robot 0 came 0.07 m closer to it, robot 1
     # got 0.1 m away. Less the opponent's: 0.13 m and 0.17 m.
     np.testing.assert_allclose(terms["push"], [0.13, -0.13], atol=1e-6)
     np.testing.assert_allclose(terms["approach"], [0.17, -0.17], atol=1e-6)
     np.testing.assert_allclose(reward, [10 * 0.13 + 2 * 0.17, -10 * 0.13 - 2 * 0.17], atol=1e-5)
     # From y 0.1 back to 0.06, still on robot 1's half: that counts half. On robot 0's half: it counts for robot 1.
-    np.testing.assert_allclose(terms_of(env, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6)
-    np.testing.assert_allclose(terms_of(env, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6)
+    np.testing.assert_allclose(terms_of(env, before, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6)
+    np.testing.assert_allclose(terms_of(env, before, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6)
 
 
 def test_tug_result_and_end() -> None:
@@ -195,8 +194,8 @@ def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_t
 def test_door_rewards_result_and_end() -> None:
     env = made("go1revolvingdoor")
     state = placed(env, [[3.9, 0.0, 0.3], [3.0, 0.5, 0.3]])
-    state = dataclasses.replace(state, task=dataclasses.replace(state.task, distance=jnp.array([0.08, 1.0])))
-    terms, reward = terms_of(env, state)
+    before = placed(env, [[3.93, 0.0, 0.3], [2.85, 0.0, 0.3]])  # 0.08 m and 1 m from the line's middle
+    terms, reward = terms_of(env, before, state)
     np.testing.assert_allclose(terms["win"], [1, -1])
     # Robot 0 is 0.05 m from the line's middle, robot 1 hypot(0.85, 0.5) = 0.98615 m: 0.03 m and 0.01385 m closer.
     np.testing.assert_allclose(terms["approach"], [0.01615, -0.01615], atol=1e-4)
@@ -206,7 +205,7 @@ def test_door_rewards_result_and_end() -> None:
     assert result(env, placed(env, [[3.9, 0.0, 0.3], [3.9, 0.5, 0.3]])) == (0, 0)
     fallen = placed(env, [[3.0, 0.0, 0.3], [3.0, 0.5, 0.3]], [[0, 0, 0], [0.9, 0, 0]])
     assert result(env, fallen) == (1, 0)
-    np.testing.assert_allclose(terms_of(env, fallen)[0]["win"], [1, -1])
+    np.testing.assert_allclose(terms_of(env, fallen, fallen)[0]["win"], [1, -1])
     both = placed(env, [[0.6, -1.0, 0.3], [0.6, 1.0, 0.3]])
     assert not stepped(env, both).terminated
     assert env.max_steps == 250
@@ -243,11 +242,11 @@ def test_wrestling_rewards_result_and_end() -> None:
     inside, out = [3.1, -0.5, 0.7], [3.1, 1.75, 0.7]
     play = ring(env, inside, [3.1, 0.6, 0.7])
     assert result(env, play) == (0, 0) and not stepped(env, play).terminated
-    np.testing.assert_allclose(terms_of(env, play)[1], [0, 0])
+    np.testing.assert_allclose(terms_of(env, play, play)[1], [0, 0])
     won = ring(env, inside, out)
     assert result(env, won) == (1, 0) and stepped(env, won).terminated
-    np.testing.assert_allclose(terms_of(env, won)[1], [10, -10])
-    np.testing.assert_allclose(terms_of(env, ring(env, [1.3, 0.0, 0.7], [3.1, 0.6, 0.7]))[1], [-10, 10])
+    np.testing.assert_allclose(terms_of(env, won, won)[1], [10, -10])
+    np.testing.assert_allclose(terms_of(env, play, ring(env, [1.3, 0.0, 0.7], [3.1, 0.6, 0.7]))[1], [-10, 10])
     assert result(env, ring(env, [3.1, -1.75, 0.7], out)) == (0, 0)
     assert result(env, ring(env, inside, [3.1, 0.6, 0.7], roll=1.26)) == (1, 0)  # over 0.4 pi
     assert result(env, ring(env, inside, [3.1, 0.6, 0.7], roll=1.25)) == (0, 0)
@@ -272,16 +271,16 @@ def test_bridge_rewards_result_and_end() -> None:
     env = made("go1bridge")
     facing = [[0, 0, 0], [0, 0, PI]]
     apart = placed(env, [[3.1, 0, 1.32], [6.9, 0, 1.32]], facing)
-    np.testing.assert_allclose(terms_of(env, apart)[1], [0, 0])
+    np.testing.assert_allclose(terms_of(env, apart, apart)[1], [0, 0])
     assert result(env, apart) == (0, 0) and not stepped(env, apart).terminated
     across = placed(env, [[7.1, 0.9, 1.32], [7.8, 0, 1.32]], facing)
-    np.testing.assert_allclose(terms_of(env, across)[1], [1, -1])
+    np.testing.assert_allclose(terms_of(env, across, across)[1], [1, -1])
     assert result(env, across) == (1, 0) and not stepped(env, across).terminated
     swapped = placed(env, [[7.1, 0.3, 1.32], [2.9, 0, 1.32]], facing)
-    np.testing.assert_allclose(terms_of(env, swapped)[1], [0, 0])
+    np.testing.assert_allclose(terms_of(env, swapped, swapped)[1], [0, 0])
     assert result(env, swapped) == (0, 0)
     off = placed(env, [[7.1, 0.3, 1.32], [5.0, 0.6, 0.45]], facing)
-    np.testing.assert_allclose(terms_of(env, off)[1], [11, -11])
+    np.testing.assert_allclose(terms_of(env, off, off)[1], [11, -11])
     assert result(env, off) == (1, 0) and stepped(env, off).terminated
     both = placed(env, [[5.0, -0.6, 0.4], [5.0, 0.6, 0.45]], facing)
     assert result(env, both) == (0, 0) and stepped(env, both).terminated

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mqe_jax import objects
-from mqe_jax.envs import State, make
+from mqe_jax.envs import Moment, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.cooperative import plan_seesaw, plan_seesaw_alone
@@ -93,19 +93,17 @@ def test_observation(env: Any, fresh: State) -> None:
 
 def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
     no, yes = jnp.array(False), jnp.array(True)
-    state = dataclasses.replace(fresh, task=dataclasses.replace(fresh.task, x=jnp.array([7.70, 3.90])))
+    before = Moment(fresh, robot_state([[7.70, 0, 0.3], [3.90, 0, 0.3]]))
 
     def reward(after: RobotState, collision: Any = no) -> tuple[Any, Any]:
-        terms, task = env.rewards(state, after, collision)
+        terms = env.rewards(before, Moment(fresh, after), collision)
         total, logged = weigh(terms, env.params.rewards, 2)
         assert float(logged["average_step_reward"]) == float(total[0]) == float(total[1])
-        return total[0], (terms, task)
+        return total[0], terms
 
     # One stands on the platform: heights 1.3 + 0.45 - 0.56; ways 0.02 - 0.01; squares 0.01 + 0.04 - 0.5.
     up = robot_state([[7.72, 0.1, 1.3], [3.89, -0.2, 0.45]])
-    total, (_, task) = reward(up)
-    assert float(total) == pytest.approx(10 + 1.19 + 5 * 0.01 + 0.5 * 0.45, abs=1e-4)
-    np.testing.assert_allclose(task.x, [7.72, 3.89], rtol=1e-6)
+    assert float(reward(up)[0]) == pytest.approx(10 + 1.19 + 5 * 0.01 + 0.5 * 0.45, abs=1e-4)
     assert float(reward(up, yes)[0]) == pytest.approx(11.465 - 2, abs=1e-4)
     # Before the platform, or too low: nothing for success. Both on it: twice.
     for position, count in (
@@ -113,14 +111,14 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
         ([[7.8, 0, 1.15], [3.9, 0, 0.4]], 0),
         ([[7.8, 0, 1.3]] * 2, 2),
     ):
-        assert float(reward(robot_state(position))[1][0]["success"]) == count
+        assert float(reward(robot_state(position))[1]["success"]) == count
     # A fall, by roll and by nothing less.
-    assert float(reward(robot_state(SPAWN, roll=(0.0, 0.81)))[1][0]["fall"]) == 1
-    assert float(reward(robot_state(SPAWN, roll=(-0.79, 0.0), pitch=(0.9, 0.0)))[1][0]["fall"]) == 0
+    assert float(reward(robot_state(SPAWN, roll=(0.0, 0.81)))[1]["fall"]) == 1
+    assert float(reward(robot_state(SPAWN, roll=(-0.79, 0.0), pitch=(0.9, 0.0)))[1]["fall"]) == 0
     fallen = robot_state([[7.70, 0.5, 0.28], [3.90, -0.5, 0.28]], roll=(0.9, 0.0))
     assert float(reward(fallen)[0]) == pytest.approx(-2, abs=1e-4)
     # 0.3 m and 0.4 m from each other is 0.5 m, which is not closer; 0.4 m is: -0.25 / 0.16.
-    assert float(reward(robot_state([[4.0, 0, 0.3], [4.31, 0.4, 0.3]]))[1][0]["crowding"]) == 0
+    assert float(reward(robot_state([[4.0, 0, 0.3], [4.31, 0.4, 0.3]]))[1]["crowding"]) == 0
     close = robot_state([[7.70, 0.5, 0.28], [7.30, 0.5, 0.28]])
     assert float(reward(close)[0]) == pytest.approx(5 * (7.30 - 3.90) - 0.25 / 0.16, abs=1e-3)
 

@@ -13,6 +13,7 @@ import pytest
 
 from mqe_jax.envs import State, make
 from mqe_jax.errors import InputError
+from tests.states import terms_of
 
 BOX, BALL = "go1pushbox", "go1football-defender"
 GOAL = np.array([12.0, 0.0])
@@ -76,8 +77,7 @@ def test_ball_and_robots_start_nearer_to_the_goal() -> None:
 def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
     """Reward terms of a step in which some coordinates take new values."""
     data = state.data.replace(qpos=state.data.qpos.at[jnp.asarray(columns)].set(jnp.asarray(values)))
-    state = dataclasses.replace(state, data=data)
-    return {name: float(x) for name, x in env.rewards(state, env.read(data), jnp.array(False))[0].items()}
+    return {name: float(x) for name, x in terms_of(env, state, dataclasses.replace(state, data=data))[0].items()}
 
 
 def test_shaping_terms_of_push_box() -> None:

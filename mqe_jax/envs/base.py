@@ -26,7 +26,7 @@ from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import weigh
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.robots.index import RobotState
@@ -212,8 +212,8 @@ class QuadrupedEnv(Task):
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
             key=next_key,
         )
-        terms, _ = self.rewards(state, robot_state, no)
-        _, logged = weigh(terms, self.params.rewards, self.num_agents)
+        now = Moment(state, robot_state)
+        _, logged = weigh(self.rewards(now, now, no), self.params.rewards, self.num_agents)
         names = (*logged, *self.outcome(state, robot_state, no), "collision", "diverged", "overflow")
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
@@ -235,15 +235,15 @@ class QuadrupedEnv(Task):
         action = self.unmirror_action(jnp.where((state.step < state.frozen_steps)[:, None], 0.0, action))
         key, push_key, noise_key, npc_key = jax.random.split(state.key, 4)
 
-        before = self.read(state.data)
+        before = Moment(state, self.read(state.data))
         target, control = self.controller.targets(
             state.control,
             action,
-            before.proprioception,
-            self.npc_commands(state, before),
+            before.robots.proprioception,
+            self.npc_commands(*before),
             state.randomized.action_lag,
         )
-        data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before, npc_key)
+        data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
         fields, forces = self.randomizer.fields(state.randomized), self.external_forces(state)
         data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
         robot_state = self.read(data)
@@ -252,9 +252,9 @@ class QuadrupedEnv(Task):
 
         diverged = bad_action | self._diverged(data)
         collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
-        terms, task = self.rewards(state, robot_state, collision)
+        state = dataclasses.replace(state, task=self.step_task(before, Moment(state, robot_state)))
+        terms = self.rewards(before, Moment(state, robot_state), collision)
         reward, logged = weigh(terms, self.params.rewards, self.num_agents)
-        state = dataclasses.replace(state, task=task)
         failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
         terminated = failed | self.ending(state, robot_state)
         metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Platform
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -104,10 +104,9 @@ class Go1Bridge(Duel):
         first, second = self.params.spawn_x
         return (first, 0.0, 0.0), (second, 0.0, np.pi)
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        out = self.eliminated(robot_state)
-        terms = {"win": self.zero_sum(out[::-1] & ~out), "far_side": self.zero_sum(self.across(robot_state))}
-        return terms, None
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        out = self.eliminated(after.robots)
+        return {"win": self.zero_sum(out[::-1] & ~out), "far_side": self.zero_sum(self.across(after.robots))}
 
     def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots are off the bridge or have fallen (2,) bool."""

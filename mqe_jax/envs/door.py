@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from annotated_types import Gt
 
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Door
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -20,7 +19,7 @@ from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import DoorGap, EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
-    from mujoco import mjx
+    pass
 
 _WALL_LENGTH = 1.0  # m along x, of the block with the door at its centre
 
@@ -70,15 +69,6 @@ class DoorParams(TaskParams):
             fail("door_size", self.door_size, f"narrower than the gap, {self.gap}")
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class DoorState:
-    """The task's own state."""
-
-    distance: jax.Array
-    """Distance of each robot to the midpoint of the line after the last step (2,), m."""
-
-
 class Go1RevolvingDoor(Duel):
     """Revolving Door.
 
@@ -119,20 +109,15 @@ class Go1RevolvingDoor(Duel):
         x, y = self.params.spawn_x, self.params.spawn_y
         return (x, -y, 0.0), (x, y, 0.0)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DoorState:
-        return DoorState(self.distance(robot_state))
-
     def distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to the midpoint of the line (2,), m."""
         return jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1)
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        distance = self.distance(robot_state)
-        terms = {
-            "win": self.zero_sum(self.wins(state, robot_state)),
-            "approach": self.zero_sum(state.task.distance - distance),
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        return {
+            "win": self.zero_sum(self.wins(*after)),
+            "approach": self.zero_sum(self.distance(before.robots) - self.distance(after.robots)),
         }
-        return terms, DoorState(distance)
 
     def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """A robot leads while it is past the line."""

@@ -5,9 +5,8 @@ The field extends from x 2 to 12; the goals are gaps in the thick walls behind b
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Ball
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -147,17 +146,6 @@ class Football2vs2Params(FootballParams):
     """Weights of the reward terms."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class FootballMatchState:
-    """The task's own state."""
-
-    goal: jax.Array
-    """Distance of the ball to the goal that each team attacks, after the last step (2,), m."""
-    robot: jax.Array
-    """Distance of the ball to each team's nearest robot, after the last step (2,), m."""
-
-
 class FootballMatch(Football, Match):
     """Base of the football matches.
 
@@ -175,15 +163,10 @@ class FootballMatch(Football, Match):
         """The centre of the field, m."""
         return float(GOALS[:, 0].mean()), 0.0
 
-    def reset_task(
-        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array
-    ) -> FootballMatchState:
-        return self.distances(robot_state, data)
-
-    def distances(self, robot_state: RobotState, data: mjx.Data) -> FootballMatchState:
-        """Returns the ball's distances to goals and robots."""
-        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - self.ball(data)[:2], axis=-1)
-        return FootballMatchState(self.goal_distance(data), jnp.min(apart.reshape(2, -1), axis=1))
+    def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
+        """Returns the ball's distances to the goal that each team attacks and to each team's nearest robot (2,), m."""
+        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - self.ball(state.data)[:2], axis=-1)
+        return self.goal_distance(state.data), jnp.min(apart.reshape(2, -1), axis=1)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -215,15 +198,14 @@ class FootballMatch(Football, Match):
             blocks["teammate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
         return blocks
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        after = self.distances(robot_state, state.data)
-        terms = {
-            "goal": self.zero_sum(self.in_goal(state.data)),
-            "progress": self.zero_sum(state.task.goal - after.goal),
-            "approach": self.zero_sum(state.task.robot - after.robot),
-            "fall": self.zero_sum(self.eliminated(robot_state)),
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        (goal_before, robot_before), (goal, robot) = self.distances(*before), self.distances(*after)
+        return {
+            "goal": self.zero_sum(self.in_goal(after.state.data)),
+            "progress": self.zero_sum(goal_before - goal),
+            "approach": self.zero_sum(robot_before - robot),
+            "fall": self.zero_sum(self.eliminated(after.robots)),
         }
-        return terms, after
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends with a goal."""

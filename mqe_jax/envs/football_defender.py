@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
 from mqe_jax.settings import Fraction, record
@@ -56,10 +56,6 @@ class DefenderState:
 
     scored: jax.Array
     """Whether the ball has been in the goal in this episode () bool."""
-    goal: jax.Array
-    """Distance of the ball to the goal's midpoint after the last step (), m."""
-    robot: jax.Array
-    """Distance of the ball to the nearest of the two robots after the last step (), m."""
 
 
 class Go1FootballDefender(Football):
@@ -91,7 +87,10 @@ class Go1FootballDefender(Football):
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
-        return DefenderState(jnp.zeros((), bool), *self.distances(robot_state, data))
+        return DefenderState(jnp.zeros((), bool))
+
+    def step_task(self, before: Moment, after: Moment) -> DefenderState:
+        return DefenderState(before.state.task.scored | self.in_goal(after.state.data)[0])
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
@@ -106,10 +105,10 @@ class Go1FootballDefender(Football):
         way = start * (jnp.asarray(GOALS[0]) - qpos[ball])
         return qpos.at[ball].add(way).at[self.index.base_qpos[:2, 0]].add(way[0]), qvel
 
-    def distances(self, robot_state: RobotState, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
+    def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal's midpoint and to the nearest of the two robots (), m."""
-        apart = jnp.linalg.norm(robot_state.position_w[:2, :2] - self.ball(data)[:2], axis=-1)
-        return self.goal_distance(data)[0], jnp.min(apart)
+        apart = jnp.linalg.norm(robot_state.position_w[:2, :2] - self.ball(state.data)[:2], axis=-1)
+        return self.goal_distance(state.data)[0], jnp.min(apart)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -122,16 +121,14 @@ class Go1FootballDefender(Football):
             "ball_velocity": for_all(self.ball_velocity(state.data), 2),
         }
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        goal = self.in_goal(state.data)[0]
-        distance, robot = self.distances(robot_state, state.data)
-        terms = {
-            "goal": goal,
-            "nearness": jnp.exp(-distance / 3.0),
-            "progress": state.task.goal - distance,
-            "approach": state.task.robot - robot,
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        (goal_before, robot_before), (goal, robot) = self.distances(*before), self.distances(*after)
+        return {
+            "goal": self.in_goal(after.state.data)[0],
+            "nearness": jnp.exp(-goal / 3.0),
+            "progress": goal_before - goal,
+            "approach": robot_before - robot,
         }
-        return terms, DefenderState(state.task.scored | goal, distance, robot)
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a goal at any time in this episode."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +12,14 @@ from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
-    from mujoco import mjx
+    pass
 
 
 @record
@@ -68,15 +67,6 @@ class GateParams(TaskParams):
         check_gap("gate_width", self.gate_width, self.track_width)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class GateState:
-    """The task's own state."""
-
-    distance: jax.Array
-    """Distance of each robot to its target after the last step (2,), m."""
-
-
 class Go1Gate(QuadrupedEnv):
     """Narrow Gate.
 
@@ -98,9 +88,6 @@ class Go1Gate(QuadrupedEnv):
         track = Track(blocks=(SpawnArea(2.0), gate, Plane(1.0), EndWall()), width=params.track_width)
         return Scene(track, num_robots=2)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> GateState:
-        return GateState(self.target_distance(robot_state))
-
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((*PAIR, GATE))
@@ -114,15 +101,13 @@ class Go1Gate(QuadrupedEnv):
         target = np.array([[params.target_x, params.target_y], [params.target_x, -params.target_y]], np.float32)
         return jnp.linalg.norm(robot_state.position_w[:, :2] - target, axis=-1)
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        distance = self.target_distance(robot_state)
-        terms = {
-            "success": reward.past(robot_state.position_w[:, 0], state.anchors[0, 0], self.params.past_gate),
-            "approach": reward.decrease(state.task.distance, distance),
-            "crowding": reward.crowding(robot_state.position_w[:, :2]),
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        return {
+            "success": reward.past(after.robots.position_w[:, 0], after.state.anchors[0, 0], self.params.past_gate),
+            "approach": reward.decrease(self.target_distance(before.robots), self.target_distance(after.robots)),
+            "crowding": reward.crowding(after.robots.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
         }
-        return terms, GateState(distance)
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: both robots are through; `success/one`: at least one is, however the episode ended."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +10,14 @@ import jax.numpy as jnp
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import Positive, record
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
-    from mujoco import mjx
+    pass
 
 
 @record
@@ -37,15 +36,6 @@ class PlaneParams(TaskParams):
     """Width of the strip across which the robots are spawned side by side, m."""
     rewards: PlaneRewards = PlaneRewards()
     """Weights of the reward terms."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class PlaneState:
-    """The task's own state."""
-
-    x: jax.Array
-    """X of the robots after the last step (A,), m."""
 
 
 class Go1Plane(QuadrupedEnv):
@@ -71,9 +61,6 @@ class Go1Plane(QuadrupedEnv):
         )
         return Scene(track, num_robots=self.num_agents)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PlaneState:
-        return PlaneState(robot_state.position_w[:, 0])
-
     @property
     def observation_layout(self) -> ObservationLayout:
         agents = self.num_agents
@@ -86,9 +73,8 @@ class Go1Plane(QuadrupedEnv):
         blocks = {"one_hot": jnp.eye(self.num_agents), "base": info}
         return blocks | ({"teammates": others(info)} if self.num_agents > 1 else {})
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        x = robot_state.position_w[:, 0]
-        return {"forward": jnp.sum(x - state.task.x)}, PlaneState(x)
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        return {"forward": jnp.sum(after.robots.position_w[:, 0] - before.robots.position_w[:, 0])}
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: no robot has fallen."""

@@ -6,7 +6,7 @@ The box is too heavy for one robot to push effectively.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import numpy as np
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Box
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -90,14 +90,8 @@ class PushBoxParams(TaskParams):
 class PushBoxState:
     """The task's own state."""
 
-    x: jax.Array
-    """X of the box after the last step (), m."""
     start: jax.Array
     """X of the box at the reset (), m."""
-    behind: jax.Array
-    """Summed distances of the robots to their places behind the box after the last step (), m."""
-    lateral_offset: jax.Array
-    """Lateral distance between box and gate after the last step (), m."""
 
 
 class Go1PushBox(QuadrupedEnv):
@@ -138,16 +132,15 @@ class Go1PushBox(QuadrupedEnv):
         return qpos, qvel
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PushBoxState:
-        x = self.object_pose(data, "box")[0]
-        return PushBoxState(x, x, *self.distances(robot_state, data, anchors))
+        return PushBoxState(self.object_pose(data, "box")[0])
 
-    def distances(self, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
         """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""
-        box = self.object_pose(data, "box")[:2]
+        box = self.object_pose(state.data, "box")[:2]
         length, width, _ = self.params.box_size
         places = box + jnp.array([[-0.5 * length - _BEHIND, -0.25 * width], [-0.5 * length - _BEHIND, 0.25 * width]])
         behind = jnp.sum(jnp.linalg.norm(robot_state.position_w[:2, :2] - places, axis=-1))
-        return behind, jnp.abs(box[1] - anchors[0, 1])
+        return behind, jnp.abs(box[1] - state.anchors[0, 1])
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -162,21 +155,23 @@ class Go1PushBox(QuadrupedEnv):
             "box_quaternion": for_all(pose[3:], 2),
         }
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        x = self.object_pose(state.data, "box")[0]
-        behind, lateral_offset = self.distances(robot_state, state.data, state.anchors)
-        terms = {
-            "progress": x - state.task.x,
-            "success": self.through(state).astype(jnp.float32),
-            "approach": state.task.behind - behind,
-            "aim": state.task.lateral_offset - lateral_offset,
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        (behind_before, offset_before), (behind, offset) = self.distances(*before), self.distances(*after)
+        return {
+            "progress": self.box_x(after.state) - self.box_x(before.state),
+            "success": self.through(after.state).astype(jnp.float32),
+            "approach": behind_before - behind,
+            "aim": offset_before - offset,
         }
-        return terms, PushBoxState(x, state.task.start, behind, lateral_offset)
+
+    def box_x(self, state: State) -> jax.Array:
+        """Returns the x of the box's centre (), m."""
+        return self.object_pose(state.data, "box")[0]
 
     def through(self, state: State) -> jax.Array:
         """Returns whether the box is past the gate () bool."""
-        return self.object_pose(state.data, "box")[0] > state.anchors[0, 0] + self.params.past_gate
+        return self.box_x(state) > state.anchors[0, 0] + self.params.past_gate
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the box is past the gate; `success/distance`: its displacement along x, m."""
-        return {"success": self.through(state), "success/distance": state.task.x - state.task.start}
+        return {"success": self.through(state), "success/distance": self.box_x(state) - state.task.start}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -20,7 +19,7 @@ from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
-    from mujoco import mjx
+    pass
 
 
 @record
@@ -90,15 +89,6 @@ class SeesawParams(TaskParams):
             fail("plank_start", self.plank_start, f"within +-plank_limit, {self.plank_limit}")
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class SeesawState:
-    """The task's own state."""
-
-    x: jax.Array
-    """X of each robot after the last step (2,), m."""
-
-
 class Go1Seesaw(QuadrupedEnv):
     """Climb on Seesaw.
 
@@ -140,9 +130,6 @@ class Go1Seesaw(QuadrupedEnv):
         """Places the plank at its initial angle, with the near end on the ground."""
         return qpos.at[self.objects["seesaw"].qpos].set(self.params.plank_start), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> SeesawState:
-        return SeesawState(robot_state.position_w[:, 0])
-
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout(PAIR)
@@ -155,20 +142,20 @@ class Go1Seesaw(QuadrupedEnv):
         x, z = self.params.on_platform
         return (robot_state.position_w[:, 0] > x) & (robot_state.position_w[:, 2] > z)
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         params = self.params
-        x, y, z = robot_state.position_w.T
-        roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
-        terms = {
-            "success": jnp.sum(self.on_platform(robot_state)).astype(jnp.float32),
+        robots = after.robots
+        x, y, z = robots.position_w.T
+        roll, pitch = jnp.abs(robots.euler[:, 0]), jnp.abs(robots.euler[:, 1])
+        return {
+            "success": jnp.sum(self.on_platform(robots)).astype(jnp.float32),
             "height": jnp.sum(z) - params.height_base,
-            "progress": jnp.sum(x - state.task.x),
+            "progress": jnp.sum(x - before.robots.position_w[:, 0]),
             "lateral_offset": jnp.sum(jnp.square(y)) - params.lateral_offset_base,
             "collision": collision.astype(jnp.float32),
             "fall": jnp.any((roll > params.max_roll) | (pitch > params.max_pitch)).astype(jnp.float32),
-            "crowding": reward.crowding(robot_state.position_w[:, :2]) / 2,
+            "crowding": reward.crowding(robots.position_w[:, :2]) / 2,
         }
-        return terms, SeesawState(x)
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a robot stands on the platform; `success/height`: height of the highest robot, m."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import numpy as np
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
 from mqe_jax.robots.index import RobotState
@@ -96,15 +95,6 @@ class SheepHardParams(SheepEasyParams):
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class SheepState:
-    """The task's own state."""
-
-    x: jax.Array
-    """X of the sheep after the last step (S,), m."""
-
-
 class Go1SheepEasy(QuadrupedEnv):
     """Sheep Dog: sheep flee from nearby robots and must be herded through a gate.
 
@@ -146,9 +136,6 @@ class Go1SheepEasy(QuadrupedEnv):
         noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> SheepState:
-        return SheepState(self.sheep(data)[:, 0])
-
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Sets the sheep's velocities by `flock`."""
         index = self._sheep("qvel")
@@ -183,15 +170,14 @@ class Go1SheepEasy(QuadrupedEnv):
         """Returns which sheep are past the gate (S,) bool."""
         return self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        sheep, through = self.sheep(state.data), self.through(state)
-        distance = jnp.linalg.norm(sheep - state.anchors[0], axis=-1)
-        terms = {
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        sheep, through = self.sheep(after.state.data), self.through(after.state)
+        distance = jnp.linalg.norm(sheep - after.state.anchors[0], axis=-1)
+        return {
             "success": jnp.sum(through).astype(jnp.float32),
-            "progress": jnp.sum(sheep[:, 0] - state.task.x),
+            "progress": jnp.sum(sheep[:, 0] - self.sheep(before.state.data)[:, 0]),
             "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-distance / 2.0))),
         }
-        return terms, SheepState(sheep[:, 0])
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the fraction of the sheep that are past the gate, however the episode ended."""

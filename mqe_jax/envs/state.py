@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 
 from mqe_jax.control import ControlState
 from mqe_jax.envs.randomization import RandomizedParams
+from mqe_jax.robots.index import RobotState
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -57,3 +58,10 @@ class State:
     """Initial steps during which each agent's action is replaced by zero (A,) int32."""
     key: jax.Array
     """Random key."""
+
+
+class Moment(NamedTuple):
+    """A state and the robots' states read from its physics state."""
+
+    state: State
+    robots: RobotState

@@ -11,7 +11,7 @@ import numpy as np
 
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import ObjectIndex
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
@@ -104,12 +104,16 @@ class Task:
         """Returns the observation's blocks by name (A, width)."""
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the unweighted reward terms, () or (A,), and the task's own fields after the step.
+    def step_task(self, before: Moment, after: Moment) -> Any:
+        """Returns the task's own state fields after a step; `after` still has those before it."""
+        return before.state.task
+
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        """Returns the unweighted reward terms of a step, () or (A,).
 
         Args:
-            state: the state before the step, with the physics state after it.
-            robot_state: after the step.
+            before: before the step.
+            after: after the step.
             collision: whether there is any trunk contact of an agent () bool.
         """
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import numpy as np
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Cylinder
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -74,12 +74,8 @@ class TugParams(TaskParams):
 class TugState:
     """The task's own state."""
 
-    y: jax.Array
-    """Y of the cylinder after the last step (), m."""
     previous_y: jax.Array
     """Y of the cylinder one step earlier (), m."""
-    distance: jax.Array
-    """Distance of each robot to the cylinder's axis after the last step (2,), m."""
 
 
 class Go1Tug(Duel):
@@ -131,16 +127,18 @@ class Go1Tug(Duel):
         return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(shift)
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> TugState:
-        y = self.cylinder_y(data)
-        return TugState(y, y, self.distance(robot_state, y))
+        return TugState(self.cylinder_y(data))
+
+    def step_task(self, before: Moment, after: Moment) -> TugState:
+        return TugState(self.cylinder_y(before.state.data))
 
     def cylinder_y(self, data: mjx.Data) -> jax.Array:
         """Returns the cylinder's y (), m."""
         return self.object_pose(data, "cylinder")[0]
 
-    def distance(self, robot_state: RobotState, y: jax.Array) -> jax.Array:
+    def distance(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to the cylinder's axis (2,), m."""
-        axis = jnp.array([self.center[0], 0.0]).at[1].set(y)
+        axis = jnp.array([self.center[0], 0.0]).at[1].set(self.cylinder_y(state.data))
         return jnp.linalg.norm(robot_state.position_w[:, :2] - axis, axis=-1)
 
     @property
@@ -161,19 +159,17 @@ class Go1Tug(Duel):
         return {
             "base": super().observe(state, robot_state)["base"],
             "cylinder": jnp.stack([side * self.cylinder_y(state.data), side * speed], axis=-1),
-            "distance": self.distance(robot_state, self.cylinder_y(state.data))[:, None],
+            "distance": self.distance(state, robot_state)[:, None],
             "previous_cylinder": (side * state.task.previous_y)[:, None],
         }
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        y, side = self.cylinder_y(state.data), jnp.array([1.0, -1.0])
-        back = side * (y - state.task.y) < 0
-        distance = self.distance(robot_state, y)
-        terms = {
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        y, side = self.cylinder_y(after.state.data), jnp.array([1.0, -1.0])
+        back = side * (y - self.cylinder_y(before.state.data)) < 0
+        return {
             "push": self.zero_sum(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),
-            "approach": self.zero_sum(state.task.distance - distance),
+            "approach": self.zero_sum(self.distance(*before) - self.distance(*after)),
         }
-        return terms, TugState(y, state.task.y, distance)
 
     def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """A robot leads while the cylinder is on the opponent's half."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -91,8 +91,8 @@ class Go1Wrestling(Duel):
         (x, y), apart = self.center, self.params.spawn_y
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
-    def rewards(self, state: State, robot_state: RobotState, collision: jax.Array) -> tuple[dict[str, jax.Array], Any]:
-        return {"win": self.zero_sum(self.wins(state, robot_state))}, None
+    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        return {"win": self.zero_sum(self.wins(*after))}
 
     def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots have fallen or left the ring (2,) bool."""
