@@ -16,19 +16,18 @@ from mujoco import mjx
 from mqe_jax.collision import OBJECT_BIT, WALL_BIT
 from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.objects import Object
+from mqe_jax.objects import Object, add_body, add_slides, add_solid
 from mqe_jax.planners import scripted_policy
 from mqe_jax.planners.steering import Observation, go_to, pose
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
-from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall, register_block
+from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall
 from mqe_jax.train.evaluate import evaluate
 
 # Step 1: a terrain block defines its walls.
 
 
-@register_block("pillar")
 @dataclasses.dataclass(frozen=True)
 class Pillar(TerrainBlock):
     """Free ground with a square pillar at its centre."""
@@ -46,17 +45,17 @@ class Pillar(TerrainBlock):
 # Step 2: an object adds one body named `object/<name>`; its joints are its generalised coordinates.
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Mouse(Object):
     """A ball-shaped mouse that slides over the ground. Coordinates: x, y; velocity likewise."""
 
-    radius: float = 0.12
+    radius: Positive = 0.12
     """Radius, m."""
 
-    def add(self, spec: mujoco.MjSpec, visual: bool) -> None:
-        body = self._body(spec, (0, 0, 0), 1.0, (0.01, 0.01, 0.01))
-        self._slides(body, "xy", damping=1.0)
-        self._solid(
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        body = add_body(spec, name, (0, 0, 0), 1.0, (0.01, 0.01, 0.01))
+        add_slides(body, "xy", damping=1.0)
+        add_solid(
             body,
             mujoco.mjtGeom.mjGEOM_SPHERE,
             (0.45, 0.4, 0.4, 1.0),
@@ -118,7 +117,7 @@ class Go1Catch(QuadrupedEnv):
 
     def scene(self) -> Scene:
         track = Track(blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1)
-        return Scene(track, num_robots=1, objects=(Mouse("mouse"),))
+        return Scene(track, num_robots=1, objects={"mouse": Mouse()})
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import numpy as np
 from mqe_jax import robots
 from mqe_jax.collision import MAX_ROBOTS
 from mqe_jax.errors import InputError
-from mqe_jax.objects import Object, ObjectIndex, index_objects
+from mqe_jax.objects import Object
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.motors import Motors
 from mqe_jax.robots.robot import Robot
@@ -32,8 +32,8 @@ class Scene:
     """Robot type shared by all R robots."""
     contacts: str = "full"
     """Set of the robots' collision geoms, one of `mqe_jax.robots.CONTACTS`."""
-    objects: tuple[Object, ...] = ()
-    """Movable and fixed objects, added after the robots."""
+    objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
+    """Movable and fixed objects by name, added after the robots as bodies `object/<name>`."""
     colors: tuple[int, ...] = ()
     """Colours of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty."""
     friction: float = 1.0
@@ -62,6 +62,20 @@ class Scene:
             raise InputError(
                 f"Scene.colors: {self.colors} must have one colour for each of the {self.num_robots} robots"
             )
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectIndex:
+    """Addresses of one object in a compiled model; host integers."""
+
+    qpos: np.ndarray
+    """Addresses of its coordinates in qpos (C,)."""
+    qvel: np.ndarray
+    """Addresses of its velocities in qvel (V,)."""
+    body: int
+    """Body id."""
+    geom: int
+    """Id of its collision geom, -1 if it has none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,8 +147,8 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
             color=scene.colors[number] if scene.colors else number,
         )
         spec.attach(body, prefix=robots.prefix(number), frame=spec.worldbody.add_frame())
-    for item in scene.objects:
-        item.add(spec, visual)
+    for name, item in scene.objects.items():
+        item.add(spec, f"object/{name}", visual)
     robots.add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
     if visual:
         spec.worldbody.add_light(
@@ -161,8 +175,26 @@ def compile_scene(scene: Scene) -> CompiledScene:
         model=model,
         index=index,
         motors=Motors.of(scene.robot, index, scene.timestep),
-        objects=index_objects(model, scene.objects),
+        objects=_index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),
         mocap_anchor=np.array([wall.anchor for wall in moving], np.int32),
     )
+
+
+def _index_objects(model: mujoco.MjModel, names: Iterable[str]) -> Mapping[str, ObjectIndex]:
+    """Looks up the addresses of all objects of a compiled model by name."""
+    found = {}
+    for name in names:
+        body = model.body(f"object/{name}")
+        joints = range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]) if body.jntnum[0] else ()
+        widths = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+        qpos, qvel = [], []
+        for joint in joints:
+            coordinates, speeds = widths.get(mujoco.mjtJoint(model.jnt_type[joint]), (1, 1))
+            qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
+            qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
+        as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"object/{name}")
+        found[name] = ObjectIndex(as_int(qpos), as_int(qvel), int(body.id), geom)
+    return found

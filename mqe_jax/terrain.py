@@ -1,6 +1,6 @@
-"""Terrain: a track is a row of named blocks along x, each as wide as the track.
+"""Terrain: a track is a row of blocks along x, each as wide as the track.
 
-A block is a small frozen dataclass with a length and a `layout` method, registered by name. Walls whose positions
+A block is a small frozen dataclass with a length and a `layout` method. Walls whose positions
 differ between environments are attached to an anchor, which is sampled at reset and is part of the state (mocap bodies,
 which all engines support).
 
@@ -10,14 +10,12 @@ Frame: the environment's, x along the track from its start, y across it with 0 o
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar
 
 import mujoco
 import numpy as np
 
 from mqe_jax.collision import GROUND_BIT, WALL_BIT
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.errors import InputError
 
 # A block parameter that may be a pair (easy, hard), interpolated by the track's difficulty in [0, 1].
 Ranged = float | tuple[float, float]
@@ -80,43 +78,10 @@ class Layout:
     """Spawn poses (x, y, yaw) of the robots, m and rad."""
 
 
-BLOCKS: dict[str, type[TerrainBlock]] = {}
-B = TypeVar("B", bound="TerrainBlock")
-
-
-def register_block(name: str) -> Callable[[type[B]], type[B]]:
-    """Registers a block class under `name`, for `block(name, ...)` and configuration files."""
-
-    def register(cls: type[B]) -> type[B]:
-        cls.name = name
-        BLOCKS[name] = cls
-        return cls
-
-    return register
-
-
-def block(name: str, **parameters: Any) -> TerrainBlock:
-    """Creates a block by its registered name.
-
-    Raises:
-        InputError: for an unknown block or parameter, with the nearest match.
-    """
-    if name not in BLOCKS:
-        raise InputError(f"terrain block: unknown name {name!r}{nearest(name, BLOCKS)}; allowed: {', '.join(BLOCKS)}")
-    fields = [field.name for field in dataclasses.fields(BLOCKS[name])]
-    for key in parameters:
-        if key not in fields:
-            raise InputError(
-                f"terrain block {name}: unknown parameter {key!r}{nearest(key, fields)}; allowed: {', '.join(fields)}"
-            )
-    return BLOCKS[name](**parameters)
-
-
 @dataclasses.dataclass(frozen=True)
 class TerrainBlock:
     """Base of all blocks."""
 
-    name: ClassVar[str] = ""
     length: Ranged = 1.0
     """Extent along x, m."""
 
@@ -126,24 +91,22 @@ class TerrainBlock:
 
     def at(self, difficulty: float) -> TerrainBlock:
         """Returns the block with every (easy, hard) parameter interpolated at a difficulty in [0, 1]."""
-        ranged = {field.name for field in dataclasses.fields(self) if "Ranged" in str(field.type)}
-        fixed = {}
-        for name in ranged:
-            value = getattr(self, name)
-            if isinstance(value, tuple | list):
-                fixed[name] = value[0] + difficulty * (value[1] - value[0])
-        return dataclasses.replace(self, **fixed)
+        ranged = [field.name for field in dataclasses.fields(self) if "Ranged" in str(field.type)]
+        return dataclasses.replace(self, **{name: _at(getattr(self, name), difficulty) for name in ranged})
+
+
+def _at(value: Ranged, difficulty: float) -> float:
+    if isinstance(value, tuple | list):
+        return value[0] + difficulty * (value[1] - value[0])
+    return value
 
 
 def _number(value: Ranged) -> float:
     if isinstance(value, tuple | list):
-        raise InputError(
-            f"terrain block: the range {value} is not resolved; call `at` with a difficulty in [0, 1] first"
-        )
+        raise InputError(f"terrain block: the range {value} is not resolved; call `at` first")
     return float(value)
 
 
-@register_block("spawn")
 @dataclasses.dataclass(frozen=True)
 class SpawnArea(TerrainBlock):
     """Spawn poses side by side across the track, with a wall behind them."""
@@ -165,7 +128,6 @@ class SpawnArea(TerrainBlock):
         return Layout(barriers=back, spawn=spawn)
 
 
-@register_block("plane")
 @dataclasses.dataclass(frozen=True)
 class Plane(TerrainBlock):
     """Ground without walls."""
@@ -174,7 +136,6 @@ class Plane(TerrainBlock):
         return Layout()
 
 
-@register_block("end_wall")
 @dataclasses.dataclass(frozen=True)
 class EndWall(TerrainBlock):
     """The wall at the end of the track."""
@@ -185,7 +146,6 @@ class EndWall(TerrainBlock):
         return Layout(barriers=(Barrier(f"end{number}", (start, 0.0), (-1.0, 0.0), track.width),))
 
 
-@register_block("gate")
 @dataclasses.dataclass(frozen=True)
 class Gate(TerrainBlock):
     """A wall across the middle of the block with a gap."""
@@ -219,15 +179,6 @@ class Gate(TerrainBlock):
         return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))
 
 
-@register_block("door_gap")
-@dataclasses.dataclass(frozen=True)
-class DoorGap(Gate):
-    """The gate of the revolving door, whose hinge is at the centre of the gap."""
-
-    length: Ranged = 1.0
-    width: Ranged = 2.0
-
-
 @dataclasses.dataclass(frozen=True)
 class RoughGround:
     """Perlin-noise ground instead of the flat floor; a height field, on all engines.
@@ -249,9 +200,7 @@ class RoughGround:
 
     def heights(self, length: float, width: float, difficulty: float = 1.0) -> np.ndarray:
         """Returns heights in [0, amplitude] (rows along y, columns along x), m; `difficulty` as in `Track`."""
-        amplitude = self.amplitude
-        if isinstance(amplitude, tuple | list):
-            amplitude = amplitude[0] + difficulty * (amplitude[1] - amplitude[0])
+        amplitude = _at(self.amplitude, difficulty)
         rows, columns = (round(extent / self.resolution) + 1 for extent in (width, length))
         total = np.zeros((rows, columns))
         for octave in range(self.octaves):
@@ -336,8 +285,8 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
     Moving walls become mocap bodies named `wall/<name>`, in the order of the layout's walls.
     """
     layout = track.layout()
-    world = spec.worldbody
-    _add_ground(spec, track, visual)
+    world, solid = spec.worldbody, {"contype": WALL_BIT, "conaffinity": 0}
+    _add_ground(spec, track)
     for barrier in layout.barriers:
         normal = np.array([*barrier.normal, 0.0])
         world.add_geom(
@@ -346,16 +295,11 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             size=(0, 0, 1),
             pos=(*barrier.point, 0.0),
             zaxis=normal,
-            contype=WALL_BIT,
-            conaffinity=0,
             group=3,
+            **solid,
         )
         if visual:
-            half = (
-                track.wall_thickness / 2,
-                barrier.length / 2 + track.wall_thickness,
-                track.wall_height / 2,
-            )
+            half = (track.wall_thickness / 2, barrier.length / 2 + track.wall_thickness, track.wall_height / 2)
             center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
             yaw = np.arctan2(normal[1], normal[0])
             world.add_geom(
@@ -382,14 +326,13 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             size=half,
             pos=position,
             rgba=WALL_COLOR,
-            contype=WALL_BIT,
-            conaffinity=0,
             group=1,
+            **solid,
         )
     return layout
 
 
-def _add_ground(spec: mujoco.MjSpec, track: Track, visual: bool) -> None:
+def _add_ground(spec: mujoco.MjSpec, track: Track) -> None:
     ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": FLOOR_COLOR, "group": 0}
     if track.rough is None:
         spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
@@ -397,13 +340,8 @@ def _add_ground(spec: mujoco.MjSpec, track: Track, visual: bool) -> None:
     length, width = track.length, track.width
     heights = track.rough.heights(length, width, track.difficulty)
     top = max(float(heights.max()), 1e-6)
-    spec.add_hfield(
-        name="ground",
-        nrow=heights.shape[0],
-        ncol=heights.shape[1],
-        size=(length / 2, width / 2, top, 0.1),
-        userdata=(heights / top).ravel(),
-    )
+    (rows, columns), size = heights.shape, (length / 2, width / 2, top, 0.1)
+    spec.add_hfield(name="ground", nrow=rows, ncol=columns, size=size, userdata=(heights / top).ravel())
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=(length / 2, 0, 0), **ground
     )

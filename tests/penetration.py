@@ -76,8 +76,8 @@ def full_model(scene: Scene) -> mujoco.MjModel:
             geom.contype = geom.conaffinity = 0
         _add_full_shapes(body, robot)
         spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
-    for item in scene.objects:
-        item.add(spec, False)
+    for name, item in scene.objects.items():
+        item.add(spec, f"object/{name}", False)
     return spec.compile()
 
 

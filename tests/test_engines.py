@@ -22,15 +22,15 @@ from tests import engines as comparison
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a single step
 # Far apart, so that only the first robot touches them; the second one stands at x = 1.
-OBJECTS = (
-    Box("box"),
-    Ball("ball"),
-    Sheep("sheep"),
-    Cylinder("cylinder", position=(40.0, 0.0)),
-    Door("door", position=(50.0, 0.0)),
-    Seesaw("seesaw", hinge=(60.0, 0.0, 0.545)),
-    Platform("platform", center=(70.0, 0.0, 0.3)),
-)
+OBJECTS = {
+    "box": Box(),
+    "ball": Ball(),
+    "sheep": Sheep(),
+    "cylinder": Cylinder(x=40.0),
+    "door": Door(position=(50.0, 0.0)),
+    "seesaw": Seesaw(hinge=(60.0, 0.0, 0.545)),
+    "platform": Platform(center=(70.0, 0.0, 0.3)),
+}
 PLACES = {"box": (10.0, 0.0, 0.5), "ball": (20.0, 0.0, 0.1), "sheep": (30.0, 0.0)}
 # What the robot meets, by the start of the geom's name: start of its trunk (x, y, z), and where it moves at 0.5 m/s.
 AHEAD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)

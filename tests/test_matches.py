@@ -166,16 +166,16 @@ def test_a_duel_is_seen_by_both_in_their_own_frames(task: str) -> None:
     np.testing.assert_allclose(obs[1], [*mirrored[0], *mirrored[1]], atol=1e-5)
 
 
-@pytest.mark.parametrize(("task", "top"), [("go1wrestling", "platform_top"), ("go1bridge", "top")])
-def test_a_platform_above_the_robots_is_refused(task: str, top: str) -> None:
+@pytest.mark.parametrize(
+    ("task", "top"), [("go1wrestling", {"platform": {"center": (3.1, 0.0, 2.0)}}), ("go1bridge", {"top": 2.0})]
+)
+def test_a_platform_above_the_robots_is_refused(task: str, top: Any) -> None:
     with pytest.raises(ValueError, match=r"spawn_height: .* must be at least 2.30"):
-        make(task, impl="c", control="position", num_envs=1, **{top: 2.0})  # pyright: ignore[reportArgumentType]
+        make(task, impl="c", control="position", num_envs=1, **top)
 
 
 def test_the_cylinder_slides_along_y_under_more_than_its_friction_and_stays_in_the_arena() -> None:
-    scene = compile_scene(
-        Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects=(Cylinder("can", position=(9.0, 0.0)),))
-    )
+    scene = compile_scene(Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects={"can": Cylinder(x=9.0)}))
     index = scene.objects["can"]
     way = {}
     for force in (20.0, 40.0, -200.0):
@@ -216,7 +216,7 @@ def test_a_door_turns_about_its_middle_and_lets_one_side_through_at_a_time() -> 
         Scene(
             Track((SpawnArea(2.0), Plane(4.0)), walled=False),
             num_robots=1,
-            objects=(Door("door", position=(4.0, 0.0)),),
+            objects={"door": Door(position=(4.0, 0.0))},
         )
     )
     index, data = scene.objects["door"], mujoco.MjData(scene.model)

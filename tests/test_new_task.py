@@ -15,7 +15,6 @@ import pytest
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make, register_task
 from mqe_jax.errors import InputError
 from mqe_jax.planners import planner_of, scripted_policy
-from mqe_jax.terrain import BLOCKS
 from mqe_jax.train.evaluate import evaluate
 
 FILE = Path(__file__).parents[1] / "examples" / "new_task.py"
@@ -30,7 +29,7 @@ def example() -> Any:
     sys.modules["new_task"] = module
     spec.loader.exec_module(module)
     yield module
-    del sys.modules["new_task"], TASKS["go1catch"], PLANNERS["go1catch"], BLOCKS["pillar"]
+    del sys.modules["new_task"], TASKS["go1catch"], PLANNERS["go1catch"]
 
 
 def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:

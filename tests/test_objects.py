@@ -33,12 +33,12 @@ def herd() -> Any:
     return made("go1sheep-hard")
 
 
-def plain(*objects: objects.Object) -> Any:
+def plain(**objects: objects.Object) -> Any:
     return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
 
 
 def test_a_ball_with_initial_velocity_rolls_and_comes_to_rest() -> None:
-    scene = plain(Ball("ball"))
+    scene = plain(ball=Ball())
     index, data = scene.objects["ball"], mujoco.MjData(scene.model)
     data.qpos[index.qpos[:3]] = [2.0, 3.0, 0.1]
     data.qvel[index.qvel[:3]] = [3.0, 0.0, 0.0]
@@ -52,7 +52,7 @@ def test_a_ball_with_initial_velocity_rolls_and_comes_to_rest() -> None:
 
 
 def test_a_box_slides_under_more_than_its_friction_only() -> None:
-    scene = plain(Box("box", friction=0.5))
+    scene = plain(box=Box(friction=0.5))
     index = scene.objects["box"]
     weight = 6.0 * objects.GRAVITY
     moved = []
@@ -219,7 +219,7 @@ def test_the_planner_wins(task: str, share: float) -> None:
 
 
 def test_objects_are_indexed_by_name() -> None:
-    scene = plain(Box("box"), Sheep("dolly"))
+    scene = plain(box=Box(), dolly=Sheep())
     assert scene.objects["box"].qpos.shape == (7,) and scene.objects["box"].qvel.shape == (6,)
     assert scene.objects["dolly"].qpos.shape == (2,)
     assert scene.model.body(scene.objects["dolly"].body).name == "object/dolly"

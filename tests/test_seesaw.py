@@ -72,9 +72,9 @@ def test_the_scene_is_as_listed(env: Any) -> None:
 
 def test_what_turns_has_its_centre_of_mass_in_its_hinge(env: Any) -> None:
     scenes = [(env.compiled, "seesaw", 100.0)]
-    door = Door("door", position=(2.6, 0.3))
+    door = Door(position=(2.6, 0.3))
     scenes.append(
-        (compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0))), num_robots=1, objects=(door,))), "door", 4.0)
+        (compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0))), num_robots=1, objects={"door": door})), "door", 4.0)
     )
     for compiled, name, mass in scenes:
         model, body = compiled.model, compiled.objects[name].body
@@ -158,7 +158,7 @@ def test_endings(env: Any, step: Any, fresh: State) -> None:
 
 def plank() -> Any:
     scene = compile_scene(
-        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=(Seesaw("seesaw"),))
+        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects={"seesaw": Seesaw()})
     )
     return scene.model, scene.objects["seesaw"]
 

@@ -1,4 +1,4 @@
-"""Terrain: blocks by name, difficulty, rough ground, and robots that stand on it on the engines."""
+"""Terrain: difficulty, rough ground, and robots that stand on it on the engines."""
 
 from __future__ import annotations
 
@@ -12,18 +12,9 @@ from mqe_jax import engines
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
-from mqe_jax.terrain import BLOCKS, EndWall, Gate, Plane, RoughGround, SpawnArea, Track, block
+from mqe_jax.terrain import EndWall, Gate, Plane, RoughGround, SpawnArea, Track
 
 ROUGH = RoughGround(amplitude=(0.0, 0.08), wavelength=1.0, octaves=3, seed=1)
-
-
-def test_blocks_are_made_by_name() -> None:
-    assert block("gate", width=0.7) == Gate(width=0.7)
-    assert {"spawn", "plane", "gate", "door_gap", "end_wall"} <= set(BLOCKS)
-    with pytest.raises(InputError, match=r"terrain block: unknown name 'gat' \(did you mean 'gate'\?\)"):
-        block("gat")
-    with pytest.raises(InputError, match=r"terrain block gate: unknown parameter 'widht' \(did you mean 'width'\?\)"):
-        block("gate", widht=1.0)
 
 
 def test_difficulty_interpolates_the_ranges_of_blocks() -> None:

@@ -89,15 +89,15 @@ class Go1Bridge(Duel):
         params = self.params
         first, second = params.platform_x
         length, width = params.platform
-        blocks = [
-            Platform(f"platform{side}", center=(x, 0.0, params.top), size=(length, width, params.top))
+        objects = {
+            f"platform{side}": Platform(center=(x, 0.0, params.top), size=(length, width, params.top))
             for side, x in enumerate(params.platform_x)
-        ]
+        }
         middle = (*self.center, params.top)
         span = second - first - length
-        deck = Platform("deck", center=middle, size=(span, params.bridge_width, params.bridge_thickness))
+        objects["deck"] = Platform(center=middle, size=(span, params.bridge_width, params.bridge_thickness))
         track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
-        return Scene(track, num_robots=2, objects=(*blocks, deck), colors=(0, 2))
+        return Scene(track, num_robots=2, objects=objects, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """One robot on each platform, facing the bridge."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
-from annotated_types import Gt
 
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
@@ -16,7 +15,7 @@ from mqe_jax.objects import Door
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
-from mqe_jax.terrain import DoorGap, EndWall, Plane, SpawnArea, Track
+from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
     pass
@@ -43,16 +42,8 @@ class DoorParams(TaskParams):
     """Width of the track, m."""
     gap: Positive = 2.0
     """Width of the gap that holds the door, m."""
-    door_x: Annotated[float, Gt(_WALL_LENGTH / 2)] = 2.6
-    """X of the hinge, m."""
-    door_size: tuple[Positive, Positive, Positive] = (0.08, 1.95, 0.8)
-    """Thickness, width and height of the door, m."""
-    door_mass: Positive = 4.0
-    """Mass of the door, kg."""
-    door_inertia: Positive = 1.232
-    """Inertia about the hinge, kg m^2."""
-    door_damping: NonNegative = 0.5
-    """Damping of the hinge, N m s/rad."""
+    door: Door = Door()
+    """The door in the gap."""
     spawn_x: float = 0.5
     """X of the robots' spawn poses, m."""
     spawn_y: NonNegative = 1.0
@@ -65,8 +56,10 @@ class DoorParams(TaskParams):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_gap("gap", self.gap, self.track_width)
-        if self.door_size[1] >= self.gap:
-            fail("door_size", self.door_size, f"narrower than the gap, {self.gap}")
+        if self.door.size[1] >= self.gap:
+            fail("door.size", self.door.size, f"narrower than the gap, {self.gap}")
+        if self.door.position[0] <= _WALL_LENGTH / 2:
+            fail("door.position", self.door.position, f"at an x greater than {_WALL_LENGTH / 2}")
 
 
 class Go1RevolvingDoor(Duel):
@@ -87,20 +80,12 @@ class Go1RevolvingDoor(Duel):
 
     def scene(self) -> Scene:
         params = self.params
-        wall = DoorGap(_WALL_LENGTH, width=params.gap)
-        blocks = (SpawnArea(params.door_x - _WALL_LENGTH / 2), wall, Plane(2.5), EndWall())
-        door = Door(
-            "door",
-            position=(params.door_x, 0.0),
-            size=params.door_size,
-            mass=params.door_mass,
-            inertia=params.door_inertia,
-            damping=params.door_damping,
-        )
+        wall = Gate(_WALL_LENGTH, width=params.gap)
+        blocks = (SpawnArea(params.door.position[0] - _WALL_LENGTH / 2), wall, Plane(2.5), EndWall())
         return Scene(
             Track(blocks=blocks, width=params.track_width, wall_height=0.85),
             num_robots=2,
-            objects=(door,),
+            objects={"door": params.door},
             colors=(0, 2),
         )
 

@@ -44,12 +44,8 @@ class FootballParams(TaskParams):
     """Width of the goal mouths, m."""
     wall_height: Positive = 1.0
     """Height of all walls, m."""
-    ball_radius: Positive = 0.1
-    """Radius of the ball, m."""
-    ball_mass: Positive = 0.318
-    """Mass of the ball, kg."""
-    ball_damping: NonNegative = 0.1
-    """Linear damping of the ball, N s/m."""
+    ball: Ball = Ball()
+    """The ball."""
     ball_noise: NonNegative = 0.0
     """Half-width of the uniform noise on the ball's position at reset, m."""
 
@@ -77,9 +73,8 @@ class Football(QuadrupedEnv):
             width=params.field_width,
             wall_height=params.wall_height,
         )
-        ball = Ball("ball", radius=params.ball_radius, mass=params.ball_mass, damping=params.ball_damping)
         robots = len(self.kick_off)
-        return Scene(track, num_robots=robots, objects=(ball,), colors=self.colors)
+        return Scene(track, num_robots=robots, objects={"ball": params.ball}, colors=self.colors)
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """The kick-off poses."""
@@ -91,7 +86,7 @@ class Football(QuadrupedEnv):
         """Samples the ball's initial position about its spot."""
         params = self.params
         noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)
-        position = jnp.array([*self.ball_spot, params.ball_radius]).at[:2].add(noise)
+        position = jnp.array([*self.ball_spot, params.ball.radius]).at[:2].add(noise)
         return qpos.at[self.objects["ball"].qpos[:3]].set(position), qvel
 
     def ball(self, data: mjx.Data) -> jax.Array:

@@ -57,12 +57,8 @@ class PushBoxParams(TaskParams):
     """Half-widths of the range of the gap's centre in x and y, m."""
     past_gate: float = 0.0
     """Distance of the box's centre behind the gate's at which it counts as through, m."""
-    box_size: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
-    """Full extents of the box, m."""
-    box_mass: Positive = 6.0
-    """Mass of the box, kg."""
-    box_friction: NonNegative = 1.0
-    """Sliding friction between box and ground."""
+    box: Box = Box()
+    """The box."""
     box_x: float = 2.5
     """X of the box's centre at reset, m."""
     box_noise: NonNegative = 0.5
@@ -80,7 +76,7 @@ class PushBoxParams(TaskParams):
         super().__post_init__()
         check_gap("gate_width", self.gate_width, self.track_width)
         gate = _SPAWN_LENGTH + (_GATE_LENGTH - _GATE_DEPTH) / 2 - self.gate_random[0]
-        room = max(gate - (self.box_x + self.box_noise + self.box_size[0] / 2), 0.0)
+        room = max(gate - (self.box_x + self.box_noise + self.box.size[0] / 2), 0.0)
         if self.head_start > room:
             fail("head_start", self.head_start, f"at most {room:.2f}, the distance between box and gate")
 
@@ -113,8 +109,7 @@ class Go1PushBox(QuadrupedEnv):
         params = self.params
         gate = Gate(_GATE_LENGTH, width=params.gate_width, depth=_GATE_DEPTH, random=params.gate_random)
         track = Track(blocks=(SpawnArea(_SPAWN_LENGTH), gate, EndWall()), width=params.track_width)
-        box = Box("box", size=params.box_size, mass=params.box_mass, friction=params.box_friction)
-        return Scene(track, num_robots=2, objects=(box,))
+        return Scene(track, num_robots=2, objects={"box": params.box})
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
@@ -123,7 +118,7 @@ class Go1PushBox(QuadrupedEnv):
         params = self.params
         key, start_key = jax.random.split(key) if params.head_start else (key, key)
         noise = jax.random.uniform(key, (2,), minval=-params.box_noise, maxval=params.box_noise)
-        pose = jnp.array([params.box_x, 0.0, params.box_size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
+        pose = jnp.array([params.box_x, 0.0, params.box.size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
         qpos = qpos.at[self.objects["box"].qpos].set(pose)
         if params.head_start:
             start = params.head_start * assistance * jax.random.uniform(start_key)
@@ -137,7 +132,7 @@ class Go1PushBox(QuadrupedEnv):
     def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
         """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""
         box = self.object_pose(state.data, "box")[:2]
-        length, width, _ = self.params.box_size
+        length, width, _ = self.params.box.size
         places = box + jnp.array([[-0.5 * length - _BEHIND, -0.25 * width], [-0.5 * length - _BEHIND, 0.25 * width]])
         behind = jnp.sum(jnp.linalg.norm(robot_state.position_w[:2, :2] - places, axis=-1))
         return behind, jnp.abs(box[1] - state.anchors[0, 1])

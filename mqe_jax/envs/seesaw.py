@@ -15,7 +15,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, fail, record
+from mqe_jax.settings import Positive, fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -52,28 +52,12 @@ class SeesawParams(TaskParams):
     gait: str = "pace"
     track_width: Positive = 3.0
     """Track width, m."""
-    hinge: tuple[float, float, float] = (5.6, 0.0, 0.545)
-    """Position of the plank's hinge (x, y, z), m."""
-    plank_size: tuple[Positive, Positive, Positive] = (4.123, 1.0, 0.03)
-    """Length, width and thickness, m."""
-    plank_behind: float = 0.103
-    """Distance of the plank's centre from the hinge towards the near end, m."""
-    plank_mass: Positive = 100.0
-    """Plank mass, kg."""
-    plank_inertia: Positive = 100.0
-    """Plank inertia about the hinge, kg m^2."""
-    plank_limit: Positive = 0.254
-    """Maximum |angle|, rad."""
-    plank_damping: NonNegative = 1000.0
-    """Damping of the plank's hinge, N m s/rad."""
+    plank: Seesaw = Seesaw()
+    """The seesaw."""
     plank_start: float = -0.25
     """Angle at reset, rad; negative with the near end down."""
-    platform: tuple[float, float, float] = (8.0, 0.0, 1.0)
-    """Centre of the platform's top face (x, y, z), m."""
-    platform_size: tuple[Positive, Positive, Positive] = (1.0, 1.0, 0.03)
-    """Full extents, m."""
-    platform_column: NonNegative = 0.2
-    """Radius of the column under the platform, m."""
+    platform: Platform = Platform(center=(8.0, 0.0, 1.0), size=(1.0, 1.0, 0.03), column=0.2)
+    """The platform at the seesaw's far end."""
     on_platform: tuple[float, float] = (7.7, 1.2)
     """X and z beyond which a robot counts as on the platform, m."""
     height_base: float = 0.56
@@ -85,8 +69,8 @@ class SeesawParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if abs(self.plank_start) > self.plank_limit:
-            fail("plank_start", self.plank_start, f"within +-plank_limit, {self.plank_limit}")
+        if abs(self.plank_start) > self.plank.limit:
+            fail("plank_start", self.plank_start, f"within +-plank.limit, {self.plank.limit}")
 
 
 class Go1Seesaw(QuadrupedEnv):
@@ -108,21 +92,8 @@ class Go1Seesaw(QuadrupedEnv):
     def scene(self) -> Scene:
         params = self.params
         track = Track(blocks=(SpawnArea(2.0), Plane(8.0), EndWall()), width=params.track_width)
-        plank = Seesaw(
-            "seesaw",
-            hinge=params.hinge,
-            size=params.plank_size,
-            behind=params.plank_behind,
-            mass=params.plank_mass,
-            inertia=params.plank_inertia,
-            limit=params.plank_limit,
-            damping=params.plank_damping,
-        )
-        platform = Platform(
-            "platform", center=params.platform, size=params.platform_size, column=params.platform_column
-        )
         # Plank and platform use the ground's collision bits.
-        return Scene(track, num_robots=2, objects=(plank, platform))
+        return Scene(track, num_robots=2, objects={"seesaw": params.plank, "platform": params.platform})
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array

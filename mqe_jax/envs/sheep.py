@@ -122,7 +122,7 @@ class Go1SheepEasy(QuadrupedEnv):
         spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_spacing)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
         track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
-        flock = tuple(Sheep(f"sheep{number}") for number in range(self.num_sheep))
+        flock = {f"sheep{number}": Sheep() for number in range(self.num_sheep)}
         return Scene(track, num_robots=2, objects=flock)
 
     def reset_objects(

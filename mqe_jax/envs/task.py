@@ -12,10 +12,9 @@ import numpy as np
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.objects import ObjectIndex
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
-from mqe_jax.scene import CompiledScene, Scene
+from mqe_jax.scene import CompiledScene, ObjectIndex, Scene
 
 if TYPE_CHECKING:
     from mujoco import mjx

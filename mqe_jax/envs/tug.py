@@ -17,7 +17,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Cylinder
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, fail, record
+from mqe_jax.settings import NonNegative, Positive, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -44,16 +44,8 @@ class TugParams(TaskParams):
     episode_length: Positive = 15.0
     spawn_height: Positive = 0.34
     spawn_noise: NonNegative = 0.0
-    arena: tuple[Positive, Positive] = (3.0, 6.0)
-    """Extents of the arena along x and y, m; its near wall is at x 0.1."""
-    radius: Positive = 1.2
-    """Radius of the cylinder, m."""
-    height: Positive = 0.5
-    """Height of the cylinder, m."""
-    mass: Positive = 3.0
-    """Mass of the cylinder, kg."""
-    cylinder_friction: NonNegative = 1.0
-    """Sliding friction between cylinder and ground."""
+    cylinder: Cylinder = Cylinder()
+    """The cylinder. The arena is centred on it; its side walls are where the cylinder's reach ends."""
     spawn_x: NonNegative = 1.0
     """Half-width of the range of the robots' initial x about the arena's centre, m."""
     spawn_y: NonNegative = 2.5
@@ -62,11 +54,6 @@ class TugParams(TaskParams):
     """Minimum distance of the cylinder on the opponent's half at the end of the episode for a win, m."""
     rewards: TugRewards = TugRewards()
     """Weights of the reward terms."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if 2 * self.radius >= self.arena[1]:
-            fail("radius", self.radius, f"less than half of the arena's extent along y, {self.arena[1]}")
 
 
 @jax.tree_util.register_dataclass
@@ -97,23 +84,13 @@ class Go1Tug(Duel):
     @property
     def center(self) -> tuple[float, float]:
         """The centre of the arena, m."""
-        return _START_X + self.params.arena[0] / 2, 0.0
+        return self.params.cylinder.x, 0.0
 
     def scene(self) -> Scene:
-        params = self.params
-        length, width = params.arena
+        cylinder = self.params.cylinder
+        length, width = 2 * (cylinder.x - _START_X), 2 * (cylinder.reach + cylinder.radius)
         track = Track(blocks=(Plane(_START_X), SpawnArea(length), EndWall()), width=width)
-        reach = width / 2 - params.radius
-        cylinder = Cylinder(
-            "cylinder",
-            position=self.center,
-            radius=params.radius,
-            height=params.height,
-            mass=params.mass,
-            friction=params.cylinder_friction,
-            reach=reach,
-        )
-        return Scene(track, num_robots=2, objects=(cylinder,), colors=(0, 2))
+        return Scene(track, num_robots=2, objects={"cylinder": cylinder}, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """One robot on each side, facing the centre."""

@@ -37,12 +37,10 @@ class WrestlingParams(TaskParams):
     episode_length: Positive = 15.0
     spawn_height: Positive = 0.74
     max_roll: Positive = 0.4 * np.pi
-    center: tuple[float, float] = (3.1, 0.0)
-    """Centre of platform and ring (x, y), m."""
-    platform: tuple[Positive, Positive, Positive] = (4.37, 4.37, 0.5)
-    """Extents of the platform, m; its lower part is below the ground."""
-    platform_top: Positive = 0.4
-    """Height of the platform's top face, m; robots dropped from the spawn height land on their feet."""
+    platform: Platform = Platform(center=(3.1, 0.0, 0.4), size=(4.37, 4.37, 0.5))
+    """The platform, with the ring in its centre; its lower part is below the ground. Robots dropped from the spawn
+    height land on their feet.
+    """
     ring_radius: Positive = 1.7
     """Radius of the ring, m."""
     ring_depth: NonNegative = 0.2
@@ -54,7 +52,7 @@ class WrestlingParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.platform_top, self.robot)
+        check_above(self.spawn_height, self.platform.center[2], self.robot)
 
 
 class Go1Wrestling(Duel):
@@ -75,16 +73,13 @@ class Go1Wrestling(Duel):
     @property
     def center(self) -> tuple[float, float]:
         """The centre of the ring, m."""
-        return self.params.center
+        return self.params.platform.center[:2]
 
     def scene(self) -> Scene:
         params = self.params
-        x, y = self.center
-        top = params.platform_top
-        platform = Platform("platform", center=(x, y, top), size=params.platform)
-        ring = Ring("ring", center=(x, y, top), radius=params.ring_radius)
+        ring = Ring(center=params.platform.center, radius=params.ring_radius)
         track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
-        return Scene(track, num_robots=2, objects=(platform, ring), colors=(0, 2))
+        return Scene(track, num_robots=2, objects={"platform": params.platform, "ring": ring}, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Facing each other across the ring."""
@@ -98,7 +93,7 @@ class Go1Wrestling(Duel):
         """Returns which robots have fallen or left the ring (2,) bool."""
         params = self.params
         apart = jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
-        below = robot_state.position_w[:, 2] < params.platform_top - params.ring_depth
+        below = robot_state.position_w[:, 2] < params.platform.center[2] - params.ring_depth
         return self.fallen(robot_state) | (apart > params.ring_radius) | below
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
