@@ -6,7 +6,6 @@ docs/new_task.md explains the steps; `python examples/new_task.py` evaluates the
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +101,7 @@ class CatchParams(TaskParams):
     """Weights of the reward terms."""
 
 
-class Go1Catch(QuadrupedEnv):
+class Go1Catch(QuadrupedEnv[None, CatchParams]):
     """Catch a mouse.
 
     - Scene: a walled track 3 m wide with a pillar, and a mouse behind it.
@@ -113,7 +112,7 @@ class Go1Catch(QuadrupedEnv):
 
     name = "go1catch"
     title = "Catch a Mouse"
-    Params: ClassVar[type[TaskParams]] = CatchParams
+    Params = CatchParams
 
     def scene(self) -> Scene:
         track = Track(blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1)
@@ -143,8 +142,11 @@ class Go1Catch(QuadrupedEnv):
         return {"base": robot_state.base_info, "mouse": self.object_pose(state.data, "mouse")[None]}
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        distance = self.distance(*after)
-        return {"approach": self.distance(*before) - distance, "caught": distance < self.params.reach}
+        distance = self.distance(after.state, after.robots)
+        return {
+            "approach": self.distance(before.state, before.robots) - distance,
+            "caught": distance < self.params.reach,
+        }
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends when the mouse is caught."""

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
+from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy, team_size
 from mqe_jax.settings import fail
@@ -35,37 +36,18 @@ class Opponent:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class TeamState:
-    """State of M environments of one team of T agents, in N matches of A agents; see `EnvState`."""
+class TeamState(EnvironmentState):
+    """State of M environments of one team of T agents, in N matches of A agents; metrics are those of team 0.
+
+    The first N of `step` and `assistance` are those of the matches; `key` is that of the opponents' actions.
+    """
 
     match: State
     """State of the matches, leading axis N."""
     action: jax.Array
     """Actions of all agents in the last step (N, A, D)."""
-    obs: jax.Array
-    """Observations (M, T, O)."""
-    privileged_obs: jax.Array
-    """Privileged observations (M, P)."""
-    final_obs: jax.Array
-    """Observations at the end of the last step (M, T, O)."""
-    final_privileged_obs: jax.Array
-    """Privileged observations at the end of the last step (M, P)."""
-    reward: jax.Array
-    """Rewards (M, T)."""
-    terminated: jax.Array
-    """Whether the episode terminated (M,) bool."""
-    truncated: jax.Array
-    """Whether the episode was truncated (M,) bool."""
-    metrics: dict[str, jax.Array]
-    """Metrics of the match, of team 0 (M,) each."""
-    step: jax.Array
-    """Environment steps since the reset (M,) int32; the first N are those of the matches."""
-    assistance: jax.Array
-    """Curriculum level (M,); the first N are those of the matches."""
     opponents: tuple[Opponent, ...]
     """The opponent of each block of environments."""
-    key: jax.Array
-    """Random key of the opponents' actions."""
 
 
 class OneTeam:

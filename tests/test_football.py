@@ -14,7 +14,7 @@ import pytest
 from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.npc import defend
 from mqe_jax.planners import scripted_policy
-from tests.states import initial, made, observation, placed, stepper, still, terms_of, with_object
+from tests.states import initial, made, moment, observation, placed, stepper, still, terms_of, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -223,7 +223,7 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
     env = envs["go1football-2vs2"]
     state = fresh[env.name]
     before = with_ball(env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0))
-    goals, robots = env.distances(before, env.read(before.data))
+    goals, robots = env.distances(moment(env, before))
     np.testing.assert_allclose(goals, [5, 5], atol=1e-5)
     np.testing.assert_allclose(robots, [2, 3], atol=1e-5)
     # The ball at (8, 0): 4 m from team 0's goal (+1), 6 m from team 1's (-1): 1 - (-1) = 2.

@@ -136,7 +136,7 @@ def test_tug_result_and_end() -> None:
 
 
 def test_the_arena_moves_the_middle_and_spawn_noise_counts() -> None:
-    env: Any = make("go1tug", impl="c", control="position", arena=(4.0, 6.0), spawn_noise=0.05)
+    env: Any = make("go1tug", impl="c", control="position", cylinder={"x": 2.1}, spawn_noise=0.05)
     assert env.center == (2.1, 0.0)
     spawn = np.asarray(jax.jit(jax.vmap(env.spawn))(jax.random.split(jax.random.PRNGKey(0), 64)))
     assert np.abs(spawn[..., 0] - 2.1).max() <= 1.05 and 0.04 < np.abs(np.abs(spawn[..., 1]) - 2.5).max() <= 0.05

@@ -22,11 +22,11 @@ from mqe_jax import engines, robots, skills
 from mqe_jax.actuators import Actuators, NetworkActuators, load_actuator_network
 from mqe_jax.control import Controller, check_mode
 from mqe_jax.envs.observation import ObservationLayout
-from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import weigh
-from mqe_jax.envs.state import Moment, State
+from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.robots.index import RobotState
@@ -45,18 +45,19 @@ def check_num_envs(num_envs: int) -> None:
         raise InputError(f"num_envs: {num_envs} must be at least 1")
 
 
-class QuadrupedEnv(Task):
+class QuadrupedEnv(Task[S, P]):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
     def __init__(
         self,
-        params: TaskParams | None = None,
+        params: P | None = None,
         *,
         impl: str = "auto",
         control: str = "command",
         num_envs: int = 4096,
     ) -> None:
         self.params = self.Params() if params is None else params
+        self.weights = vars(self.params)["rewards"]
         expected = self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
@@ -168,13 +169,13 @@ class QuadrupedEnv(Task):
         """Environment steps until the time limit."""
         return round(self.params.episode_length / self.dt)
 
-    def with_num_envs(self, num_envs: int) -> QuadrupedEnv:
+    def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
         """Returns an environment whose engine holds `num_envs` environments: itself, or one with larger buffers."""
         if self.physics.holds(num_envs):
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
-    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State:
+    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns a randomised initial state; runs no forward pass of the physics.
 
         Args:
@@ -213,12 +214,12 @@ class QuadrupedEnv(Task):
             key=next_key,
         )
         now = Moment(state, robot_state)
-        _, logged = weigh(self.rewards(now, now, no), self.params.rewards, self.num_agents)
+        _, logged = weigh(self.rewards(now, now, no), self.weights, self.num_agents)
         names = (*logged, *self.outcome(state, robot_state, no), "collision", "diverged", "overflow")
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: State[S], action: jax.Array) -> State[S]:
         """Advances one environment by one environment step.
 
         Args:
@@ -240,7 +241,7 @@ class QuadrupedEnv(Task):
             state.control,
             action,
             before.robots.proprioception,
-            self.npc_commands(*before),
+            self.npc_commands(before.state, before.robots),
             state.randomized.action_lag,
         )
         data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
@@ -254,7 +255,7 @@ class QuadrupedEnv(Task):
         collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
         state = dataclasses.replace(state, task=self.step_task(before, Moment(state, robot_state)))
         terms = self.rewards(before, Moment(state, robot_state), collision)
-        reward, logged = weigh(terms, self.params.rewards, self.num_agents)
+        reward, logged = weigh(terms, self.weights, self.num_agents)
         failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
         terminated = failed | self.ending(state, robot_state)
         metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}
@@ -332,7 +333,7 @@ class QuadrupedEnv(Task):
         position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
 
-    def _observed(self, state: State, robot_state: RobotState, key: jax.Array) -> State:
+    def _observed(self, state: State[S], robot_state: RobotState, key: jax.Array) -> State[S]:
         layout = self.observation_layout
         obs = layout.pack(self.observe(state, robot_state))
         noise = self.params.randomization.observation_noise

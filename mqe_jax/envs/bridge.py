@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +63,7 @@ class BridgeParams(TaskParams):
             fail("platform_x", self.platform_x, f"more than a platform's length, {self.platform[0]}, apart")
 
 
-class Go1Bridge(Duel):
+class Go1Bridge(Duel[None, BridgeParams]):
     """Traverse Bridge.
 
     - Scene: two platforms, 1 m high, joined by a bridge 0.7 m wide; one robot is spawned on each.
@@ -78,7 +77,7 @@ class Go1Bridge(Duel):
 
     name = "go1bridge"
     title = "Traverse Bridge"
-    Params: ClassVar[type[TaskParams]] = BridgeParams
+    Params = BridgeParams
 
     @property
     def center(self) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ class DoorParams(TaskParams):
             fail("door.position", self.door.position, f"at an x greater than {_WALL_LENGTH / 2}")
 
 
-class Go1RevolvingDoor(Duel):
+class Go1RevolvingDoor(Duel[None, DoorParams]):
     """Revolving Door.
 
     - Scene: a wall with a gap of 2 m that holds a door on a central hinge; both robots start on the same side.
@@ -76,7 +76,7 @@ class Go1RevolvingDoor(Duel):
     name = "go1revolvingdoor"
     title = "Revolving Door"
     symmetry = "reflect"
-    Params: ClassVar[type[TaskParams]] = DoorParams
+    Params = DoorParams
 
     def scene(self) -> Scene:
         params = self.params
@@ -100,7 +100,7 @@ class Go1RevolvingDoor(Duel):
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         return {
-            "win": self.zero_sum(self.wins(*after)),
+            "win": self.zero_sum(self.wins(after.state, after.robots)),
             "approach": self.zero_sum(self.distance(before.robots) - self.distance(after.robots)),
         }
 

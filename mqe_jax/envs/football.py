@@ -6,7 +6,7 @@ The field extends from x 2 to 12; the goals are gaps in the thick walls behind b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
-from mqe_jax.envs.state import Moment, State
+from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.objects import Ball
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
@@ -54,7 +54,10 @@ class FootballParams(TaskParams):
         check_gap("goal_width", self.goal_width, self.field_width)
 
 
-class Football(QuadrupedEnv):
+F = TypeVar("F", bound=FootballParams)
+
+
+class Football(QuadrupedEnv[S, F]):
     """Base of the football tasks: the field, the ball and the kick-off."""
 
     kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()
@@ -141,7 +144,7 @@ class Football2vs2Params(FootballParams):
     """Weights of the reward terms."""
 
 
-class FootballMatch(Football, Match):
+class FootballMatch(Football[None, F], Match[None, F]):
     """Base of the football matches.
 
     - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at x 2.
@@ -158,10 +161,10 @@ class FootballMatch(Football, Match):
         """The centre of the field, m."""
         return float(GOALS[:, 0].mean()), 0.0
 
-    def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
+    def distances(self, now: Moment) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal that each team attacks and to each team's nearest robot (2,), m."""
-        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - self.ball(state.data)[:2], axis=-1)
-        return self.goal_distance(state.data), jnp.min(apart.reshape(2, -1), axis=1)
+        apart = jnp.linalg.norm(now.robots.position_w[:, :2] - self.ball(now.state.data)[:2], axis=-1)
+        return self.goal_distance(now.state.data), jnp.min(apart.reshape(2, -1), axis=1)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -194,7 +197,7 @@ class FootballMatch(Football, Match):
         return blocks
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        (goal_before, robot_before), (goal, robot) = self.distances(*before), self.distances(*after)
+        (goal_before, robot_before), (goal, robot) = self.distances(before), self.distances(after)
         return {
             "goal": self.zero_sum(self.in_goal(after.state.data)),
             "progress": self.zero_sum(goal_before - goal),
@@ -211,22 +214,22 @@ class FootballMatch(Football, Match):
         return self.in_goal(state.data)
 
 
-class Go1Football1vs1(FootballMatch):
+class Go1Football1vs1(FootballMatch[Football1vs1Params]):
     """Football (1 vs 1), see `FootballMatch`."""
 
     name = "go1football-1vs1"
     title = "Football (1 vs 1)"
-    Params: ClassVar[type[TaskParams]] = Football1vs1Params
+    Params = Football1vs1Params
     kick_off = ((4.0, 0.0, 0.0), (10.0, 0.0, np.pi))
     colors = (0, 2)
 
 
-class Go1Football2vs2(FootballMatch):
+class Go1Football2vs2(FootballMatch[Football2vs2Params]):
     """Football (2 vs 2), see `FootballMatch`."""
 
     name = "go1football-2vs2"
     title = "Football (2 vs 2)"
-    Params: ClassVar[type[TaskParams]] = Football2vs2Params
+    Params = Football2vs2Params
     # The second team's poses are the first's after a half turn about the centre.
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 2.0, np.pi), (10.0, -2.0, np.pi))
     colors = (0, 1, 2, 3)

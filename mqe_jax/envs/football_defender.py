@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,6 @@ import numpy as np
 
 from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
-from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
@@ -58,7 +57,7 @@ class DefenderState:
     """Whether the ball has been in the goal in this episode () bool."""
 
 
-class Go1FootballDefender(Football):
+class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     """Football (2 vs 1).
 
     - Scene: the field, a ball, and a third robot that defends the goal at x 12 (see `mqe_jax.npc.defend`).
@@ -71,12 +70,12 @@ class Go1FootballDefender(Football):
 
     name = "go1football-defender"
     title = "Football (2 vs 1)"
-    Params: ClassVar[type[TaskParams]] = DefenderParams
+    Params = DefenderParams
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi))
     ball_spot = (5.0, -2.1)
     colors = (0, 1, 2)
 
-    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array:
+    def npc_commands(self, state: State[DefenderState], robot_state: RobotState) -> jax.Array:
         """Walk commands of the defender (1, C)."""
         commands = jnp.asarray(self.controller.default_commands)
         if not self.params.defender_idle:
@@ -89,7 +88,7 @@ class Go1FootballDefender(Football):
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
         return DefenderState(jnp.zeros((), bool))
 
-    def step_task(self, before: Moment, after: Moment) -> DefenderState:
+    def step_task(self, before: Moment[DefenderState], after: Moment[DefenderState]) -> DefenderState:
         return DefenderState(before.state.task.scored | self.in_goal(after.state.data)[0])
 
     def reset_objects(
@@ -105,24 +104,26 @@ class Go1FootballDefender(Football):
         way = start * (jnp.asarray(GOALS[0]) - qpos[ball])
         return qpos.at[ball].add(way).at[self.index.base_qpos[:2, 0]].add(way[0]), qvel
 
-    def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
+    def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal's midpoint and to the nearest of the two robots (), m."""
-        apart = jnp.linalg.norm(robot_state.position_w[:2, :2] - self.ball(state.data)[:2], axis=-1)
-        return self.goal_distance(state.data)[0], jnp.min(apart)
+        apart = jnp.linalg.norm(now.robots.position_w[:2, :2] - self.ball(now.state.data)[:2], axis=-1)
+        return self.goal_distance(now.state.data)[0], jnp.min(apart)
 
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((*PAIR, *BALL_BLOCKS))
 
-    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe(self, state: State[DefenderState], robot_state: RobotState) -> dict[str, jax.Array]:
         return {
             **pair(robot_state.base_info[:2]),
             "ball": for_all(self.ball(state.data), 2),
             "ball_velocity": for_all(self.ball_velocity(state.data), 2),
         }
 
-    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        (goal_before, robot_before), (goal, robot) = self.distances(*before), self.distances(*after)
+    def rewards(
+        self, before: Moment[DefenderState], after: Moment[DefenderState], collision: jax.Array
+    ) -> dict[str, jax.Array]:
+        (goal_before, robot_before), (goal, robot) = self.distances(before), self.distances(after)
         return {
             "goal": self.in_goal(after.state.data)[0],
             "nearness": jnp.exp(-goal / 3.0),
@@ -130,6 +131,6 @@ class Go1FootballDefender(Football):
             "approach": robot_before - robot,
         }
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a goal at any time in this episode."""
         return {"success": state.task.scored}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ class GateParams(TaskParams):
         check_gap("gate_width", self.gate_width, self.track_width)
 
 
-class Go1Gate(QuadrupedEnv):
+class Go1Gate(QuadrupedEnv[None, GateParams]):
     """Narrow Gate.
 
     - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is sampled at reset.
@@ -80,7 +80,7 @@ class Go1Gate(QuadrupedEnv):
 
     name = "go1gate"
     title = "Narrow Gate"
-    Params: ClassVar[type[TaskParams]] = GateParams
+    Params = GateParams
 
     def scene(self) -> Scene:
         params = self.params

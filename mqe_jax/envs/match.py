@@ -17,12 +17,13 @@ import numpy as np
 
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.envs.state import State
+from mqe_jax.envs.params import P
+from mqe_jax.envs.state import S, State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 
 
-class Match(QuadrupedEnv):
+class Match(QuadrupedEnv[S, P]):
     """Base of the competitive tasks.
 
     Reward: zero-sum; each term is the team's own minus the opponents'.
@@ -57,11 +58,11 @@ class Match(QuadrupedEnv):
         """Returns which team is eliminated (2,) bool: by default one with a fallen robot."""
         return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
 
-    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team leads if neither is eliminated (2,) bool."""
         return jnp.zeros(2, bool)
 
-    def wins(self, state: State, robot_state: RobotState) -> jax.Array:
+    def wins(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team wins if the episode ends in this step (2,) bool, at most one."""
         out, leading = self.eliminated(robot_state), self.leading(state, robot_state)
         return jnp.where(jnp.any(out), out[::-1] & ~out, leading & ~leading[::-1])
@@ -104,7 +105,7 @@ class Match(QuadrupedEnv):
         own = jnp.asarray(own, jnp.float32)
         return (own - own[::-1])[self.team_of]
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Win, draw and loss of each team; success: team 0 wins."""
         wins = self.wins(state, robot_state)
         result = {}
@@ -115,14 +116,14 @@ class Match(QuadrupedEnv):
         return {"success": wins[0], **result}
 
 
-class Duel(Match):
+class Duel(Match[S, P]):
     """Base of the one-on-one matches: each observes both robots in its own frame."""
 
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
 
-    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (2, width), each in its agent's own frame."""
         views = self.views(robot_state.base_info)
         return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeVar
 
 import mqe_jax.walk_policy  # noqa: F401  (registers itself)
 from mqe_jax import robots, skills
@@ -88,6 +88,10 @@ class TaskParams:
         skills.make(self.skill, robots.get(self.robot)).check_commands(self.commands)
         if self.min_height >= self.max_height:
             fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
+
+
+P = TypeVar("P", bound=TaskParams)
+"""Parameters of a task."""
 
 
 def check_above(spawn_height: float, top: float, robot: str) -> None:

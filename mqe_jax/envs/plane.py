@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ class PlaneParams(TaskParams):
     """Weights of the reward terms."""
 
 
-class Go1Plane(QuadrupedEnv):
+class Go1Plane(QuadrupedEnv[None, PlaneParams]):
     """Robots on flat ground.
 
     - Action: see `mqe_jax.control`.
@@ -49,7 +49,7 @@ class Go1Plane(QuadrupedEnv):
 
     name = "go1plane"
     title = "Plane"
-    Params: ClassVar[type[TaskParams]] = PlaneParams
+    Params = PlaneParams
     variable_num_agents = True
 
     def scene(self) -> Scene:

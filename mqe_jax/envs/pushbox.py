@@ -6,7 +6,7 @@ The box is too heavy for one robot to push effectively.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -90,7 +90,7 @@ class PushBoxState:
     """X of the box at the reset (), m."""
 
 
-class Go1PushBox(QuadrupedEnv):
+class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     """Push Box.
 
     - Scene: a track 5 m wide with a box of 1 m and 6 kg in front of a gate of 1.5 m.
@@ -103,7 +103,7 @@ class Go1PushBox(QuadrupedEnv):
 
     name = "go1pushbox"
     title = "Push Box"
-    Params: ClassVar[type[TaskParams]] = PushBoxParams
+    Params = PushBoxParams
 
     def scene(self) -> Scene:
         params = self.params
@@ -129,19 +129,19 @@ class Go1PushBox(QuadrupedEnv):
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PushBoxState:
         return PushBoxState(self.object_pose(data, "box")[0])
 
-    def distances(self, state: State, robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
+    def distances(self, now: Moment[PushBoxState]) -> tuple[jax.Array, jax.Array]:
         """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""
-        box = self.object_pose(state.data, "box")[:2]
+        box = self.object_pose(now.state.data, "box")[:2]
         length, width, _ = self.params.box.size
         places = box + jnp.array([[-0.5 * length - _BEHIND, -0.25 * width], [-0.5 * length - _BEHIND, 0.25 * width]])
-        behind = jnp.sum(jnp.linalg.norm(robot_state.position_w[:2, :2] - places, axis=-1))
-        return behind, jnp.abs(box[1] - state.anchors[0, 1])
+        behind = jnp.sum(jnp.linalg.norm(now.robots.position_w[:2, :2] - places, axis=-1))
+        return behind, jnp.abs(box[1] - now.state.anchors[0, 1])
 
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((*PAIR, GATE, Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")))
 
-    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe(self, state: State[PushBoxState], robot_state: RobotState) -> dict[str, jax.Array]:
         pose = self.object_pose(state.data, "box")
         return {
             **pair(robot_state.base_info),
@@ -150,8 +150,10 @@ class Go1PushBox(QuadrupedEnv):
             "box_quaternion": for_all(pose[3:], 2),
         }
 
-    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        (behind_before, offset_before), (behind, offset) = self.distances(*before), self.distances(*after)
+    def rewards(
+        self, before: Moment[PushBoxState], after: Moment[PushBoxState], collision: jax.Array
+    ) -> dict[str, jax.Array]:
+        (behind_before, offset_before), (behind, offset) = self.distances(before), self.distances(after)
         return {
             "progress": self.box_x(after.state) - self.box_x(before.state),
             "success": self.through(after.state).astype(jnp.float32),
@@ -159,14 +161,14 @@ class Go1PushBox(QuadrupedEnv):
             "aim": offset_before - offset,
         }
 
-    def box_x(self, state: State) -> jax.Array:
+    def box_x(self, state: State[PushBoxState]) -> jax.Array:
         """Returns the x of the box's centre (), m."""
         return self.object_pose(state.data, "box")[0]
 
-    def through(self, state: State) -> jax.Array:
+    def through(self, state: State[PushBoxState]) -> jax.Array:
         """Returns whether the box is past the gate () bool."""
         return self.box_x(state) > state.anchors[0, 0] + self.params.past_gate
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State[PushBoxState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the box is past the gate; `success/distance`: its displacement along x, m."""
         return {"success": self.through(state), "success/distance": self.box_x(state) - state.task.start}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +73,7 @@ class SeesawParams(TaskParams):
             fail("plank_start", self.plank_start, f"within +-plank.limit, {self.plank.limit}")
 
 
-class Go1Seesaw(QuadrupedEnv):
+class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
     """Climb on Seesaw.
 
     - Scene: a track 3 m wide with a balanced plank whose near end is on the ground and whose far end reaches a
@@ -87,7 +87,7 @@ class Go1Seesaw(QuadrupedEnv):
 
     name = "go1seesaw"
     title = "Climb on Seesaw"
-    Params: ClassVar[type[TaskParams]] = SeesawParams
+    Params = SeesawParams
 
     def scene(self) -> Scene:
         params = self.params

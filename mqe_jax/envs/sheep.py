@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +95,7 @@ class SheepHardParams(SheepEasyParams):
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
 
 
-class Go1SheepEasy(QuadrupedEnv):
+class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     """Sheep Dog: sheep flee from nearby robots and must be herded through a gate.
 
     - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front of it.
@@ -108,7 +108,7 @@ class Go1SheepEasy(QuadrupedEnv):
 
     name = "go1sheep-easy"
     title = "Sheep Dog (Easy)"
-    Params: ClassVar[type[TaskParams]] = SheepEasyParams
+    Params = SheepEasyParams
 
     @property
     def num_sheep(self) -> int:
@@ -189,4 +189,4 @@ class Go1SheepHard(Go1SheepEasy):
 
     name = "go1sheep-hard"
     title = "Sheep Dog (Hard)"
-    Params: ClassVar[type[TaskParams]] = SheepHardParams
+    Params = SheepHardParams

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import jax
 
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class State:
-    """State of one environment with A agents, R robots and G anchors; a batch has leading axes."""
+S = TypeVar("S")
+"""A task's own state."""
 
-    data: mjx.Data
-    """Physics state."""
+
+@dataclasses.dataclass(frozen=True)
+class EnvironmentState:
+    """Fields of every environment's state (`mqe_jax.train.types.EnvState`); a batch has leading axes."""
+
     obs: jax.Array
     """The agents' observations (A, O); after an auto-reset, those of the new episode."""
     privileged_obs: jax.Array
@@ -37,11 +38,26 @@ class State:
     truncated: jax.Array
     """Whether the episode was truncated at the time limit () bool."""
     metrics: dict[str, jax.Array]
-    """`reward/<name>`, `average_step_reward`, `success`, `collision`, `diverged`, `overflow` (1 where the physics
-    engine may have dropped contacts or constraints in any physics step of this step) and the task's own, () each.
-    """
+    """`reward/<name>` and the task's own, () each."""
     step: jax.Array
-    """Environment steps since the reset () int32."""
+    """Environment steps counted towards the time limit () int32; a trainer may set it to a random offset."""
+    assistance: jax.Array
+    """Curriculum level () in [0, 1]; 0 is the unmodified task."""
+    key: jax.Array
+    """Random key."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State(EnvironmentState, Generic[S]):
+    """State of one environment with A agents, R robots and G anchors.
+
+    Its metrics include `average_step_reward`, `success`, `collision`, `diverged` and `overflow` (1 where the physics
+    engine may have dropped contacts or constraints in any physics step of this step).
+    """
+
+    data: mjx.Data
+    """Physics state."""
     anchors: jax.Array
     """Positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame."""
     control: ControlState
@@ -50,18 +66,14 @@ class State:
     """Recurrent state of the actuators."""
     randomized: RandomizedParams
     """Randomised physics parameters."""
-    task: Any
+    task: S
     """The task's own fields."""
-    assistance: jax.Array
-    """Curriculum level () in [0, 1]; 0 is the unmodified task."""
     frozen_steps: jax.Array
     """Initial steps during which each agent's action is replaced by zero (A,) int32."""
-    key: jax.Array
-    """Random key."""
 
 
-class Moment(NamedTuple):
+class Moment(NamedTuple, Generic[S]):
     """A state and the robots' states read from its physics state."""
 
-    state: State
+    state: State[S]
     robots: RobotState

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs.observation import ObservationLayout
-from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.state import Moment, State
+from mqe_jax.envs.params import P, TaskParams
+from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
 from mqe_jax.scene import CompiledScene, ObjectIndex, Scene
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 
-class Task:
+class Task(Generic[S, P]):
     """Interface of a task and its defaults; `QuadrupedEnv` steps it.
 
     A task must override `scene`, `observation_layout`, `observe` and `rewards`, and may override the others. All
@@ -31,14 +31,14 @@ class Task:
     """Id of the task."""
     title: ClassVar[str] = ""
     """Display title: the paper's name if the task is in the paper."""
-    Params: ClassVar[type[TaskParams]] = TaskParams
-    """Class of the task's parameters."""
+    Params: ClassVar[type[Any]] = TaskParams
+    """Class of the task's parameters, P."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
     """Non-zero values of metrics in a step in which the physics diverged."""
     variable_num_agents: ClassVar[bool] = False
     """Whether `num_agents` may differ from the task's default."""
 
-    params: Any
+    params: P
     """The task's parameters."""
     impl: str
     """Physics engine: 'jax', 'warp' or 'c'."""
@@ -78,11 +78,12 @@ class Task:
         """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,), at a curriculum level ()."""
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> Any:
-        """Returns the task's own state fields at the start of an episode."""
-        return None
+    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> S:
+        """Returns the task's own state fields at the start of an episode; by default None."""
+        none: Any = None
+        return none
 
-    def npc_commands(self, state: State, robot_state: RobotState) -> jax.Array | None:
+    def npc_commands(self, state: State[S], robot_state: RobotState) -> jax.Array | None:
         """Returns the skill's commands (R - A, C) for the NPC robots, or None if there are none."""
         return None
 
@@ -99,15 +100,15 @@ class Task:
         """The blocks of an agent's observation, in order."""
         raise NotImplementedError(f"{type(self).__name__}: observation_layout is not defined")
 
-    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
 
-    def step_task(self, before: Moment, after: Moment) -> Any:
+    def step_task(self, before: Moment[S], after: Moment[S]) -> S:
         """Returns the task's own state fields after a step; `after` still has those before it."""
         return before.state.task
 
-    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+    def rewards(self, before: Moment[S], after: Moment[S], collision: jax.Array) -> dict[str, jax.Array]:
         """Returns the unweighted reward terms of a step, () or (A,).
 
         Args:
@@ -117,11 +118,11 @@ class Task:
         """
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
 
-    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
+    def ending(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns whether the task's own rules end the episode () bool."""
         return jnp.zeros((), bool)
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Returns `success` () and further `success/...` metrics, which are evaluated at the end of an episode.
 
         Args:
@@ -131,6 +132,6 @@ class Task:
         """
         return {"success": jnp.zeros(())}
 
-    def external_forces(self, state: State) -> jax.Array | None:
+    def external_forces(self, state: State[S]) -> jax.Array | None:
         """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""
         return None

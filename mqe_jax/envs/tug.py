@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Cylinder
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, record
+from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -55,6 +55,11 @@ class TugParams(TaskParams):
     rewards: TugRewards = TugRewards()
     """Weights of the reward terms."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.cylinder.x <= _START_X:
+            fail("cylinder.x", self.cylinder.x, f"greater than that of the near wall, {_START_X}")
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +70,7 @@ class TugState:
     """Y of the cylinder one step earlier (), m."""
 
 
-class Go1Tug(Duel):
+class Go1Tug(Duel[TugState, TugParams]):
     """Push Cylinder.
 
     - Scene: a closed arena with a cylinder of 3 kg that slides along y; a robot on each side of it.
@@ -79,7 +84,7 @@ class Go1Tug(Duel):
 
     name = "go1tug"
     title = "Push Cylinder"
-    Params: ClassVar[type[TaskParams]] = TugParams
+    Params = TugParams
 
     @property
     def center(self) -> tuple[float, float]:
@@ -106,17 +111,17 @@ class Go1Tug(Duel):
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> TugState:
         return TugState(self.cylinder_y(data))
 
-    def step_task(self, before: Moment, after: Moment) -> TugState:
+    def step_task(self, before: Moment[TugState], after: Moment[TugState]) -> TugState:
         return TugState(self.cylinder_y(before.state.data))
 
     def cylinder_y(self, data: mjx.Data) -> jax.Array:
         """Returns the cylinder's y (), m."""
         return self.object_pose(data, "cylinder")[0]
 
-    def distance(self, state: State, robot_state: RobotState) -> jax.Array:
+    def distance(self, now: Moment[TugState]) -> jax.Array:
         """Returns each robot's horizontal distance to the cylinder's axis (2,), m."""
-        axis = jnp.array([self.center[0], 0.0]).at[1].set(self.cylinder_y(state.data))
-        return jnp.linalg.norm(robot_state.position_w[:, :2] - axis, axis=-1)
+        axis = jnp.array([self.center[0], 0.0]).at[1].set(self.cylinder_y(now.state.data))
+        return jnp.linalg.norm(now.robots.position_w[:, :2] - axis, axis=-1)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -129,25 +134,25 @@ class Go1Tug(Duel):
             )
         )
 
-    def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe(self, state: State[TugState], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (2, width), each in its agent's own frame."""
         speed = state.data.qvel[self.objects["cylinder"].qvel[0]]
         side = jnp.array([1.0, -1.0])
         return {
             "base": super().observe(state, robot_state)["base"],
             "cylinder": jnp.stack([side * self.cylinder_y(state.data), side * speed], axis=-1),
-            "distance": self.distance(state, robot_state)[:, None],
+            "distance": self.distance(Moment(state, robot_state))[:, None],
             "previous_cylinder": (side * state.task.previous_y)[:, None],
         }
 
-    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+    def rewards(self, before: Moment[TugState], after: Moment[TugState], collision: jax.Array) -> dict[str, jax.Array]:
         y, side = self.cylinder_y(after.state.data), jnp.array([1.0, -1.0])
         back = side * (y - self.cylinder_y(before.state.data)) < 0
         return {
             "push": self.zero_sum(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),
-            "approach": self.zero_sum(self.distance(*before) - self.distance(*after)),
+            "approach": self.zero_sum(self.distance(before) - self.distance(after)),
         }
 
-    def leading(self, state: State, robot_state: RobotState) -> jax.Array:
+    def leading(self, state: State[TugState], robot_state: RobotState) -> jax.Array:
         """A robot leads while the cylinder is on the opponent's half."""
         return self.cylinder_y(state.data) * jnp.array([1.0, -1.0]) > self.params.win_distance

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +54,7 @@ class WrestlingParams(TaskParams):
         check_above(self.spawn_height, self.platform.center[2], self.robot)
 
 
-class Go1Wrestling(Duel):
+class Go1Wrestling(Duel[None, WrestlingParams]):
     """Sumo Wrestling.
 
     - Scene: a platform with a ring of 3.4 m diameter marked on it; the robots face each other, 2 m apart.
@@ -68,7 +67,7 @@ class Go1Wrestling(Duel):
 
     name = "go1wrestling"
     title = "Sumo Wrestling"
-    Params: ClassVar[type[TaskParams]] = WrestlingParams
+    Params = WrestlingParams
 
     @property
     def center(self) -> tuple[float, float]:
@@ -87,7 +86,7 @@ class Go1Wrestling(Duel):
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        return {"win": self.zero_sum(self.wins(*after))}
+        return {"win": self.zero_sum(self.wins(after.state, after.robots))}
 
     def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots have fallen or left the ring (2,) bool."""

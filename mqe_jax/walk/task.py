@@ -11,6 +11,7 @@ import numpy as np
 
 from mqe_jax import walk_policy
 from mqe_jax.envs.randomization import Randomization, RandomizedParams
+from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.robots.robot import Robot
 from mqe_jax.walk.rewards import WalkRewards
 from mqe_jax.walk_policy import WalkMemory
@@ -71,27 +72,15 @@ class EpisodeSpec:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class WalkState:
-    """State of one environment."""
+class WalkState(EnvironmentState):
+    """State of one environment: the walk policy's observation (1, 70), noisy if randomised, and the critic's (P,).
+
+    `LATENT_TARGET` of the latter is the regression target of the adaptation network. Slopes, forces and pushes are
+    scaled by 1 - `assistance`.
+    """
 
     data: mjx.Data
     """Physics state."""
-    obs: jax.Array
-    """The walk policy's observation (1, 70), noisy if randomised."""
-    privileged_obs: jax.Array
-    """Observation of the critic (P,); `LATENT_TARGET` is the regression target of the adaptation network."""
-    final_obs: jax.Array
-    """Observation of the state that the last step reached (1, 70)."""
-    final_privileged_obs: jax.Array
-    """Privileged observation of the state that the last step reached (P,)."""
-    reward: jax.Array
-    """Reward (1,)."""
-    terminated: jax.Array
-    """Whether the robot has fallen () bool."""
-    truncated: jax.Array
-    """Whether the episode was truncated at the time limit () bool."""
-    metrics: dict[str, jax.Array]
-    """Reward terms and tracking errors, () each."""
     spec: EpisodeSpec
     """Commands and disturbances."""
     slope: jax.Array
@@ -106,14 +95,8 @@ class WalkState:
     """Recurrent state of the walk policy: gait phase and last actions; the history is empty."""
     mean_error: jax.Array
     """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
-    step: jax.Array
-    """Steps counted towards the time limit () int32; a trainer may set it to a random offset."""
     episode_steps: jax.Array
     """Steps since the reset () int32."""
-    assistance: jax.Array
-    """Curriculum () in [0, 1]: slopes, forces and pushes are scaled by 1 - assistance."""
-    key: jax.Array
-    """Random key."""
 
 
 def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Array | float) -> EpisodeSpec:
