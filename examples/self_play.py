@@ -19,7 +19,7 @@ from mqe_jax.train.policy import policy_of
 
 def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episodes: int = 32) -> list[EvalResult]:
     """Trains, and returns evaluations against the last snapshot and the scripted policy."""
-    network = {"recurrent": False, "hidden_sizes": [64, 64], "layer_norm": True}
+    network = {"recurrent": False, "hidden_sizes": [64, 64], "openrl_layers": True}
     settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
     config = build(TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True})
     matches = VectorEnv(make("go1wrestling", episode_length=5.0, num_envs=num_envs), num_envs)

@@ -116,7 +116,7 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
     [
         ("go1revolvingdoor", "command", {"recurrent": True, "share_policy": False, "action_mean": "tanh"}),
         ("go1revolvingdoor", "position", {"recurrent": False, "activation": "elu", "hidden_sizes": [32, 16]}),
-        ("go1gate", "torque", {"recurrent": True, "activation": "tanh", "gru_size": 24, "layer_norm": True}),
+        ("go1gate", "torque", {"recurrent": True, "activation": "tanh", "gru_size": 24, "openrl_layers": True}),
     ],
 )
 def test_networks_memories_and_controls_agree(task: str, control: str, network: dict[str, Any]) -> None:

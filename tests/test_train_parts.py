@@ -215,7 +215,7 @@ def test_layer_norm_has_mean_zero_and_variance_one_before_scale_and_shift() -> N
 def test_normalised_layers_by_hand(recurrent: bool) -> None:
     """OpenRL's order: dense, activation, norm; dense, norm; recurrent unit, norm; action layer."""
     settings = ActorCritic(
-        layer_norm=True, hidden_sizes=(5,), recurrent=recurrent, gru_size=4, critic_input="own", action_gain=1.0
+        openrl_layers=True, hidden_sizes=(5,), recurrent=recurrent, gru_size=4, critic_input="own", action_gain=1.0
     )
     dims = EnvDims(agents=2, observation=3, privileged=0, action=2, values=2)
     network = settings.build(dims)

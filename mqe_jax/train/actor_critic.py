@@ -36,9 +36,9 @@ class ActorCritic(GaussianSettings):
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"
     """Activation after each hidden layer."""
-    layer_norm: bool = False
-    """Normalise each hidden layer and the output of the recurrent unit, with one more normalised linear layer after the
-    hidden layers, as in OpenRL's networks."""
+    openrl_layers: bool = False
+    """Add the layers of OpenRL's networks: a normalisation after each hidden layer and after the recurrent unit, and a
+    linear layer with one of its own after the hidden layers."""
     recurrent: bool = True
     """Use a gated recurrent unit after the hidden layers of actor and critic."""
     gru_size: PositiveInt = 64
@@ -65,7 +65,7 @@ def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, setti
     }
     if settings.recurrent:
         params["gru"] = nn.gru_init(gru_key, width, settings.gru_size)
-    if settings.layer_norm:
+    if settings.openrl_layers:
         params["linear"] = nn.dense_init(jax.random.fold_in(hidden_key, 1), width, width)
         widths = (*settings.hidden_sizes, width, *((settings.gru_size,) if settings.recurrent else ()))
         params["norm"] = {str(i): nn.layer_norm_init(size) for i, size in enumerate(widths)}
@@ -75,7 +75,7 @@ def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, setti
 def _hidden(params: Params, x: jax.Array, settings: ActorCritic) -> jax.Array:
     """Applies the hidden layers: (..., n_in) -> (..., width)."""
     activation = _ACTIVATIONS[settings.activation]
-    if not settings.layer_norm:
+    if not settings.openrl_layers:
         return nn.mlp(params["hidden"], x, activation, activate_last=True)
     for i in range(len(settings.hidden_sizes)):
         x = nn.layer_norm(params["norm"][str(i)], activation(nn.dense(params["hidden"][str(i)], x)))
@@ -98,7 +98,7 @@ def _trunk(
             return h, h
 
         memory, x = jax.lax.scan(step, memory, (is_first, x), unroll=min(x.shape[0], 8))
-        if settings.layer_norm:
+        if settings.openrl_layers:
             x = nn.layer_norm(params["norm"][str(len(settings.hidden_sizes) + 1)], x)
     return nn.dense(params["head"], x), memory
 

@@ -1,4 +1,4 @@
-"""Presets of the algorithms: only the settings in which they differ. See docs/algorithms.md."""
+"""Presets of the algorithms: only the settings in which they differ, as in configs/paper. See docs/algorithms.md."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mqe_jax.settings import fail
 _TEAM = {"name": "actor_critic", "share_policy": True, "critic_input": "privileged"}
 
 ALGORITHMS: Mapping[str, Mapping[str, Any]] = {
-    "mappo": {"ppo": {"ratio": "agent", "value": "agent", "dual_clip": None}, "network": _TEAM},
+    "mappo": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None}, "network": _TEAM},
     "jrpo": {"ppo": {"ratio": "joint", "value": "joint", "dual_clip": None}, "network": _TEAM},
     "mat": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None}, "network": {"name": "mat"}},
     "ippo": {
-        "ppo": {"ratio": "agent", "value": "agent", "dual_clip": None},
+        "ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None},
         "network": {"name": "actor_critic", "share_policy": False, "critic_input": "own"},
     },
-    "dual-clip": {"ppo": {"ratio": "agent", "value": "agent", "dual_clip": 3.0}, "network": _TEAM},
+    "dual-clip": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": 3.0}, "network": _TEAM},
 }
 """Presets of settings: multi-agent PPO, joint-ratio PPO, multi-agent transformer, independent PPO, dual-clip MAPPO."""
 

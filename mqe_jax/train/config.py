@@ -37,7 +37,7 @@ class PPO:
     minibatches: PositiveInt = 1
     """Minibatches per epoch."""
     ratio: Literal["agent", "dimension", "joint"] = "agent"
-    """Probability ratio that is clipped: per agent, per action dimension (OpenRL), or joint of the team (JRPO)."""
+    """Probability ratio that is clipped: per agent, per action dimension (OpenRL's MAPPO), or joint (JRPO)."""
     value: Literal["agent", "joint"] = "agent"
     """One value per agent, or one of the team, of its mean reward."""
     clip: Positive = 0.2
@@ -144,7 +144,7 @@ class EvaluationSettings:
 
 @record
 class TrainConfig:
-    """Settings of a training run; the defaults are the paper's MAPPO (arXiv 2403.16015, through OpenRL)."""
+    """Settings of a training run; the defaults are mostly OpenRL's, but with one ratio per agent."""
 
     task: Annotated[str | None, tyro.conf.Suppress] = None
     """Id of the task."""
