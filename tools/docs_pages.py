@@ -129,15 +129,25 @@ def _clip(name: str) -> str | None:
     return f"../clips/{name}.webp" if (ROOT / "docs" / "clips" / f"{name}.webp").is_file() else None
 
 
+def _meanings(cls: type[Any]) -> dict[str, str]:
+    """Returns the docstrings of a class's own fields by name."""
+    members = _package()[f"{cls.__module__}.{cls.__qualname__}"[8:]].members
+    return {name: x.docstring.value for name, x in members.items() if x.docstring}
+
+
 def _fields(record: type[Any], column: str, skip: tuple[str, ...] = ()) -> str:
     """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give."""
-    classes = [_package()[f"{c.__module__}.{c.__qualname__}"[8:]] for c in record.__mro__ if c is not object]
-    meanings = [{name: x.docstring.value for name, x in c.members.items() if x.docstring} for c in classes]
+    meanings = [_meanings(cls) for cls in record.__mro__ if cls is not object]
     values = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
     rows = []
     for name in sorted(values, key=lambda name: name not in meanings[0]):
-        meaning = " ".join(next((own[name] for own in meanings if name in own), "").split()).replace("|", "\\|")
-        rows.append(f"| `{name}` | {_shown(values[name])} | {meaning} |")
+        parts = {name: (values[name], next((own[name] for own in meanings if name in own), ""))}
+        if dataclasses.is_dataclass(values[name]):  # an object of the scene
+            inner, texts = values[name], _meanings(type(values[name]))
+            parts = {f"{name}.{f.name}": (getattr(inner, f.name), texts[f.name]) for f in dataclasses.fields(inner)}
+        for part, (value, text) in parts.items():
+            meaning = " ".join(text.split()).replace("|", "\\|")
+            rows.append(f"| `{part}` | {_shown(value)} | {meaning} |")
     return f"| name | {column} | meaning |\n|---|---|---|\n" + "\n".join(rows)
 
 

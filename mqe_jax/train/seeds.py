@@ -25,6 +25,7 @@ class Seeds:
         self.count = count
         self.shared = jax.tree.map(lambda one, many: one.shape == many.shape, alone, batched)
         """Whether each leaf of a state is unbatched under `vmap`."""
+        self._take = jax.jit(self._at)
 
     def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
         """Returns the compiled `update(state) -> (state, metrics)` of all seeds; metrics gain a leading axis S.
@@ -33,7 +34,7 @@ class Seeds:
         """
 
         def alone(states: PyTree) -> tuple[PyTree, PyTree]:
-            state, metrics = update(self.take(states, 0))
+            state, metrics = update(self._at(states, 0))
             return self.stack([state]), jax.tree.map(lambda x: x[None], metrics)
 
         return jax.jit(alone if self.count == 1 else jax.vmap(update))
@@ -44,6 +45,9 @@ class Seeds:
 
     def take(self, states: Any, seed: int) -> Any:
         """Returns one seed's state."""
+        return self._take(states, seed)
+
+    def _at(self, states: Any, seed: int) -> Any:
         return jax.tree.map(lambda once, x: x if once else x[seed], self.shared, states)
 
 
