@@ -12,6 +12,7 @@ import pytest
 from mqe_jax.train import loss, nn
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.advantage import gae
+from mqe_jax.train.config import PPO, Curriculum, OptimizerSettings, TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import (
     running_init,
@@ -23,6 +24,7 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import adam
+from mqe_jax.train.schedules import scheduled
 
 KEY = jax.random.PRNGKey(0)
 
@@ -89,6 +91,28 @@ def test_ratio_functions_by_hand() -> None:
     np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
     np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
     np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
+
+
+def test_schedules_by_hand() -> None:
+    """Ten updates; the assistance falls to 0 in five, the learning rate in the last two, and so on."""
+    config = TrainConfig(
+        num_envs=1,
+        rollout_steps=10,
+        total_steps=100,
+        ppo=PPO(
+            entropy_coef=0.01, entropy_coef_final=0.0, advantage_clip=3.0, advantage_clip_until=0.5, critic_warmup=0.2
+        ),
+        optimizer=OptimizerSettings(schedule="linear", anneal=0.2),
+        curriculum=Curriculum(assistance=1.0, assistance_until=0.5, failure_bootstrap=0.8, failure_bootstrap_until=0.4),
+    )
+    expected = {
+        0: (1.0, 0.8, 3.0, 0.01, 0.0, 1.0),
+        2: (0.6, 0.4, 3.0, 0.008, 1.0, 1.0),
+        5: (0.0, 0.0, math.inf, 0.005, 1.0, 1.0),
+        9: (0.0, 0.0, math.inf, 0.001, 1.0, 0.5),
+    }
+    for updates, values in expected.items():
+        np.testing.assert_allclose(jnp.stack(scheduled(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:

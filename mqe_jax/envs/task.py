@@ -40,6 +40,8 @@ class Task(Generic[S, P]):
 
     params: P
     """The task's parameters."""
+    weights: Any
+    """Weights of the reward terms: the field `rewards` of the parameters."""
     impl: str
     """Physics engine: 'jax', 'warp' or 'c'."""
     control: str
