@@ -107,7 +107,7 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
         assert sweeps.run(folder, jobs, environments) == jobs[:1]
     assert trained == ["joint"]
     assert sweeps.run(folder, jobs, environments) == []
-    assert trained == ["joint", "agent"]
+    assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
 
 
