@@ -9,7 +9,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task
-from mqe_jax.envs.state import Moment, State
+from mqe_jax.envs.state import EnvironmentState, Moment, State
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import override
 
@@ -46,6 +46,7 @@ __all__ = [
     "ALIASES",
     "PLANNERS",
     "TASKS",
+    "EnvironmentState",
     "Moment",
     "QuadrupedEnv",
     "Randomization",
