@@ -138,7 +138,7 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
 def _fields(record: type[Any], column: str, skip: tuple[str, ...] = ()) -> str:
     """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give."""
     meanings = [_meanings(cls) for cls in record.__mro__ if cls is not object]
-    values = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
+    values: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
     rows = []
     for name in sorted(values, key=lambda name: name not in meanings[0]):
         parts = {name: (values[name], next((own[name] for own in meanings if name in own), ""))}
