@@ -97,6 +97,25 @@ def test_steps_without_limits_are_taken_only_where_limits_have_no_effect(monkeyp
     jax.tree.map(np.testing.assert_array_equal, *states)
 
 
+def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None:
+    env: Any = make("go1plane", impl="c", control="torque", num_agents=1, num_envs=2)
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    data = state.data.replace(qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(env.robot.joint_speed_limit))
+    arrays = [
+        np.asarray(x) for x in (data.qpos, data.qvel, data.qacc_warmstart, np.tile(env.robot.torque_limit, (2, 1)))
+    ]
+    call = lambda: env.physics._call((), False, env.physics.num_substeps, *arrays)  # noqa: E731
+    expected = call()
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Batch, "step", interrupted)
+        call()
+    np.testing.assert_array_equal(call(), expected)
+
+
 def test_joint_targets_are_changed_so_that_the_actuators_give_the_motors_torque() -> None:
     motors, go1 = motors_of("go1"), robots.get("go1")
     gain, bias = np.full(12, go1.kp), np.tile([0.0, -go1.kp, -go1.kd], (12, 1))

@@ -85,7 +85,8 @@ def _pack(package: str, archive: Path) -> None:
 def export(run: Path, folder: Path) -> None:
     """Writes scene.xml, scene.json and policy.onnx of a run into a folder."""
     from mqe_jax.cli.setup import make_env
-    from mqe_jax.export.policy import shapes, to_onnx
+    from mqe_jax.export.check import checked_onnx
+    from mqe_jax.export.policy import shapes
     from mqe_jax.export.scene import scene_settings, scene_xml
     from mqe_jax.policies import load_policy
 
@@ -93,7 +94,7 @@ def export(run: Path, folder: Path) -> None:
     task = policy.config.task
     assert task is not None, f"{run}: its settings have no task"
     env, _ = make_env(task, "c", policy.config.env, 1)
-    model = to_onnx(policy, env)
+    model, _ = checked_onnx(policy, env)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "policy.onnx").write_bytes(model.SerializeToString())
     (folder / "scene.xml").write_text(scene_xml(env), encoding="utf-8")

@@ -14,11 +14,6 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.settings import record
 
-STEPS = 100
-"""Steps of the episodes on which the graph is compared with JAX."""
-LARGEST_ERROR = 1e-4
-"""Largest allowed difference of any output from JAX."""
-
 
 @record
 class Export:
@@ -44,17 +39,11 @@ class Export:
         if task is None:
             raise InputError(f"{self.run_dir}: its settings have no 'task' entry")
 
-        from mqe_jax.export.check import errors, record
-        from mqe_jax.export.policy import shapes, to_onnx
+        from mqe_jax.export.check import STEPS, checked_onnx
+        from mqe_jax.export.policy import shapes
 
         env, _ = make_env(task, "c", policy.config.env, 1)
-        model = to_onnx(policy, env)
-        error, output = max((error, name) for name, error in errors(model, *record(policy, env, STEPS)).items())
-        if not error <= LARGEST_ERROR:
-            raise InputError(
-                f"export: {self.onnx} is not written, because in {STEPS} steps of {task} the graph's output "
-                f"{output!r} differs from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
-            )
+        model, error = checked_onnx(policy, env)
         check_folder(self.onnx.parent, "onnx")
         write_atomically(self.onnx, model.SerializeToString())
         sizes = shapes(model)

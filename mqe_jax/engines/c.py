@@ -169,13 +169,15 @@ def _step_limited(
     angles, speeds = motors.joint_qpos, motors.joint_qvel
     asked, armature = ctrl[ids].astype(np.float32), batch.expand("dof_armature")
     base = armature[rows, speeds]
-    for _ in range(substeps):
-        joints = qpos[rows, angles].astype(np.float32), qvel[rows, speeds].astype(np.float32)
-        ctrl[ids], added = motors.limit(np, asked, *joints, gain, bias)
-        armature[rows, speeds] = base + added if added.any() else base
-        batch.step(ids=ids)
-        _clamp(batch, motors, rows)
-    armature[rows, speeds] = base
+    try:
+        for _ in range(substeps):
+            joints = qpos[rows, angles].astype(np.float32), qvel[rows, speeds].astype(np.float32)
+            ctrl[ids], added = motors.limit(np, asked, *joints, gain, bias)
+            armature[rows, speeds] = base + added if added.any() else base
+            batch.step(ids=ids)
+            _clamp(batch, motors, rows)
+    finally:  # the batch is used again
+        armature[rows, speeds] = base
 
 
 def _clamp(batch: Batch, motors: Motors, rows: Any) -> None:

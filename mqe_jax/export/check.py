@@ -9,10 +9,32 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 
-from mqe_jax.export.policy import input_shapes, policy_step
+from mqe_jax.errors import InputError
+from mqe_jax.export.policy import input_shapes, policy_step, to_onnx
 from mqe_jax.train.policy import TrainedPolicy
 
+STEPS = 100
+"""Environment steps over which a graph is compared with JAX."""
+LARGEST_ERROR = 1e-4
+"""Largest error of a graph's outputs."""
+
 Arrays = dict[str, np.ndarray]
+
+
+def checked_onnx(policy: TrainedPolicy, env: Any) -> tuple[onnx.ModelProto, float]:
+    """Returns the graph of a policy and its largest error against JAX in `STEPS` steps of the task.
+
+    Raises:
+        InputError: if it is larger than `LARGEST_ERROR`, or onnxruntime cannot run the graph.
+    """
+    model = to_onnx(policy, env)
+    error, output = max((error, name) for name, error in errors(model, *record(policy, env, STEPS)).items())
+    if not error <= LARGEST_ERROR:
+        raise InputError(
+            f"export: nothing is written, because in {STEPS} steps of {env.name} the graph's output {output!r} differs "
+            f"from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
+        )
+    return model, error
 
 
 def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
@@ -57,9 +79,12 @@ def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
-    names = [output.name for output in session.get_outputs()]
-    found = dict(zip(names, session.run(names, inputs), strict=True))
+    try:
+        session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
+        names = [output.name for output in session.get_outputs()]
+        found = dict(zip(names, session.run(names, inputs), strict=True))
+    except Exception as error:  # onnxruntime's errors have no common class
+        raise InputError(f"export: onnxruntime cannot run the graph: {error}") from None
     differences = {name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names}
     if (gait := differences.get("next_walk_gait")) is not None:
         differences["next_walk_gait"] = np.minimum(gait, np.abs(1.0 - gait))

@@ -76,7 +76,8 @@ def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> 
 
     for equation in jaxpr.eqns:
         values, name, params = [read(v) for v in equation.invars], equation.primitive.name, equation.params
-        if (inner := params.get("call_jaxpr", params.get("jaxpr"))) is not None:
+        inner = params.get("call_jaxpr", params.get("jaxpr"))
+        if inner is not None and name != "reduce":  # whose jaxpr is that of its operator
             results = _evaluate(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values)
         elif any(isinstance(x, jax.core.Tracer) for x in values):
             results = REPLACED[name](*values) if name in REPLACED else equation.primitive.bind(*values, **params)
