@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from mqe_jax.engines import Engine
 from mqe_jax.errors import InputError
+from mqe_jax.files import read_tensors
 from mqe_jax.robots.index import RobotIndex
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 
@@ -63,16 +64,10 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
     Raises:
         InputError: if the file is missing, damaged, or holds other names or shapes.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
     file = pathlib.Path(path)
     if not file.is_file():
         raise InputError(f"actuator_network: no file {file}")
-    try:
-        flat = load_file(file)
-    except SafetensorError as error:
-        raise InputError(f"actuator_network {file}: not a safetensors file ({error})") from None
+    flat = read_tensors(file, "actuator_network")
     params: ActuatorParams = {}
     for layer, (n_in, n_out) in zip(("0", "2", "4"), ((6, 32), (32, 32), (32, 1)), strict=True):
         for kind, shape in (("weight", (n_out, n_in)), ("bias", (n_out,))):

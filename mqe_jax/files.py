@@ -8,9 +8,13 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError, InUseError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextlib.contextmanager
@@ -52,6 +56,17 @@ def append(path: Path, content: bytes) -> None:
     """Appends to a file, which it creates where there is none; an OSError names it."""
     with naming(path), path.open("ab") as file:
         file.write(content)
+
+
+def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
+    """Reads a safetensors file; an InputError says `what` it should be."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        return load_file(file)
+    except SafetensorError as error:
+        raise InputError(f"{what} {file}: not a safetensors file ({error})") from None
 
 
 def check_folder(folder: Path, field: str = "run_dir") -> None:

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.files import read_tensors, write_atomically
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.skills import Command, Skill, register
@@ -221,9 +221,6 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     Raises:
         InputError: if the file is missing, damaged, or holds other names or shapes.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
-
     file = pathlib.Path(path) if path is not None else ASSETS / robot.walk.weights
     train = f"train it with 'mqe walk train --robot {robot.name}'"
     if not file.is_file() and path is None:
@@ -233,11 +230,7 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
         )
     if not file.is_file():
         raise InputError(f"walk policy: no file {file}; {train} or convert official weights with 'mqe walk convert'")
-    try:
-        flat = load_file(file)
-    except SafetensorError as error:
-        raise InputError(f"walk policy {file}: not a safetensors file ({error})") from None
-    return nested_params(flat, str(file))
+    return nested_params(read_tensors(file, "walk policy"), str(file))
 
 
 def save_params(
