@@ -20,6 +20,7 @@ from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.viz import curves
+from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import WALK, train_walk
 
 _HINT = "resume with the same command and --resume; the run is in {}"
@@ -96,6 +97,8 @@ class WalkTrain:
 
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
+    task: WalkTask = WalkTask()
+    """Parameters of the walking task."""
     run_dir: Path = Path("runs/walk")
     """Run folder: walk.safetensors (rounded to float16), metrics.csv, checkpoints."""
     resume: bool = False
@@ -112,7 +115,7 @@ class WalkTrain:
             walk_policy.load_params(robot, self.weights)
             config = override(config, {"network.weights": str(self.weights.resolve())})
         with interrupts.before_exit(lambda: _HINT.format(self.run_dir)):
-            train_walk(robot, self.run_dir, config, impl=self.impl, resume=self.resume)
+            train_walk(robot, self.run_dir, config, self.task, impl=self.impl, resume=self.resume)
         echo(f"mqe: {self.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 

@@ -43,6 +43,8 @@ class WalkTask:
     """Maximum commanded yaw rate, rad/s."""
     slope: float = 0.32
     """Maximum slope, rad."""
+    slope_share: float = 0.5
+    """Fraction of the episodes' specs that have a slope."""
     force: float = 40.0
     """Maximum sustained horizontal force on the trunk, N."""
     push: float = 0.9
@@ -133,7 +135,7 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
         default[14],
     ]
     angle = uniform(-jnp.pi, jnp.pi)
-    slope = jnp.where(chance(0.5), uniform(0.0, task.slope), 0.0) * difficulty
+    slope = jnp.where(chance(task.slope_share), uniform(0.0, task.slope), 0.0) * difficulty
     direction = uniform(-jnp.pi, jnp.pi)
     force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * difficulty
     return EpisodeSpec(

@@ -8,7 +8,7 @@ from typing import Any
 from mqe_jax import walk_policy
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.robots.robot import Robot
-from mqe_jax.settings import override
+from mqe_jax.settings import override, to_mapping
 from mqe_jax.train.config import (
     PPO,
     Checkpointing,
@@ -21,6 +21,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.runner import train
 from mqe_jax.walk.env import WalkEnv
 from mqe_jax.walk.network import WalkNetwork
+from mqe_jax.walk.task import WalkTask
 
 WALK = TrainConfig(
     task="walk",
@@ -42,13 +43,16 @@ WALK = TrainConfig(
 """Settings for training walk weights from nothing; the assistance is the curriculum of slopes, forces and pushes."""
 
 
-def train_walk(robot: Robot, run_dir: Path, config: TrainConfig, *, impl: str, resume: bool) -> TrainState:
+def train_walk(
+    robot: Robot, run_dir: Path, config: TrainConfig, task: WalkTask | None = None, *, impl: str, resume: bool
+) -> TrainState:
     """Trains walk weights and writes them to walk.safetensors (float16) in the run folder, at every checkpoint.
 
     Args:
         robot: the robot.
         run_dir: run folder, as that of `mqe_jax.train.runner.train`.
         config: settings, such as `WALK`.
+        task: parameters of the walking task; default: `WalkTask()`.
         impl: engine.
         resume: continue from the newest checkpoint.
 
@@ -56,8 +60,9 @@ def train_walk(robot: Robot, run_dir: Path, config: TrainConfig, *, impl: str, r
         InputError: as `train`.
         NonFiniteError: as `train`.
     """
-    config = override(config, {"env": {"robot": robot.name}})
-    env: Any = WalkEnv(robot, impl=impl, num_envs=config.num_envs)
+    task = task or WalkTask()
+    config = override(config, {"env": {"robot": robot.name, **to_mapping(task)}})
+    env: Any = WalkEnv(robot, task, impl=impl, num_envs=config.num_envs)
 
     def save(state: TrainState, row: dict[str, float]) -> None:
         updates = int(row["updates"])
