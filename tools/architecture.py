@@ -22,7 +22,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("skills", "walk_policy", "actuators", "control"),
     ("envs", "train"),
     ("planners", "walk"),
-    ("policies", "opponents"),
+    ("policies", "opponents", "demonstrations"),
     ("study", "viz", "view", "export", "adapters"),
     ("cli",),
 )
@@ -32,7 +32,7 @@ ACROSS = {
     "rotation": 0.86, "collision": 0.3, "robots": 0.58, "terrain": 0.12,
     "objects": 0.33, "npc": 0.53, "scene": 0.3, "engines": 0.7, "skills": 0.1,
     "walk_policy": 0.35, "actuators": 0.62, "control": 0.88, "envs": 0.25, "train": 0.9,
-    "planners": 0.34, "walk": 0.62, "policies": 0.42, "opponents": 0.7,
+    "planners": 0.34, "walk": 0.62, "policies": 0.3, "opponents": 0.6, "demonstrations": 0.88,
     "study": 0.08, "viz": 0.27, "view": 0.46, "export": 0.65,
     "adapters": 0.84, "cli": 0.5,
 }  # fmt: skip

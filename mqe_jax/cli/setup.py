@@ -11,10 +11,11 @@ import jax
 import yaml
 
 from mqe_jax.cli.output import echo
+from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import PLANNERS, VectorEnv, make
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.opponents import Mirror, versus
-from mqe_jax.policies import load_policy
+from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.settings import fail, override
 from mqe_jax.train import runner
 from mqe_jax.train.algorithms import preset
@@ -77,15 +78,23 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     against the scripted policy, or an idle team where that one does not fit.
     """
     task, episodes = config.task or "", config.evaluation.episodes
-    both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    both, _ = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    demonstrator = config.curriculum.demonstrator
+
+    def batch(num_envs: int) -> VectorEnv:
+        if demonstrator is None:
+            return VectorEnv(both, num_envs, seeds)
+        policy = load_policy(demonstrator, both)
+        return Demonstrated(both, num_envs, all_agents(both, policy, policy if len(both.teams) > 1 else None), seeds)
+
     eval_env = None
     if config.evaluation.every is not None:
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
     if len(both.teams) < 2:
-        return env, eval_env
+        return batch(config.num_envs), eval_env
     if config.num_envs % 2:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
-    mirror = Mirror(VectorEnv(both, config.num_envs // 2, seeds))
+    mirror = Mirror(batch(config.num_envs // 2))
     return mirror, None if eval_env is None else versus(eval_env, [_reference(eval_env.env)])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,25 +12,29 @@ from mqe_jax.envs.base import QuadrupedEnv, check_num_envs
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 
-# Fields that describe the last step; an auto-reset keeps them.
-_KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
+KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
+"""Fields that an auto-reset keeps; all but the first describe the last step."""
+
+Start = Callable[[jax.Array, jax.Array], State]
+"""Returns an initial state from a random key and the assistance, as `QuadrupedEnv.reset`."""
 
 
-def autoreset(env: QuadrupedEnv, state: State) -> State:
+def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> State:
     """Replaces the state of one environment by a new initial state if its episode has ended.
 
     Resets the whole state, without a forward pass. `reward`, `terminated`, `truncated`, `metrics` and `final_obs`
-    still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept.
+    still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept. The new
+    episode starts in the state of `start`, by default of the task's reset.
     """
     done = state.terminated | state.truncated
     key, reset_key = jax.random.split(state.key)
-    fresh = env.reset(reset_key, state.assistance)
+    fresh = (start or env.reset)(reset_key, state.assistance)
     merged = {
         field.name: jax.tree.map(
             lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
         )
         for field in dataclasses.fields(state)
-        if field.name not in ("data", "key", *_KEPT)
+        if field.name not in ("data", "key", *KEPT)
     }
     data = env.physics.merge(done, fresh.data, state.data)
     return dataclasses.replace(state, data=data, key=key, **merged)
@@ -70,11 +75,15 @@ class VectorEnv:
         Raises:
             InputError: as `QuadrupedEnv.step`, and for another number of environments.
         """
-        shape = (self.num_envs, self.num_agents, self.action_size)
-        if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
+        self.check_action(action)
 
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action))
 
         return jax.vmap(one)(state, action)
+
+    def check_action(self, action: jax.Array) -> None:
+        """Raises an InputError for actions of another shape than (N, A, action_size)."""
+        shape = (self.num_envs, self.num_agents, self.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")

@@ -94,6 +94,9 @@ class Curriculum:
     """Initial assistance of the environment (its state's `assistance`), annealed linearly to 0."""
     assistance_until: Positive = 0.5
     """Fraction of training after which the assistance is 0."""
+    demonstrator: str | None = None
+    """Policy in states of whose episodes training episodes start, with the probability `assistance`: scripted, a run
+    folder or a policy file; none starts all as the task does."""
     failure_bootstrap: Fraction = 0.0
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
@@ -176,6 +179,8 @@ class TrainConfig:
     evaluation: EvaluationSettings = EvaluationSettings()
 
     def __post_init__(self) -> None:
+        if self.curriculum.demonstrator is not None and not self.curriculum.assistance:
+            fail("curriculum.assistance", self.curriculum.assistance, "above 0 where curriculum.demonstrator is set")
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":
             fail("ppo.value", self.ppo.value, "'joint' when ppo.ratio is 'joint'")
 

@@ -117,14 +117,14 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
     names = ("trot", "pace", "bound", "pronk")
     gaits = np.array([list(walk_policy.GAITS[name].values()) for name in names], np.float32)
-    gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.64, 0.28, 0.04, 0.04])))]
-    varied = chance(0.35)
+    gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.6, 0.32, 0.04, 0.04])))]
+    varied = chance(0.5)
     vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
     default = walk_policy.WalkPolicy(robot).default_commands()
     width, length = robot.walk.stance_width, robot.walk.stance_length
     rest = [
         vary(-0.12, 0.06, default[3]),
-        vary(2.0, 4.0, default[4]),
+        vary(2.0, 4.2, default[4]),
         *gait,
         default[8],
         vary(0.03, 0.16, default[9]),
