@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.errors import InputError
-from mqe_jax.policies import load_policy, team_size
+from mqe_jax.policies import load_opponent, team_size
 from mqe_jax.settings import fail
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.types import Memory, PyTree
@@ -216,7 +216,7 @@ def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path]) -> Versus:
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
     """
-    policies = [load_policy(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
+    policies = [load_opponent(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
     return Versus(env, policies)
 
 

@@ -108,6 +108,14 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
     return policy
 
 
+def load_opponent(source: str | Path, env: Any, *, deterministic: bool = False) -> Policy:
+    """Returns `load_policy` for an opponent, which errors name so."""
+    try:
+        return load_policy(source, env, deterministic=deterministic)
+    except InputError as error:
+        raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
+
+
 def team_size(env: Any) -> int:
     """Returns the number of agents for which one policy acts: those of a team."""
     return len(env.teams[0])

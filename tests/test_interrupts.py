@@ -27,7 +27,6 @@ FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-ste
 FAKE += ["--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "4", "--checkpoint.every", "100000"]
 PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_program.py"))]
 GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
-GATE += ["--curriculum.demonstrator", "None"]
 GATE += ["--num-envs", "4", "--rollout-steps", "8", "--ppo.minibatches", "2", "--checkpoint.every", "100000"]
 GATE += ["--total-steps", str(100 * 32)]
 

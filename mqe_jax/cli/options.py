@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from mqe_jax import settings
-from mqe_jax.errors import InputError
 from mqe_jax.settings import record
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ class PolicyOptions(TaskOptions):
         """
         from mqe_jax.cli import setup
         from mqe_jax.envs import ALIASES, PLANNERS
-        from mqe_jax.policies import all_agents, load_policy
+        from mqe_jax.policies import all_agents, load_opponent, load_policy
 
         task, params = ALIASES.get(self.target, self.target), self.overrides()
         name = self.policy or ("scripted" if task in PLANNERS else "forward")
@@ -88,8 +87,5 @@ class PolicyOptions(TaskOptions):
         env, vector_env = setup.make_env(task, self.impl, params, num_envs)
         own, opponent = load_policy(name, env, deterministic=self.deterministic), None
         if self.opponent is not None:
-            try:
-                opponent = load_policy(self.opponent, env, deterministic=self.deterministic)
-            except InputError as error:
-                raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
+            opponent = load_opponent(self.opponent, env, deterministic=self.deterministic)
         return env, vector_env, all_agents(env, own, opponent)

@@ -74,10 +74,13 @@ def make_env(
 def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     """Returns training and evaluation environments (None without evaluation) of seeds trained together.
 
-    In a match both teams of each of `num_envs` / 2 matches are environments of the policy; it is evaluated as team 0
-    against the scripted policy, or an idle team where that one does not fit.
+    In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
+    environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
+
+    Raises:
+        InputError: for a task, an opponent or a demonstrator that is not allowed.
     """
-    task, episodes = config.task or "", config.evaluation.episodes
+    task, episodes, opponents = config.task or "", config.evaluation.episodes, config.opponents
     both, _ = make_env(task, impl, config.training_env, config.num_envs, seeds)
     demonstrator = config.curriculum.demonstrator
 
@@ -91,11 +94,13 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     if config.evaluation.every is not None:
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
     if len(both.teams) < 2:
+        if opponents:
+            fail("opponents", list(opponents), f"empty: {both.name} is not a match; it has one team")
         return batch(config.num_envs), eval_env
-    if config.num_envs % 2:
+    if config.num_envs % 2 and not opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
-    mirror = Mirror(batch(config.num_envs // 2))
-    return mirror, None if eval_env is None else versus(eval_env, [_reference(eval_env.env)])
+    learning = Mirror(batch(config.num_envs // 2)) if not opponents else versus(batch(config.num_envs), opponents)
+    return learning, None if eval_env is None else versus(eval_env, opponents or [_reference(eval_env.env)])
 
 
 def _reference(env: Any) -> str:

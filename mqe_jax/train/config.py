@@ -27,6 +27,8 @@ from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
 
+_OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
+
 
 @record
 class PPO:
@@ -155,6 +157,9 @@ class TrainConfig:
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Annotated[Mapping[str, Any], tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
     """Further overrides during training only, not in evaluation."""
+    opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
+    """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, a run folder or a policy
+    file. Several have equal shares of the environments. Without, both teams of each match learn."""
     seed: Seed = 0
     """Random seed."""
     num_envs: PositiveInt = 500
@@ -183,6 +188,11 @@ class TrainConfig:
             fail("curriculum.assistance", self.curriculum.assistance, "above 0 where curriculum.demonstrator is set")
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":
             fail("ppo.value", self.ppo.value, "'joint' when ppo.ratio is 'joint'")
+        shares = len(self.opponents) or 1
+        if self.num_envs % shares:
+            fail("num_envs", self.num_envs, f"a multiple of the number of opponents, {shares}")
+        if self.evaluation.every is not None and self.evaluation.episodes % shares:
+            fail("evaluation.episodes", self.evaluation.episodes, f"a multiple of the number of opponents, {shares}")
 
     @property
     def training_env(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 from mqe_jax import walk_policy
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.robots.robot import Robot
-from mqe_jax.settings import override, to_mapping
+from mqe_jax.settings import fail, override, to_mapping
 from mqe_jax.train.config import (
     PPO,
     Checkpointing,
@@ -60,6 +60,8 @@ def train_walk(
         InputError: as `train`.
         NonFiniteError: as `train`.
     """
+    if config.opponents:
+        fail("opponents", list(config.opponents), "empty: walking is not a match")
     task = task or WalkTask()
     config = override(config, {"env": {"robot": robot.name, **to_mapping(task)}})
     env: Any = WalkEnv(robot, task, impl=impl, num_envs=config.num_envs)
