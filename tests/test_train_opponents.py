@@ -27,11 +27,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     """The opponents are recorded, evaluations meet them, and seeds are trained together."""
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     both = [*TINY, *AGAINST, "--evaluation.every", "4", "--evaluation.episodes", "2"]
-    assert 0 == cli.main([*both, "--run-dir", str(whole), "--num-seeds", "2"])
-    assert 0 == cli.main([*both, "--run-dir", str(halves), "--num-seeds", "2"])
+    assert cli.main([*both, "--run-dir", str(whole), "--num-seeds", "2"]) == 0
+    assert cli.main([*both, "--run-dir", str(halves), "--num-seeds", "2"]) == 0
     for seed in ("seed0", "seed1"):
         max(list_checkpoints(halves / seed)).unlink()
-    assert 0 == cli.main([*both, "--run-dir", str(halves), "--num-seeds", "2", "--resume"])
+    assert cli.main([*both, "--run-dir", str(halves), "--num-seeds", "2", "--resume"]) == 0
     for seed in ("seed0", "seed1"):
         expected, resumed = contents(whole / seed), contents(halves / seed)
         assert expected.keys() == resumed.keys()
@@ -39,7 +39,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
             np.testing.assert_array_equal(value, resumed[name], err_msg=name)
     config = yaml.safe_load((whole / "seed0" / "config.yaml").read_text())
     assert config["opponents"] == ["idle", "random"]
-    assert 0 == cli.main(["eval", str(whole / "seed0"), "--opponent", str(whole / "seed1"), "--impl", "c", "--episodes", "2"])
+    runs = [str(whole / "seed0"), "--opponent", str(whole / "seed1")]
+    assert cli.main(["eval", *runs, "--impl", "c", "--episodes", "2"]) == 0
 
 
 WRONG: dict[str, tuple[list[str], list[str]]] = {
