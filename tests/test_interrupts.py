@@ -1,8 +1,9 @@
-"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; a training is saved and resumes exactly."""
+"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; SIGKILL too leaves a run that resumes exactly."""
 
 from __future__ import annotations
 
 import csv
+import os
 import random
 import signal
 import subprocess
@@ -231,3 +232,39 @@ def test_signals_at_random_moments(number: signal.Signals, tmp_path: Path) -> No
         print(f"{number.name}: {done} updates, {time.monotonic() - began:.2f} s to end, {saved}, {lines}")
         assert subprocess.run(command, capture_output=True).returncode == 0
         assert_same_run(whole, run_dir)
+
+
+STEPS, ENVS, ROLLOUT = 12, 4, 8
+
+
+def start_training(run_dir: Path, *flags: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
+    command += ["--run-dir", str(run_dir), "--num-envs", str(ENVS), "--rollout-steps", str(ROLLOUT)]
+    command += ["--total-steps", str(STEPS * ENVS * ROLLOUT), "--ppo.minibatches", "2", "--checkpoint.every", "1"]
+    return subprocess.Popen([*command, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
+
+
+def newest(run_dir: Path) -> dict[str, np.ndarray]:
+    """Contents of the last checkpoint by name: parameters, optimiser, environments, keys."""
+    from safetensors.numpy import load_file
+
+    return load_file(max(list_checkpoints(run_dir)))
+
+
+def test_sigkill_and_resume_changes_nothing(tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert start_training(whole).wait(300) == 0
+    process = start_training(killed)
+    deadline = time.monotonic() + 300
+    while len(list_checkpoints(killed)) < 2 and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait(60) == -signal.SIGKILL, "the training ended before it could be killed"
+    assert start_training(killed, "--resume").wait(300) == 0
+
+    expected, resumed = newest(whole), newest(killed)
+    assert expected.keys() == resumed.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(value, resumed[name], err_msg=name)
+    updates = [len((run / "metrics.csv").read_text().splitlines()) - 1 for run in (whole, killed)]
+    assert updates == [STEPS, STEPS]
