@@ -81,12 +81,12 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
         InputError: for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = config.task or "", config.evaluation.episodes, config.opponents
-    both, _ = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> VectorEnv:
         if demonstrator is None:
-            return VectorEnv(both, num_envs, seeds)
+            return env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
         policy = load_policy(demonstrator, both)
         return Demonstrated(both, num_envs, all_agents(both, policy, policy if len(both.teams) > 1 else None), seeds)
 
