@@ -168,12 +168,7 @@ class Gate(TerrainBlock):
         # Long enough to reach the side wall for every sampled gap position; the overhang is hidden when rendering.
         reach = (track.width - gap) / 2 + abs(self.offset[1]) + self.random[1]
         walls = tuple(
-            Wall(
-                f"gate{number}_{side}",
-                (0.0, sign * (gap + reach) / 2, height / 2),
-                (depth, reach, height),
-                anchor=0,
-            )
+            Wall(f"gate{number}_{side}", (0.0, sign * (gap + reach) / 2, height / 2), (depth, reach, height), anchor=0)
             for side, sign in (("right", -1.0), ("left", 1.0))
         )
         return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))

@@ -22,10 +22,7 @@ COUNT, STEPS, LIMIT = 3, 14, 5
 SEED = 7
 # The time limit ends the episodes, at the same step under every version of the physics.
 SHORT: dict[str, Any] = {"episode_length": LIMIT * 0.02}
-TASKS = [
-    "go1gate",
-    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
-]
+TASKS = ["go1gate", *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate")]
 
 
 def close(one: Any, other: Any) -> bool:

@@ -19,10 +19,7 @@ from mqe_jax.errors import InputError
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 COUNT, LIMIT, STEPS = 3, 3, 7
-TASKS = [
-    "go1gate",
-    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
-]
+TASKS = ["go1gate", *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate")]
 
 
 def task_env(task: str) -> Any:

@@ -23,10 +23,7 @@ from mqe_jax.errors import InputError
 
 # The time limit of test_adapters_gymnasium.py: in one process the compiled functions are shared.
 SHORT: dict[str, Any] = {"episode_length": 5 * 0.02, "impl": "c"}
-TASKS = [
-    "go1gate",
-    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
-]
+TASKS = ["go1gate", *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate")]
 
 
 @pytest.mark.parametrize("task", TASKS)

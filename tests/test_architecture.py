@@ -31,7 +31,9 @@ def wrong_imports(package: Path, order: list[str]) -> list[str]:
 def test_imports_follow_the_table_of_modules() -> None:
     """The table names every module, each after those that it imports."""
     order = re.findall(r"^\| `(\w+)", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
-    modules = {path.stem for path in PACKAGE.glob("*.py")} | {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    modules = {path.stem for path in PACKAGE.glob("*.py")} | {
+        path.parent.name for path in PACKAGE.glob("*/__init__.py")
+    }
     assert sorted(order) == sorted(modules - {"__init__"})
     assert wrong_imports(PACKAGE, order) == []
 

@@ -151,18 +151,7 @@ def test_a_divergence_in_training_is_recorded(
     """Of a match, whose teams are environments of their own, once and with the actions of both."""
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)  # in the second step
     (tmp_path / "small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
-    command = [
-        "train",
-        task,
-        "--impl",
-        "c",
-        "--control",
-        "position",
-        "--run-dir",
-        "run",
-        "--config",
-        "small.yaml",
-    ]
+    command = ["train", task, "--impl", "c", "--control", "position", "--run-dir", "run", "--config", "small.yaml"]
     command += ["--num-envs", num_envs, "--rollout-steps", "2", "--total-steps", "4", "--ppo.minibatches", "1"]
     assert cli.main([*command, "--set", f"num_agents={agents}", "--dump-diverged", "dump"]) == 0
     assert "recorded 2 divergences" in capfd.readouterr().err
@@ -275,10 +264,7 @@ BAD = {
     "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
     "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
     "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
-    "parameter's value": (
-        ["bench", "go1gate", "--set", "gate_width=wide"],
-        ["gate_width", "'wide'", "number"],
-    ),
+    "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
     "policy": (["eval", "fake", "--policy", "randm"], ["policy: unknown 'randm'", "random", "a run folder"]),
     "policy's file": (["eval", "fake", "--policy", "runs/none"], ["runs/none", "no such file"]),

@@ -41,10 +41,7 @@ def crowds(env: Any, data: mujoco.MjData) -> dict[str, tuple[np.ndarray, list[np
             end = np.array([half[0] - 0.45, 0.0])
             places += [middle - end + 0.2 * ring, middle + end + 0.2 * ring]
         else:
-            for quarter in (
-                0.0,
-                np.pi / 2,
-            ):  # from the first robot's start, and at right angles
+            for quarter in (0.0, np.pi / 2):  # from the first robot's start, and at right angles
                 angle = turn + quarter + np.arctan2(*(start[0] - middle)[::-1])
                 around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
                 side = np.min(half / np.maximum(np.abs(around), 1e-6), axis=1)

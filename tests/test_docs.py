@@ -19,9 +19,7 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").g
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # Blocks that are not run, by page and first line, with the reason.
-NOT_RUN = {
-    ("docs/training.md", "import jax"): "needs a run folder",
-}
+NOT_RUN = {("docs/training.md", "import jax"): "needs a run folder"}
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
 SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
 

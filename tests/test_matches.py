@@ -214,9 +214,7 @@ def test_door_rewards_result_and_end() -> None:
 def test_a_door_turns_about_its_middle_and_lets_one_side_through_at_a_time() -> None:
     scene = compile_scene(
         Scene(
-            Track((SpawnArea(2.0), Plane(4.0)), walled=False),
-            num_robots=1,
-            objects={"door": Door(position=(4.0, 0.0))},
+            Track((SpawnArea(2.0), Plane(4.0)), walled=False), num_robots=1, objects={"door": Door(position=(4.0, 0.0))}
         )
     )
     index, data = scene.objects["door"], mujoco.MjData(scene.model)

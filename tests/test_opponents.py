@@ -25,14 +25,7 @@ from mqe_jax.train.monitor import score
 from mqe_jax.train.policy import TrainedPolicy, policy_of
 
 KEY = jax.random.PRNGKey(0)
-MATCHES = (
-    "go1revolvingdoor",
-    "go1tug",
-    "go1wrestling",
-    "go1bridge",
-    "go1football-1vs1",
-    "go1football-2vs2",
-)
+MATCHES = ("go1revolvingdoor", "go1tug", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
 SETTINGS: dict[str, Any] = {
     "num_envs": 4,
     "rollout_steps": 4,

@@ -75,14 +75,12 @@ def test_value_loss_is_clipped_and_huber() -> None:
     np.testing.assert_allclose(loss.value_loss(value, old, target, None, None), [0.0, 200.0], rtol=1e-6)
 
 
-def test_gaussian_density_entropy_and_divergence() -> None:
+def test_gaussian_density_and_entropy() -> None:
     action, mean, log_std = jnp.array([0.5]), jnp.array([0.1]), jnp.array([-0.3])
     std = math.exp(-0.3)
     expected = -0.5 * (0.4 / std) ** 2 - math.log(std * math.sqrt(2 * math.pi))
     np.testing.assert_allclose(loss.log_prob(action, mean, log_std), [expected], rtol=1e-5)
     np.testing.assert_allclose(loss.entropy(log_std), 0.5 * math.log(2 * math.pi * math.e * std**2), rtol=1e-5)
-    divergence = loss.kl_divergence(mean, log_std, action, log_std)
-    np.testing.assert_allclose(divergence, 0.5 * (0.4 / std) ** 2, rtol=1e-5)
 
 
 def test_ratio_functions_by_hand() -> None:

@@ -427,12 +427,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     """Short episodes (2 steps, successes) are not over-represented against long ones (30 steps)."""
     env = Probe(
-        probes.show_hidden,
-        probes.pay_one,
-        num_envs=4,
-        max_episode_steps=2,
-        odd_episode_steps=30,
-        teams=((1,), (0,)),
+        probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30, teams=((1,), (0,))
     )
 
     def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:

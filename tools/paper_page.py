@@ -13,13 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image, ImageColor
+from PIL import Image
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import Cells, aggregate_tables, evaluated, final_rows, group
-from mqe_jax.study.figures import LINES, draw_curves, draw_evaluations, draw_profiles, draw_terms
+from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles, draw_terms
 from mqe_jax.study.report import markdown
 from mqe_jax.study.runs import Cell, Reference, Run, load_reference
 
@@ -30,7 +29,6 @@ SHAPED = (TUNED, "no-curriculum", "plain-network", "plain-curriculum", "shaped",
 GATE_TERMS = {"reward/approach": "Distance to Target Reward", "reward/success": "Success Reward"}
 """Terms of the paper's appendix figure of Narrow Gate (MAPPO), by column; it ends at `GATE_STEPS`."""
 GATE_STEPS = 20_000_000
-SHADES = 64
 MIN_SEEDS = 3
 """Seeds that a verdict requires: the interval of a single seed is a point."""
 
@@ -78,15 +76,9 @@ def figures(cells: Cells, reference: Reference) -> dict[str, bytes]:
 
 
 def reduced(png: bytes) -> bytes:
-    """Returns a PNG with a palette of the exact colours of lines and `SHADES` others, a quarter of the size."""
-    image = Image.open(io.BytesIO(png)).convert("RGB")
-    lines = np.array([ImageColor.getrgb(color) for color in (*LINES, "#ffffff")])
-    shades = np.array(image.quantize(SHADES, dither=Image.Dither.NONE).getpalette())[: 3 * SHADES].reshape(-1, 3)
-    distances = np.abs(shades[:, None] - lines).max(axis=-1).min(axis=-1)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([*lines.ravel(), *shades[distances > 8].ravel()])  # Pillow may confuse nearer ones
+    """Returns a PNG with a palette, a quarter of the size."""
     small = io.BytesIO()
-    image.quantize(palette=palette, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
+    Image.open(io.BytesIO(png)).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, "png", optimize=True)
     return small.getvalue()
 
 

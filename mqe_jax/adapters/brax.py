@@ -116,10 +116,7 @@ class AutoReset(Wrapper):
 
 
 def wrap(
-    env: BraxEnv,
-    episode_length: int = 1000,
-    action_repeat: int = 1,
-    randomization_fn: Callable[..., Any] | None = None,
+    env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable[..., Any] | None = None
 ) -> Wrapper:
     """Wraps an `Env` for Brax's trainers: batch, time limit, automatic reset to new episodes; pass it as `wrap_env_fn`.
 

@@ -59,14 +59,7 @@ def demo(arguments: Demo) -> None:
     except InputError:
         video = run_dir / "video.gif"
     echo("mqe demo: rendering an episode")
-    draw(
-        env,
-        dataclasses.replace(after, deterministic=True),
-        video,
-        seed=config.seed + 1,
-        episodes=16,
-        size=(640, 360),
-    )
+    draw(env, dataclasses.replace(after, deterministic=True), video, seed=config.seed + 1, episodes=16, size=(640, 360))
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[
-    str,
-    tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU)."),
+    str, tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU).")
 ]
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
 Seed = Annotated[settings.Seed, tyro.conf.arg(help="Random seed.")]

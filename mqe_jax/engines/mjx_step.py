@@ -19,15 +19,7 @@ from mujoco import mjx
 
 from mqe_jax.engines import private
 
-_BEFORE_COLLISION = (
-    mjx.kinematics,
-    mjx.com_pos,
-    mjx.camlight,
-    mjx.tendon,
-    mjx.crb,
-    mjx.tendon_armature,
-    mjx.factor_m,
-)
+_BEFORE_COLLISION = (mjx.kinematics, mjx.com_pos, mjx.camlight, mjx.tendon, mjx.crb, mjx.tendon_armature, mjx.factor_m)
 _CORNERS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)], np.float32)  # one of each opposite pair
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE))
 

@@ -49,12 +49,7 @@ class QuadrupedEnv(Task[S, P]):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
     def __init__(
-        self,
-        params: P | None = None,
-        *,
-        impl: str = "auto",
-        control: str = "command",
-        num_envs: int = 4096,
+        self, params: P | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
     ) -> None:
         self.params = self.Params() if params is None else params
         self.weights = vars(self.params)["rewards"]

@@ -18,8 +18,6 @@ _COLORS = {"jrpo": "#4f86e0", "mappo": "#b5316f", "mat": "#3fae49"}
 _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
 _DASHES = (0, (4, 3))
 _COLORS_OF_VARIANTS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
-LINES = (*_COLORS_OF_VARIANTS, _PALE)
-"""Colours of all lines."""
 
 
 def _figure(width: float, height: float) -> Any:

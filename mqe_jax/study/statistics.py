@@ -45,10 +45,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
 
 
 def bootstrap_interval(
-    scores: Sequence[Array],
-    statistic: Callable[..., Array],
-    random: Any,
-    samples: int = 2000,
+    scores: Sequence[Array], statistic: Callable[..., Array], random: Any, samples: int = 2000
 ) -> tuple[Array, Array]:
     """Returns the bounds of a 95% percentile bootstrap interval; runs are resampled within each task.
 

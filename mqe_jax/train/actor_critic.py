@@ -17,11 +17,7 @@ from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
-_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
-    "relu": jax.nn.relu,
-    "elu": jax.nn.elu,
-    "tanh": jnp.tanh,
-}
+_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}
 
 
 @register_network("actor_critic")
@@ -118,11 +114,8 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
     if settings.critic_input == "privileged" and not dims.privileged:
         fail("network.critic_input", "privileged", "'observations' or 'own': there is no privileged observation")
     critic_rows = agents if own else 1
-    critic_in = {
-        "privileged": dims.privileged,
-        "observations": agents * dims.observation,
-        "own": dims.observation,
-    }[settings.critic_input]
+    sizes = {"privileged": dims.privileged, "observations": agents * dims.observation, "own": dims.observation}
+    critic_in = sizes[settings.critic_input]
     critic_out = 1 if own else dims.values
     critic_shared = share or not own
 

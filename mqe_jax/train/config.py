@@ -12,17 +12,7 @@ import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.errors import InputError
-from mqe_jax.settings import (
-    Fraction,
-    NonNegative,
-    Positive,
-    PositiveInt,
-    Seed,
-    fail,
-    load_yaml,
-    override,
-    record,
-)
+from mqe_jax.settings import Fraction, NonNegative, Positive, PositiveInt, Seed, fail, load_yaml, override, record
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings

@@ -189,10 +189,7 @@ def _prepare(
         state.obs_normalizer, transitions.obs, transitions.privileged_obs, config.normalization.observations
     )
     final_obs, final_privileged = normalize_obs(
-        state.obs_normalizer,
-        transitions.final_obs,
-        transitions.final_privileged_obs,
-        config.normalization.observations,
+        state.obs_normalizer, transitions.final_obs, transitions.final_privileged_obs, config.normalization.observations
     )
     pair, _ = network.value(
         state.params,

@@ -22,13 +22,6 @@ def entropy(log_std: jax.Array) -> jax.Array:
     return jnp.sum(log_std + 0.5 + _LOG_SQRT_2PI, axis=-1)
 
 
-def kl_divergence(old_mean: jax.Array, old_log_std: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Returns KL(old || new) of diagonal Gaussians summed over the last axis: (..., D) -> (...), nats."""
-    variance_ratio = jnp.exp(2.0 * (old_log_std - log_std))
-    shift = jnp.square((old_mean - mean) * jnp.exp(-log_std))
-    return jnp.sum(log_std - old_log_std + 0.5 * (variance_ratio + shift - 1.0), axis=-1)
-
-
 def clipped_surrogate(
     log_ratio: jax.Array, advantage: jax.Array, clip: float, dual_clip: float | None = None
 ) -> jax.Array:
@@ -52,11 +45,7 @@ def huber(error: jax.Array, delta: float) -> jax.Array:
 
 
 def value_loss(
-    value: jax.Array,
-    old_value: jax.Array,
-    target: jax.Array,
-    clip: float | None,
-    huber_delta: float | None,
+    value: jax.Array, old_value: jax.Array, target: jax.Array, clip: float | None, huber_delta: float | None
 ) -> jax.Array:
     """Returns the value loss per element: Huber (or half the square), clipped around `old_value`.
 

@@ -9,14 +9,7 @@ import jax.numpy as jnp
 
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import (
-    NetworkMemory,
-    Params,
-    TraceStep,
-    Transition,
-    VectorEnv,
-    is_outcome,
-)
+from mqe_jax.train.types import NetworkMemory, Params, TraceStep, Transition, VectorEnv, is_outcome
 
 
 class RolloutState(NamedTuple):

@@ -19,14 +19,7 @@ from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import fail, to_mapping
-from mqe_jax.train.checkpoint import (
-    check_run,
-    checkpoint_step,
-    latest,
-    list_checkpoints,
-    nonfinite,
-    save_checkpoint,
-)
+from mqe_jax.train.checkpoint import check_run, checkpoint_step, latest, list_checkpoints, nonfinite, save_checkpoint
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers

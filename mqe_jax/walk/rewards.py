@@ -100,8 +100,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
 
     # Raibert heuristic: stance corners, shifted by half of the distance travelled during stance.
     stance = jnp.stack(
-        [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]],
-        -1,
+        [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]], -1
     )
     shift = jnp.abs(1.0 - 2.0 * phases) - 0.5
     speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)

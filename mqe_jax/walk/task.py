@@ -107,11 +107,7 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
     uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
     chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
     velocity = jnp.stack(
-        [
-            uniform(-task.max_vx, task.max_vx),
-            uniform(-task.max_vy, task.max_vy),
-            uniform(-task.max_yaw, task.max_yaw),
-        ]
+        [uniform(-task.max_vx, task.max_vx), uniform(-task.max_vy, task.max_vy), uniform(-task.max_yaw, task.max_yaw)]
     )
     velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)

@@ -9,14 +9,7 @@ from mqe_jax import walk_policy
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.robots.robot import Robot
 from mqe_jax.settings import fail, override, to_mapping
-from mqe_jax.train.config import (
-    PPO,
-    Checkpointing,
-    Curriculum,
-    Normalization,
-    OptimizerSettings,
-    TrainConfig,
-)
+from mqe_jax.train.config import PPO, Checkpointing, Curriculum, Normalization, OptimizerSettings, TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.runner import train
 from mqe_jax.walk.env import WalkEnv

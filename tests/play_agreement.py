@@ -1,6 +1,6 @@
 """Measures how MuJoCo in the browser agrees with the C engine here, on the scene of docs/play.
 
-`python tools/play_agreement.py build/site/play --json docs/play/agreement.json` needs Node and a page completed by
+`python -m tests.play_agreement build/site/play --json docs/play/agreement.json` needs Node and a page completed by
 tools/play.py. Episodes of the environment under the page's policy give initial states and joint targets; the page's
 code replays them in WebAssembly. Reported are the largest differences of the states after 1 and 20 environment steps,
 over all robots and rollouts, against the environment and against MuJoCo here on the page's MJCF in double precision.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,16 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-import play
 
 from mqe_jax.cli.setup import make_env
 from mqe_jax.policies import load_policy
 
-CHECK = Path(__file__).with_name("play_check.mjs")
+TOOLS = Path(__file__).parents[1] / "tools"
+sys.path.insert(0, str(TOOLS))
+
+import play  # noqa: E402
+
+CHECK = TOOLS / "play_check.mjs"
 STEPS = (1, 20)
 """Environment steps after which states are compared."""
 

@@ -1,6 +1,6 @@
 """Compares two training runs bit for bit: every metric but times, and every array of the policy.
 
-`python tools/compare_runs.py RUN_A RUN_B [--rename OLD=NEW ...]` exits with 1 and names the first difference of each
+`python -m tests.compare_runs RUN_A RUN_B [--rename OLD=NEW ...]` exits with 1 and names the first difference of each
 kind. With `--rename`, columns and arrays of RUN_A are looked up under a new name in RUN_B.
 """
 
