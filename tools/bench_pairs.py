@@ -24,7 +24,7 @@ RATES = ("env_steps_per_s", "bare_env_steps_per_s")
 
 def work(case: str, steps: int, repeats: int) -> None:
     """Process of one checkout and case: compiles, then answers each line on standard input with one timing."""
-    answer = os.fdopen(os.dup(1), "w")
+    output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
 
     import jax
@@ -44,12 +44,7 @@ def work(case: str, steps: int, repeats: int) -> None:
         return (vector.step(state, action), key), None
 
     whole = jax.jit(lambda carry: jax.lax.scan(step, carry, None, steps)[0])
-
-    def advance(data: Any) -> Any:
-        result = env.physics.step(data, data.ctrl)
-        return result[0] if isinstance(result, tuple) else result  # older checkouts return the data alone
-
-    bare_step = jax.vmap(advance)
+    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
     bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
 
     def rate(run: Any, start: Any) -> float:
@@ -64,10 +59,10 @@ def work(case: str, steps: int, repeats: int) -> None:
     data = jax.tree.map(jnp.copy, carry[0].data)
     jax.block_until_ready((whole(carry), bare(data)))
     device = jax.devices()[0].device_kind
-    print(json.dumps({"ready": mqe_jax.__file__}), file=answer, flush=True)
+    print(json.dumps({"ready": mqe_jax.__file__}), file=output, flush=True)
     for _ in sys.stdin:
         figures = {RATES[0]: round(rate(whole, carry), 1), RATES[1]: round(rate(bare, data), 1)}
-        print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=answer, flush=True)
+        print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=output, flush=True)
 
 
 def start(tree: Path, case: str, steps: int, repeats: int) -> subprocess.Popen[str]:
@@ -78,21 +73,15 @@ def start(tree: Path, case: str, steps: int, repeats: int) -> subprocess.Popen[s
     return subprocess.Popen(command, cwd=tree, env=os.environ | {"PYTHONPATH": path}, **pipes)
 
 
-def read(worker: subprocess.Popen[str]) -> dict[str, Any]:
-    """Waits for the next answer of a process; exits where it died."""
-    assert worker.stdout is not None
-    line = worker.stdout.readline()
-    if not line:
-        raise SystemExit(f"{worker.args}: the benchmark process ended")
-    return json.loads(line)
-
-
-def time_once(worker: subprocess.Popen[str]) -> dict[str, Any]:
-    """Returns one timing."""
-    assert worker.stdin is not None
-    worker.stdin.write("\n")
-    worker.stdin.flush()
-    return read(worker)
+def answer(worker: subprocess.Popen[str], ask: bool = True) -> dict[str, Any]:
+    """Waits for the next answer of a process, a timing if it is asked for one; exits where the process died."""
+    assert worker.stdin is not None and worker.stdout is not None
+    if ask:
+        worker.stdin.write("\n")
+        worker.stdin.flush()
+    if line := worker.stdout.readline():
+        return json.loads(line)
+    raise SystemExit(f"{worker.args}: the benchmark process ended")
 
 
 def main() -> int:
@@ -116,11 +105,11 @@ def main() -> int:
         for name, tree in trees.items()
     }
     for worker in workers.values():
-        read(worker)
+        answer(worker, ask=False)
     rows: list[dict[str, Any]] = []
     for pair in range(arguments.pairs):
         for (case, tree), worker in workers.items():
-            rows.append({"case": case, "tree": tree, "pair": pair, **time_once(worker)})
+            rows.append({"case": case, "tree": tree, "pair": pair, **answer(worker)})
     for worker in workers.values():
         worker.kill()
     if arguments.csv is not None:
@@ -134,10 +123,8 @@ def main() -> int:
             values = {name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)] for name in trees}
             first = next(iter(values.values()))
             result[rate] = {name: median(found) for name, found in values.items()}
-            result[f"{rate}/ratio"] = {
-                name: round(median(a / b for a, b in zip(found, first, strict=True)), 4)
-                for name, found in values.items()
-            }
+            ratios = {name: [a / b for a, b in zip(x, first, strict=True)] for name, x in values.items()}
+            result[f"{rate}/ratio"] = {name: round(median(x), 4) for name, x in ratios.items()}
         print(json.dumps(result), flush=True)
     return 0
 

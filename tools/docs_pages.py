@@ -27,7 +27,8 @@ ROOT = Path(__file__).parents[1]
 def on_files(files: Any, config: Any) -> Any:
     """Adds the generated pages."""
     (reference,) = (section["API reference"] for section in config["nav"] if "API reference" in section)
-    for path, content in (pages() | {path: reference_page(path) for path in reference}).items():
+    modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
+    for path, content in (pages() | {path: f"# {x}\n\n::: {x}\n" for path, x in modules.items()}).items():
         files.append(File.generated(config, path, content=content))
     return files
 
@@ -72,17 +73,11 @@ def pages() -> dict[str, str]:
     return made
 
 
-def reference_page(path: str) -> str:
-    """Returns the page reference/MODULE.md of the API reference, to be filled by mkdocstrings."""
-    module = f"mqe_jax.{Path(path).stem}"
-    return f"# {module}\n\n::: {module}\n"
-
-
 def overview(tasks: Mapping[str, Any]) -> str:
     """Returns the page that lists all tasks."""
     kinds: dict[str, list[str]] = {"Cooperative": [], "Competitive": [], "For tests": []}
     for name, task in tasks.items():
-        env = _make(task)
+        env = task(num_envs=1, impl="c")
         kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
         style = '{ style="min-width: 9em" }'
         image = f"[![{task.title}]({_clip(name)}){style}]({name}.md)" if _clip(name) else ""
@@ -97,7 +92,7 @@ def overview(tasks: Mapping[str, Any]) -> str:
 
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
-    env, name = _make(task), task.name
+    env, name = task(num_envs=1, impl="c"), task.name
     body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
     clip = f"The scripted policy (`mqe render {name}`):\n\n![{task.title}]({_clip(name)})"
     media = [clip] if _clip(name) else []
@@ -119,10 +114,6 @@ def task_page(task: Any) -> str:
         "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
     ]
     return "\n\n".join(sections) + "\n"
-
-
-def _make(task: Any) -> Any:
-    return task(num_envs=1, impl="c")
 
 
 def _clip(name: str) -> str | None:

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 
 from mqe_jax import robots, walk_policy
 
@@ -29,11 +30,8 @@ def main() -> None:
 
     def mix(layer: dict[str, jax.Array], *layers: dict[str, jax.Array]) -> dict[str, jax.Array]:
         weights = next(shares)
-        add = zip(weights, layers, strict=True)
-        mixed = {name: (1 - sum(weights)) * values for name, values in layer.items()}
-        for weight, other in add:
-            mixed = {name: values + weight * other[name] for name, values in mixed.items()}
-        return mixed
+        parts = [(1 - sum(weights), layer), *zip(weights, layers, strict=True)]
+        return {name: sum((weight * part[name] for weight, part in parts), jnp.zeros(())) for name in layer}
 
     params = jax.tree.map(mix, first, *others, is_leaf=lambda x: "weight" in x)
     walk_policy.save_params(params, options.out, {"robot": robot.name}, half=True)
