@@ -1,9 +1,12 @@
-"""Scenes agree on MuJoCo's C engine and MJX-JAX: every kind of object on one scene, and in the soak all tasks.
+"""Scenes and tasks agree on MuJoCo's C engine and MJX-JAX, and steps that drop contacts are counted.
 
-`python -m tests.engines` compares all engines.
+One scene has every kind of object; the soak compares all tasks. `python -m tests.engines` compares all engines.
 """
 
 from __future__ import annotations
+
+import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +15,17 @@ import numpy as np
 import pytest
 
 from mqe_jax import engines
-from mqe_jax.envs import TASKS
+from mqe_jax.engines import Engine
+from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
 from mqe_jax.robots import read_robots
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, SpawnArea, Track
 from tests import engines as comparison
+from tests.states import made, moving, placed
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a single step
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
 # Far apart, so that only the first robot touches them; the second one stands at x = 1.
 OBJECTS = {
     "box": Box(),
@@ -133,3 +138,75 @@ def test_mjx_agrees_with_the_c_engine_where_the_solver_converges(task: str) -> N
     figures = comparison.disagreement(task, "jax", comparison.record(task, num_envs=8, solver_iterations=20))
     assert figures["standing/robots_1"] < 1e-4 and figures["play/robots_1"] < 1e-3, figures
     assert figures["standing/robots_20"] < 1e-4 and figures["play/robots_20"] < 1e-3, figures
+
+
+# Compiling a scene for MJX-JAX takes half a minute. Other objects: on one scene, above.
+@pytest.mark.parametrize(
+    "task", [task if task == "go1gate" else pytest.param(task, marks=pytest.mark.soak) for task in TASKS]
+)
+def test_two_engines_step_alike(task: str) -> None:
+    """MuJoCo's C engine and MJX-JAX step from the same states to the same observations and rewards.
+
+    On MJX-JAX 20 further steps of random actions, with auto-reset, break nothing.
+    """
+    envs, starts = on_both_engines(task)
+    actions = jax.random.uniform(jax.random.PRNGKey(4), (21, 2, envs[0].num_agents, 12), minval=-1.0)
+    steps, after = [], []
+    for env, start in zip(envs, starts, strict=True):
+        lowered = jax.jit(VectorEnv(env, 2).step).lower(start, actions[0])
+        steps.append(lowered.compile(compiler_options=QUICK))
+        after.append(steps[-1](start, actions[0]))
+    for name in ("obs", "privileged_obs", "reward"):
+        expected, actual = (np.asarray(getattr(state, name)) for state in after)
+        assert np.all(np.isfinite(actual))
+        np.testing.assert_allclose(actual, expected, rtol=3e-3, atol=5e-3)
+    np.testing.assert_array_equal(after[0].terminated, after[1].terminated)
+    env, step, state = envs[1], steps[1], after[1]
+    for action in actions[1:]:
+        state = step(state, action)
+        assert np.all(np.isfinite(state.obs)) and np.all(np.isfinite(state.reward))
+        assert not np.asarray(state.metrics["diverged"]).any() and not np.asarray(state.metrics["overflow"]).any()
+        assert np.asarray(state.data.qpos)[:, env.index.base_qpos[:, 2]].min() > 0.02
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_two_engines_return_the_same_shapes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task's code accepts the state of both; their physics, which takes seconds to trace, stands still."""
+    monkeypatch.setattr(Engine, "step", lambda self, data, ctrl, **_: (data, jnp.zeros((), bool)))
+    shapes = []
+    for env in (made(task), make(task, impl="jax", control="position", num_envs=2)):
+        batch, action = VectorEnv(env, 2), jnp.zeros((2, env.num_agents, 12))
+        state = jax.eval_shape(lambda key, b=batch, a=action: b.step(b.reset(key), a), jax.random.PRNGKey(0))
+        shapes.append(jax.tree.map(lambda x: x.shape, dataclasses.replace(state, data=None)))
+    assert shapes[0] == shapes[1]
+
+
+def on_both_engines(task: str) -> tuple[list[QuadrupedEnv], list[State]]:
+    """The task on both engines, and the same two initial states on each."""
+    envs = [make(task, impl=impl, control="position", num_envs=2) for impl in ("c", "jax")]
+    state = jax.jit(jax.vmap(envs[0].reset))(jax.random.split(jax.random.PRNGKey(3), 2))
+    parts = [getattr(state.data, name) for name in ("qpos", "qvel", "mocap_pos", "ctrl")]
+    starts = [dataclasses.replace(state, data=jax.vmap(env.physics.init)(*parts)) for env in envs]
+    return envs, starts
+
+
+@pytest.mark.parametrize(
+    ("impl", "limit"),
+    [("jax", {"contacts_per_robot": 2}), pytest.param("warp", {"constraints_per_robot": 8}, marks=pytest.mark.gpu)],
+)
+def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
+    """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
+    env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
+
+    def start_at(key: jax.Array, height: jax.Array, speed: jax.Array) -> Any:
+        position = jnp.array([[1.0, 0.0, 0.0]]).at[0, 2].set(height)
+        return moving(env, placed(env, position, state=env.reset(key)), [0.0, 0.0, speed])
+
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    start = jax.vmap(start_at)(keys, jnp.array([0.3, 1.3, 0.3]), jnp.array([0.0, 0.0, 3.0]))
+    step = jax.jit(jax.vmap(env.step)).lower(start, jnp.zeros((3, 1, 12))).compile(compiler_options=QUICK)
+    after = step(start, jnp.zeros((3, 1, 12)))
+    assert after.metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
+    lifted = after.data.qpos.at[:, env.index.base_qpos[0, 2]].add(1.0)
+    after = step(dataclasses.replace(after, data=after.data.replace(qpos=lifted)), jnp.zeros((3, 1, 12)))
+    assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before

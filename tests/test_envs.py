@@ -1,4 +1,4 @@
-"""The tasks' contract, and Narrow Gate's scene, observation, rewards and endings on states made by hand."""
+"""The tasks' contract, and what all environments share: parameters, actions, observations and recordings."""
 
 from __future__ import annotations
 
@@ -9,22 +9,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax.engines import Engine
-from mqe_jax.envs import TASKS, Moment, QuadrupedEnv, Randomization, State, VectorEnv, make, replay
+from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make, replay
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
-from tests.states import initial, made, moving, placed, robot_state
+from tests.states import initial, made, stepper
 
 Array = jax.Array
-
-
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +34,7 @@ def fresh(gate: QuadrupedEnv) -> State:
 
 @pytest.fixture(scope="module")
 def gate_step(gate: QuadrupedEnv) -> Any:
-    return jax.jit(gate.step)
+    return stepper(gate.name)
 
 
 @pytest.mark.parametrize(("count", "steps"), [(8, 200), pytest.param(32, 1000, marks=pytest.mark.soak)])
@@ -121,120 +116,6 @@ def test_observation_sizes_are_those_of_the_paper(task: str, size: int) -> None:
     assert made(task).observation_size == size
 
 
-# Compiling a scene for MJX-JAX takes half a minute. Other objects: tests/test_engines.py, on one scene.
-@pytest.mark.parametrize(
-    "task", [task if task == "go1gate" else pytest.param(task, marks=pytest.mark.soak) for task in TASKS]
-)
-def test_two_engines_step_alike(task: str) -> None:
-    """MuJoCo's C engine and MJX-JAX step from the same states to the same observations and rewards.
-
-    On MJX-JAX 20 further steps of random actions, with auto-reset, break nothing.
-    """
-    envs, starts = on_both_engines(task)
-    actions = jax.random.uniform(jax.random.PRNGKey(4), (21, 2, envs[0].num_agents, 12), minval=-1.0)
-    steps, after = [], []
-    for env, start in zip(envs, starts, strict=True):
-        lowered = jax.jit(VectorEnv(env, 2).step).lower(start, actions[0])
-        steps.append(lowered.compile(compiler_options=QUICK))
-        after.append(steps[-1](start, actions[0]))
-    for name in ("obs", "privileged_obs", "reward"):
-        expected, actual = (np.asarray(getattr(state, name)) for state in after)
-        assert np.all(np.isfinite(actual))
-        np.testing.assert_allclose(actual, expected, rtol=3e-3, atol=5e-3)
-    np.testing.assert_array_equal(after[0].terminated, after[1].terminated)
-    env, step, state = envs[1], steps[1], after[1]
-    for action in actions[1:]:
-        state = step(state, action)
-        assert np.all(np.isfinite(state.obs)) and np.all(np.isfinite(state.reward))
-        assert not np.asarray(state.metrics["diverged"]).any() and not np.asarray(state.metrics["overflow"]).any()
-        assert np.asarray(state.data.qpos)[:, env.index.base_qpos[:, 2]].min() > 0.02
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_two_engines_return_the_same_shapes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The task's code accepts the state of both; their physics, which takes seconds to trace, stands still."""
-    monkeypatch.setattr(Engine, "step", lambda self, data, ctrl, **_: (data, jnp.zeros((), bool)))
-    shapes = []
-    for env in (made(task), make(task, impl="jax", control="position", num_envs=2)):
-        batch, action = VectorEnv(env, 2), jnp.zeros((2, env.num_agents, 12))
-        state = jax.eval_shape(lambda key, b=batch, a=action: b.step(b.reset(key), a), jax.random.PRNGKey(0))
-        shapes.append(jax.tree.map(lambda x: x.shape, dataclasses.replace(state, data=None)))
-    assert shapes[0] == shapes[1]
-
-
-def on_both_engines(task: str) -> tuple[list[QuadrupedEnv], list[State]]:
-    """The task on both engines, and the same two initial states on each."""
-    envs = [make(task, impl=impl, control="position", num_envs=2) for impl in ("c", "jax")]
-    state = jax.jit(jax.vmap(envs[0].reset))(jax.random.split(jax.random.PRNGKey(3), 2))
-    parts = [getattr(state.data, name) for name in ("qpos", "qvel", "mocap_pos", "ctrl")]
-    starts = [dataclasses.replace(state, data=jax.vmap(env.physics.init)(*parts)) for env in envs]
-    return envs, starts
-
-
-def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv, fresh: State) -> None:
-    state = fresh
-    both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
-    state = dataclasses.replace(state, anchors=jnp.array([[3.4, 0.2]]))
-    obs = gate.observation_layout.pack(gate.observe(state, both))
-    first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
-    second = [0, 1, 4, 5, 0.6, 0, 0, 0.2, 1, 2, 0.3, 0, 0, 0.1, 3.4, 0.2]
-    np.testing.assert_allclose(obs, [first, second], atol=1e-6)
-
-
-def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, fresh: State) -> None:
-    state = fresh
-    from mqe_jax.envs.reward import weigh
-
-    before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
-    # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
-    state = dataclasses.replace(state, anchors=jnp.array([[3.5, 0.0]]))
-    after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
-    terms = gate.rewards(Moment(state, before), Moment(state, after), jnp.array(True))
-    assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
-    assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
-    # hypot(0.3, 0.43) = 0.524 m apart, which is not closer than 0.5 m
-    assert float(terms["crowding"]) == 0
-    reward, logged = weigh(terms, gate.params.rewards, 2)
-    np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
-    close = robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]])
-    near = gate.rewards(Moment(state, after), Moment(state, close), jnp.array(False))
-    assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
-    assert float(near["collision"]) == 0
-    assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
-
-
-def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, fresh: State) -> None:
-    state = dataclasses.replace(fresh, anchors=jnp.array([[3.5, 0.0]]))
-    both, one = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]]), robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
-    fine = jnp.array(False)
-    assert float(gate.outcome(state, both, fine)["success"]) == 1
-    assert float(gate.outcome(state, both, ~fine)["success"]) == 0
-    assert float(gate.outcome(state, one, fine)["success"]) == 0
-    assert float(gate.outcome(state, one, fine)["success/one"]) == 1
-
-
-def test_gate_endings(gate: QuadrupedEnv, gate_step: Any) -> None:
-    """A fall, a trunk too low or too high, a collision and the time limit end an episode; standing does not."""
-    state = jax.jit(gate.reset)(jax.random.PRNGKey(1))
-    still = jnp.zeros((2, 12))
-    stand = placed(gate, [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]], state=state)
-    after = gate_step(stand, still)
-    assert not after.terminated and not after.truncated
-    late = gate_step(dataclasses.replace(stand, step=jnp.int32(gate.max_steps - 1)), still)
-    assert late.truncated and not late.terminated
-    rolled = [[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    assert gate_step(placed(gate, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], rolled, state=state), still).terminated
-    pitched = [[0.0, 1.2, 0.0], [0.0, 0.0, 0.0]]
-    assert not gate_step(placed(gate, [[1.0, -0.75, 0.9], [1.0, 0.75, 0.31]], pitched, state=state), still).terminated
-    assert gate_step(placed(gate, [[1.0, -0.75, 1.6], [1.0, 0.75, 0.31]], state=state), still).terminated
-    fallen = gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]]))
-    assert fallen.tolist() == [True, False]
-    turned = [[0.0, 0.0, np.pi], [0.0, 0.0, 0.0]]  # the head against the back wall
-    at_wall = placed(gate, [[0.33, -0.75, 0.31], [1.0, 0.75, 0.31]], turned, state=state)
-    bumped = gate_step(moving(gate, at_wall, [-1.5, 0.0, 0.0]), still)
-    assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2.0
-
-
 def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     gate: QuadrupedEnv, fresh: State, gate_step: Any
 ) -> None:
@@ -256,36 +137,6 @@ def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) 
     frozen = np.asarray(assisted.frozen_steps)
     assert np.all((frozen > 0).sum(1) <= 1) and (frozen[:, 0] > 0).any() and (frozen[:, 1] > 0).any()
     assert frozen.max() <= gate.params.frozen_time / gate.dt
-
-
-def test_randomisation_reaches_the_physics() -> None:
-    """Each environment's friction, payload, motors, pushes and lag differ, and a heavier trunk sags more."""
-    env = make(
-        "go1plane",
-        impl="c",
-        control="position",
-        spawn_velocity=0.0,
-        spawn_joint_scale=(1.0, 1.0),
-        spawn_height=0.31,
-        randomization={
-            "friction": (0.5, 1.25),
-            "payload": (0.0, 6.0),
-            "center_of_mass": (-0.02, 0.02),
-            "motor_strength": (0.9, 1.1),
-            "action_lag": 2,
-            "push": 0.3,
-            "observation_noise": 0.01,
-        },
-    )
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
-    params = states.randomized
-    assert np.ptp(np.asarray(params.friction)) > 0.3 and set(np.asarray(params.action_lag).tolist()) == {0, 1, 2}
-    step = jax.jit(jax.vmap(env.step))
-    for _ in range(60):
-        states = step(states, jnp.zeros((16, 2, 12)))
-    height = np.asarray(jax.vmap(env.read)(states.data).position_w)[..., 2].ravel()
-    payload = np.asarray(params.payload).ravel()
-    assert np.corrcoef(height, payload)[0, 1] < -0.5
 
 
 @pytest.mark.parametrize(
@@ -323,6 +174,16 @@ def test_bad_parameters_are_named(call: Any, message: str) -> None:
         call()
 
 
+def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
+    class Fast(TASKS["go1plane"]):
+        def scene(self) -> Any:
+            return dataclasses.replace(super().scene(), timestep=0.004)
+
+    with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
+        Fast(impl="c")
+    assert Fast(impl="c", control="position").dt == pytest.approx(0.016)
+
+
 def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
     state = fresh
     with pytest.raises(ValueError, match=r"action: shape \(2, 3\); expected \(2, 12\)"):
@@ -343,6 +204,14 @@ def test_overrides_reach_every_level() -> None:
     env = make("go1gate", impl="c", control="torque", gate_width=0.8, **{"rewards.collision": -5})
     assert env.params.gate_width == 0.8 and env.params.rewards.collision == -5.0
     assert env.action_size == 12 and float(env.compiled.model.actuator_gainprm[0, 0]) == 1.0
+
+
+def test_parameters_are_made_by_keyword() -> None:
+    assert GateParams(gate_width=0.7).gate_width == 0.7
+    with pytest.raises(InputError, match="gate_width: 0 is not allowed"):
+        GateParams(gate_width=0)
+    env = make("go1gate", impl="c", control="position", gate_width=np.float32(0.5), solver_iterations=np.int64(2))
+    assert env.params.gate_width == 0.5 and env.params.solver_iterations == 2
 
 
 def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
@@ -368,16 +237,6 @@ def test_a_captured_constant_action_is_stepped_in_compiled_code(gate: QuadrupedE
     assert int(after(state).step) == 2
 
 
-def test_observation_noise_spares_the_one_hots() -> None:
-    env = make("go1gate", impl="c", control="position", randomization={"observation_noise": 0.1})
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 8))
-    blocks = env.observation_layout.split(state.obs)
-    np.testing.assert_array_equal(blocks["one_hot"], np.tile(np.eye(2), (8, 1, 1)))
-    exact = jax.vmap(lambda state: env.observe(state, env.read(state.data))["gate"])(state)
-    error = np.asarray(blocks["gate"] - exact)
-    assert 0.05 < error.std() < 0.2
-
-
 def test_every_one_hot_is_marked_as_categorical() -> None:
     for task in TASKS:
         layout = made(task).observation_layout
@@ -396,104 +255,6 @@ def test_a_layout_slices_packs_and_splits() -> None:
     np.testing.assert_array_equal(layout.continuous, [0, 1, 1, 1, 1, 1])
     with pytest.raises(KeyError, match="unknown name 'plaice'; allowed: id, place, speed"):
         layout.slice("plaice")
-
-
-# -- privileged observation and randomised physics --------------------------------------------------------------------
-
-
-def test_the_privileged_observation_contains_the_randomised_physics_and_gait_phase() -> None:
-    env = make(
-        "go1gate",
-        impl="c",
-        num_envs=1,
-        privileged_contact_forces=True,
-        randomization=Randomization(
-            friction=(0.5, 1.25),
-            payload=(0.0, 2.0),
-            center_of_mass=(-0.02, 0.02),
-            motor_strength=(0.9, 1.1),
-            action_lag=3,
-        ),
-    )
-    state = initial(env)
-    step = jax.jit(env.step)
-    for _ in range(60):  # 1.2 s: the robots have landed, and the gait of 3 Hz is at 0.6 of a cycle
-        state = step(state, jnp.zeros((2, 3)))
-    blocks = env.privileged_layout.split(state.privileged_obs)
-    assert state.privileged_obs.shape == (env.privileged_observation_size,)
-    for name in ("friction", "payload", "motor_strength"):
-        np.testing.assert_allclose(blocks[name], getattr(state.randomized, name), rtol=1e-6)
-    np.testing.assert_allclose(blocks["center_of_mass"], np.ravel(state.randomized.center_of_mass), rtol=1e-6)
-    assert float(blocks["action_lag"][0]) == int(state.randomized.action_lag)
-    angle = 2 * np.pi * 0.6
-    np.testing.assert_allclose(blocks["gait_phase"], [np.sin(angle), np.cos(angle)] * 2, atol=1e-4)
-    force = np.asarray(blocks["contact_force"]).reshape(2, 5)
-    assert np.all(force[:, 0] == 0) and np.all(force[:, 1:].sum(1) > 20)  # N; a Go1 weighs 111 N
-    np.testing.assert_allclose(blocks["robot1/position"], env.read(state.data).position_w[1], rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)]
-)
-def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
-    """Two environments in free fall under motor torques, with different payloads on trunks of scaled inertia."""
-    env = make("go1plane", impl=impl, control="position", num_envs=2, randomization={"payload": (0.0, 6.0)})
-    model, trunk = env.compiled.model, env.index.trunk_body
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
-    start = state.data.replace(qpos=state.data.qpos.at[:, env.index.base_qpos[:, 2]].set(2.0))
-    fields = jax.vmap(env.randomizer.fields)(state.randomized)
-
-    def fall(data: Any, fields: dict[str, Array]) -> Array:
-        return env.physics.step(data, data.ctrl, fields=fields, num_substeps=20)[0].qvel
-
-    after = np.asarray(jax.jit(jax.vmap(fall))(start, fields))
-    for number in (0, 1):
-        payload = np.asarray(state.randomized.payload[number])
-        compiled = model.__copy__()
-        compiled.body_mass[trunk] += payload
-        compiled.body_inertia[trunk] *= (1 + payload / model.body_mass[trunk])[:, None]
-        data = mujoco.MjData(compiled)
-        mujoco.mj_setConst(compiled, data)
-        qvel = []
-        for used in (compiled, model):
-            mujoco.mj_resetData(used, data)
-            data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos[number], start.qvel[number], start.ctrl[number]
-            mujoco.mj_step(used, data, 20)
-            qvel.append(data.qvel.copy())
-        np.testing.assert_allclose(after[number], qvel[0], atol=1e-3)
-        assert np.abs(after[number] - qvel[1]).max() > 0.01
-
-
-@pytest.mark.parametrize(
-    ("impl", "limit"),
-    [("jax", {"contacts_per_robot": 2}), pytest.param("warp", {"constraints_per_robot": 8}, marks=pytest.mark.gpu)],
-)
-def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
-    """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
-    env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
-
-    def start_at(key: Array, height: Array, speed: Array) -> Any:
-        position = jnp.array([[1.0, 0.0, 0.0]]).at[0, 2].set(height)
-        return moving(env, placed(env, position, state=env.reset(key)), [0.0, 0.0, speed])
-
-    keys = jax.random.split(jax.random.PRNGKey(0), 3)
-    start = jax.vmap(start_at)(keys, jnp.array([0.3, 1.3, 0.3]), jnp.array([0.0, 0.0, 3.0]))
-    step = jax.jit(jax.vmap(env.step)).lower(start, jnp.zeros((3, 1, 12))).compile(compiler_options=QUICK)
-    after = step(start, jnp.zeros((3, 1, 12)))
-    assert after.metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
-    lifted = after.data.qpos.at[:, env.index.base_qpos[0, 2]].add(1.0)
-    after = step(dataclasses.replace(after, data=after.data.replace(qpos=lifted)), jnp.zeros((3, 1, 12)))
-    assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
-
-
-def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
-    class Fast(TASKS["go1plane"]):
-        def scene(self) -> Any:
-            return dataclasses.replace(super().scene(), timestep=0.004)
-
-    with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
-        Fast(impl="c")
-    assert Fast(impl="c", control="position").dt == pytest.approx(0.016)
 
 
 # -- recordings -------------------------------------------------------------------------------------------------------
@@ -537,11 +298,3 @@ def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: An
     recording = replay.load_recording(tmp_path / "gate.npz")
     with pytest.raises(InputError, match=r"recording of go1gate: anchors has shape \(1, 2\); expected shape \(0, 2\)"):
         replay.replay(recording, made("go1seesaw"))
-
-
-def test_parameters_are_made_by_keyword() -> None:
-    assert GateParams(gate_width=0.7).gate_width == 0.7
-    with pytest.raises(InputError, match="gate_width: 0 is not allowed"):
-        GateParams(gate_width=0)
-    env = make("go1gate", impl="c", control="position", gate_width=np.float32(0.5), solver_iterations=np.int64(2))
-    assert env.params.gate_width == 0.5 and env.params.solver_iterations == 2
