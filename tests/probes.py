@@ -1,4 +1,4 @@
-"""Physics-free environments with known solutions, for the learner's tests."""
+"""For the learner's tests: physics-free environments with known solutions, and a comparison of trees."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.train.types import Trace
 
@@ -195,3 +196,12 @@ class Traces:
 
     def add(self, trace: Trace) -> None:
         self.all.append(trace)
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Compares two trees: the same structure, equal leaves."""
+    one_leaves, one_structure = jax.tree.flatten(one)
+    other_leaves, other_structure = jax.tree.flatten(other)
+    assert one_structure == other_structure
+    for a, b in zip(one_leaves, other_leaves, strict=True):
+        np.testing.assert_array_equal(a, b)

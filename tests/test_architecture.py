@@ -46,6 +46,22 @@ def test_a_wrong_import_is_named(tmp_path: Path) -> None:
     assert wrong_imports(tmp_path, ["train", "envs"]) == ["train/late.py: train may not import envs"]
 
 
+def test_the_learner_imports_no_task_and_no_learning_library() -> None:
+    forbidden = {"flax", "optax", "brax", "torch"}
+    for path in (PACKAGE / "train").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            for name in names:
+                assert name.split(".")[0] not in forbidden, path
+                assert not name.startswith(
+                    ("mqe_jax.envs", "mqe_jax.adapters", "mqe_jax.cli", "mqe_jax.cli.commands")
+                ), path
+
+
 def test_fields_are_documented_by_the_docstring_under_them() -> None:
     """The other style, a section of the class's docstring, is not used."""
     files = [*PACKAGE.rglob("*.py"), *(ROOT / "examples").glob("*.py")]

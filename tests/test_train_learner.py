@@ -1,4 +1,4 @@
-"""The learner on probe environments with known solutions."""
+"""The learner and evaluations on probe environments with known solutions."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from probes import Probe
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
@@ -234,3 +235,37 @@ def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered
     assert all(np.isfinite(float(value)) for value in metrics.values())
     with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
         make_learner(Foreign(), small(num_envs=4))
+
+
+def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
+    """Short episodes (2 steps, successes) are not over-represented against long ones (30 steps)."""
+    env = Probe(
+        probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=30, teams=((1,), (0,))
+    )
+
+    def act(obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return jnp.zeros((4, 2, 1)), memory + 1
+
+    result = evaluate(env, act, 10, jax.random.PRNGKey(0), memory=jnp.zeros((4,)), block=7)
+    # 10 episodes over 4 environments: 3, 3, 2, 2
+    assert result.episodes == 10
+    assert result.success_rate == pytest.approx(5 / 10)
+    assert result.episode_length == pytest.approx((5 * 2 + 5 * 30) / 10)
+    assert result.episode_return == pytest.approx((5 * 2 + 5 * 30) / 10)  # 1 a step for the first team
+    assert result.average_step_reward == pytest.approx(1.0)
+    assert result.terms == {"pay": pytest.approx(1.0)}
+    assert result.to_dict()["diverged"] == 0 and result.overflow == 5 * 30
+    with pytest.raises(ValueError, match="episodes: 0"):
+        evaluate(env, act, 0, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+
+
+def test_memory_starts_anew_with_every_counted_episode() -> None:
+    def pay_memory(hidden: jax.Array, action: jax.Array) -> jax.Array:
+        return action[:, 0, 0]
+
+    def act(obs: jax.Array, memory: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.broadcast_to(memory[:, None, None], (4, 2, 1)), memory + 1
+
+    env = Probe(probes.show_hidden, pay_memory, num_envs=4, max_episode_steps=4)
+    result = evaluate(env, act, 8, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+    assert result.average_step_reward == pytest.approx((0 + 1 + 2 + 3) / 4)
