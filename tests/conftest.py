@@ -1,8 +1,9 @@
-"""Settings shared by all tests: the CPU, a compilation cache, and the skip reasons of GPU and soak tests."""
+"""Shared by all tests: the CPU, a compilation cache, skip reasons of GPU and soak tests, and a fake task for `mqe`."""
 
 import os
 import subprocess
 from pathlib import Path
+from typing import Any
 
 # Before the first import of jax; existing environment variables take precedence.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -55,3 +56,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.get_closest_marker("soak"):
             item.add_marker(pytest.mark.skip(reason="long: MQE_SOAK=1 pytest, or pytest -m soak, runs it"))
+
+
+@pytest.fixture
+def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The task `fake` in addition to the real ones, for `mqe`, and an empty working folder."""
+    import fake_program
+
+    from mqe_jax.cli import setup
+
+    monkeypatch.chdir(tmp_path)
+    real = setup.make_env
+
+    def make_env(task: str, *arguments: Any, **named: Any) -> Any:
+        return (fake_program.make_env if task == "fake" else real)(task, *arguments, **named)
+
+    monkeypatch.setattr(setup, "make_env", make_env)

@@ -14,6 +14,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
+"""Flags of a training that ends within seconds."""
+
 LEG = "".join(f'<body pos="0 0 -.01"><joint name="{{robot}}j{i}"/><geom size=".02"/>' for i in range(12))
 ROBOT = (
     '<body name="{robot}" pos="1 {y} .3"><freejoint/><geom type="box" size=".2 .1 .06" rgba="{rgba}"/>'

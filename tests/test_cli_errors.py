@@ -1,0 +1,150 @@
+"""The command line's exit codes, and its messages for invalid input and failures."""
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+from fake_env import SMALL
+
+from mqe_jax import cli
+from mqe_jax.cli import bench, commands, setup
+from mqe_jax.cli.train import runner
+from mqe_jax.errors import NonFiniteError
+from mqe_jax.train.nn import mlp_init
+
+pytestmark = pytest.mark.usefixtures("fake_tasks")
+
+BAD = {
+    "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
+    "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
+    "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
+    "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
+    "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
+    "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
+    "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
+    "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),
+    "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
+    "policy": (["eval", "fake", "--policy", "randm"], ["policy: unknown 'randm'", "random", "a run folder"]),
+    "policy's file": (["eval", "fake", "--policy", "runs/none"], ["runs/none", "no such file"]),
+    "opponent": (["eval", "go1tug", "--opponent", "randm"], ["opponent: unknown 'randm'", "random", "a run folder"]),
+    "opponent of no match": (["eval", "fake", "--opponent", "idle"], ["opponent: fake is not a competitive task"]),
+    "no scripted policy": (["eval", "fake", "--policy", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
+    "joints of scripted": (["eval", "go1gate", "--control", "position"], ["'position'", "--policy random or idle"]),
+    "commands of scripted": (
+        ["eval", "go1gate", "--policy", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
+        ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],
+    ),
+    "robots": (["eval", "go1tug", "--set", "num_agents=3"], ["num_agents: 3", "go1tug requires 2 robots"]),
+    "run": (["eval", "runs/none"], ["runs/none"]),
+    "no run": (["eval", "."], ["config.yaml"]),
+    "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
+    "config file": (["train", "fake", "--config", "none.yaml"], ["none.yaml"]),
+    "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),
+    "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
+    "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
+    "dump folder": (
+        ["eval", "go1plane", "--control", "position", "--episodes", "2", "--dump-diverged", "/proc/none"],
+        ["dump_diverged: /proc/none cannot be written"],
+    ),
+    "recording": (["replay", "none.npz"], ["none.npz"]),
+    "weights": (["walk", "eval", "--weights", "none.safetensors"], ["none.safetensors"]),
+    "checkpoint": (["walk", "convert", "a.jit", "b.jit", "-o", "w.safetensors"], ["a.jit"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    arguments, said = BAD[case]
+    assert cli.main(arguments) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith("mqe: ") and err.count("\n") == 1, err
+    assert all(word in err for word in said), err
+    assert list(tmp_path.iterdir()) == []  # nothing half-written
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["bench", "--nope", "3"], ["--nope"]),
+        (["bench", "go1gate", "--num-envs", "0"], ["num_envs: 0", "greater than 0"]),
+        (["eval", "fake", "--episodes", "0"], ["episodes: 0", "greater than 0"]),
+        (["eval", "fake", "--seed", "-1"], ["seed: -1 is not allowed", "greater than or equal to 0"]),
+        (["render", "fake", "-o", "a.png", "--width", "5000"], ["width: 5000", "less than or equal to 4096"]),
+        (["train", "fake", "--num-seeds", "0"], ["num_seeds: 0", "greater than 0"]),
+        (["view", "go1gate", "--num-envs", "17"], ["num_envs: 17", "less than or equal to 16"]),
+        (["view", "go1gate", "--port", "99999"], ["port: 99999", "less than 65536"]),
+        (["eval", "fake", "--episodes", "many"], ["episodes", "many"]),
+        (["train", "fake", "--ppo.gamma", "2"], ["ppo: gamma: 2.0", "less than or equal to 1"]),
+        (["train", "fake", "--ppo.clip", "much"], ["ppo.clip", "'much'"]),
+        (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network: hidden_sizes.1: 0"]),
+        (["train", "fake", "--network.heads", "2"], ["--network.heads"]),
+        (["walk", "train", "--ppo.clp", "1"], ["--ppo.clp", "Perhaps you meant: --ppo.clip"]),
+        (["train", "fake", "--seed", "99999999999999999999"], ["seed: 99999999999999999999", "4294967296"]),
+    ],
+    ids=str,
+)
+def test_wrong_flags_are_named_by_tyro(
+    arguments: list[str], said: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(arguments) == 2
+    out, err = capfd.readouterr()
+    shown = " ".join(err.replace("│", " ").split())
+    assert out == "" and all(word in shown for word in said), shown
+
+
+def test_a_table_that_cannot_be_appended_to_is_refused_before_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bench, "bench", lambda *arguments, **settings: pytest.fail("measured"))
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    for path, words in (("/proc/none/x.csv", "cannot be written"), ("other.csv", "has other columns"), (".", "read")):
+        assert cli.main(["bench", "fake", "--csv", path]) == 2
+        err = capfd.readouterr().err
+        assert err.startswith("mqe: csv: ") and words in err
+
+
+def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+    def stop(*arguments: Any, **named: Any) -> None:
+        raise NonFiniteError("run: update 3 made loss/value NaN or infinite")
+
+    monkeypatch.setattr(runner, "train_seeds", stop)
+    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 1
+    assert capfd.readouterr().err.splitlines()[-1] == "mqe: run: update 3 made loss/value NaN or infinite"
+
+
+def test_a_file_that_cannot_be_written_ends_with_2(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+    def stop(*arguments: Any, **named: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/metrics.csv")
+
+    monkeypatch.setattr(runner, "train_seeds", stop)
+    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 2
+    assert capfd.readouterr().err == "mqe: run/metrics.csv: No space left on device\n"
+
+
+def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+    def stop(arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands.Tasks, "run", stop)
+    assert cli.main(["tasks"]) == 130
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("defect", "error"),
+    [
+        (lambda: mlp_init(jax.random.PRNGKey(0), [2]), ValueError),
+        (lambda: {}["x"], KeyError),
+        (lambda: 1 // 0, Exception),
+    ],
+    ids=["our own", "KeyError", "ZeroDivisionError"],
+)
+def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also a ValueError that code of the package raises, unless it is an InputError."""
+    monkeypatch.setattr(setup, "make_env", lambda *arguments: defect())
+    with pytest.raises(error):
+        cli.main(["bench", "fake"])
