@@ -1,4 +1,4 @@
-"""Football: field, mirrored observations, rewards and endings on states made by hand, and the defender's law."""
+"""Football: field, mirrored observations, rewards and endings on states made by hand, and the defender's play."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import QuadrupedEnv, State, make
-from mqe_jax.npc import defend
 from mqe_jax.planners import scripted_policy
 from tests.states import initial, made, moment, observation, placed, stepper, still, terms_of, with_object
 
@@ -278,39 +277,6 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
 
 
 # -- the defender -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("position", "yaw", "ball", "move"),
-    [
-        # Where it should be: 3 m before the goal, 0.6 of the way to a ball 5 m away; it faces away from the goal.
-        ((9.0, 0.0), np.pi, (7.0, 0.0), (0.0, 0.0, 0.0)),
-        # 0.3 m too near the goal: forward, which is away from it. 2 m too near: as fast as it may.
-        ((9.3, 0.0), np.pi, (7.0, 0.0), (0.3, 0.0, 0.0)),
-        ((11.0, 0.0), np.pi, (7.0, 0.0), (0.5, 0.0, 0.0)),
-        # The ball is behind it, 1 m from the goal: back to 0.6 m.
-        ((9.0, 0.0), np.pi, (11.0, 0.0), (-0.5, 0.0, 0.0)),
-        # Facing +x it must turn, the short way and at full rate.
-        ((9.0, 0.0), 0.1, (7.0, 0.0), (0.0, 0.0, 1.0)),
-        ((9.0, 0.0), -0.1, (7.0, 0.0), (0.0, 0.0, -1.0)),
-        # 0.15 rad off: half of full rate, also across the cut at pi.
-        ((9.0, 0.0), np.pi - 0.15, (7.0, 0.0), (0.0, 0.0, 0.5)),
-        ((9.0, 0.0), -np.pi + 0.15, (7.0, 0.0), (0.0, 0.0, -0.5)),
-    ],
-)
-def test_the_law_of_the_defender_by_hand(position: Any, yaw: float, ball: Any, move: Any) -> None:
-    law = defend(jnp.array(position), jnp.array(yaw), jnp.array(ball), jnp.array([12.0, 0.0]))
-    np.testing.assert_allclose(law, move, atol=1e-5)
-
-
-def test_the_defender_steps_sideways_towards_the_line() -> None:
-    """Ball straight ahead, the defender 0.2 m to the right of the line in its own frame (y +0.2): moves left, to -y."""
-    own = np.hypot(3.0, 0.2)
-    facing = np.arctan2(0.2, -3.0)
-    law = defend(jnp.array([9.0, 0.2]), jnp.array(facing), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
-    np.testing.assert_allclose(law, [3.0 - own, 0.2, 0.0], atol=1e-5)
-    far = defend(jnp.array([9.0, -1.0]), jnp.array(np.pi), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
-    assert float(far[1]) == pytest.approx(-0.5)
 
 
 def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, attack_step: Any, fresh: Any) -> None:

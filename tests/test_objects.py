@@ -1,4 +1,4 @@
-"""Objects and NPCs: motion of boxes, balls and sheep, and the tasks with them."""
+"""Objects and NPCs: motion of boxes, balls, sheep and the defender, and the tasks with objects and sheep."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax import objects
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
-from mqe_jax.npc import flock
+from mqe_jax.npc import defend, flock
 from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import scripted_policy
 from mqe_jax.scene import Scene, compile_scene
@@ -113,6 +113,39 @@ def test_a_sheep_by_itself_wanders() -> None:
     track = [run_flock([[0.0, 0.0]], [[-20.0, 0.0]], 750, restlessness, seed)[:, 0] for seed in range(8)]
     ways = [np.linalg.norm(way[-1] - way[0]) for way in track]
     assert 0.03 < np.mean(ways) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "ball", "move"),
+    [
+        # Where it should be: 3 m before the goal, 0.6 of the way to a ball 5 m away; it faces away from the goal.
+        ((9.0, 0.0), np.pi, (7.0, 0.0), (0.0, 0.0, 0.0)),
+        # 0.3 m too near the goal: forward, which is away from it. 2 m too near: as fast as it may.
+        ((9.3, 0.0), np.pi, (7.0, 0.0), (0.3, 0.0, 0.0)),
+        ((11.0, 0.0), np.pi, (7.0, 0.0), (0.5, 0.0, 0.0)),
+        # The ball is behind it, 1 m from the goal: back to 0.6 m.
+        ((9.0, 0.0), np.pi, (11.0, 0.0), (-0.5, 0.0, 0.0)),
+        # Facing +x it must turn, the short way and at full rate.
+        ((9.0, 0.0), 0.1, (7.0, 0.0), (0.0, 0.0, 1.0)),
+        ((9.0, 0.0), -0.1, (7.0, 0.0), (0.0, 0.0, -1.0)),
+        # 0.15 rad off: half of full rate, also across the cut at pi.
+        ((9.0, 0.0), np.pi - 0.15, (7.0, 0.0), (0.0, 0.0, 0.5)),
+        ((9.0, 0.0), -np.pi + 0.15, (7.0, 0.0), (0.0, 0.0, -0.5)),
+    ],
+)
+def test_the_law_of_the_defender_by_hand(position: Any, yaw: float, ball: Any, move: Any) -> None:
+    law = defend(jnp.array(position), jnp.array(yaw), jnp.array(ball), jnp.array([12.0, 0.0]))
+    np.testing.assert_allclose(law, move, atol=1e-5)
+
+
+def test_the_defender_steps_sideways_towards_the_line() -> None:
+    """Ball straight ahead, the defender 0.2 m to the right of the line in its own frame (y +0.2): moves left, to -y."""
+    own = np.hypot(3.0, 0.2)
+    facing = np.arctan2(0.2, -3.0)
+    law = defend(jnp.array([9.0, 0.2]), jnp.array(facing), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
+    np.testing.assert_allclose(law, [3.0 - own, 0.2, 0.0], atol=1e-5)
+    far = defend(jnp.array([9.0, -1.0]), jnp.array(np.pi), jnp.array([7.0, 0.0]), jnp.array([12.0, 0.0]))
+    assert float(far[1]) == pytest.approx(-0.5)
 
 
 def test_sheep_observation(herd: Any) -> None:
