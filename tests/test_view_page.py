@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import open_page
-from viewer import Client, Panel, free_port
-from viewer_fuzz import bad_frames
+from viewer import Client, Panel, bad_frames, free_port
 
 STARTUP = 240.0  # s, on a loaded machine without compiled programs
 
