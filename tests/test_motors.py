@@ -1,4 +1,4 @@
-"""Motors: torque-speed curves, joint speeds and joint limits under hard driving, the same on every engine."""
+"""Joint targets of the mode `position`; motors: torque-speed curves, joint speeds and limits, on every engine."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from mqe_jax import make, robots
 from mqe_jax.engines import c
 from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.motors import BAND, CLAMP, Motors, leg_response
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -21,6 +23,21 @@ from tests.driving import MODES, drive
 from tests.test_engines import QUICK
 
 SOAK = pytest.mark.soak
+
+
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_joint_targets_are_within_the_scaled_range_of_the_default_angles(scale: float) -> None:
+    env = make("go1gate", impl="c", control="position", position_scale=scale)
+    controller = env.controller
+    still = Proprioception(jnp.zeros((2, 3)), jnp.zeros((2, 12)), jnp.zeros((2, 12)))
+    targets, _ = controller.targets(controller.reset(), jnp.ones((2, 12)), still)
+    expected = GO1.default_joints + scale * np.tile([0.125, 0.25, 0.25], 4)
+    np.testing.assert_allclose(targets, np.tile(expected, (2, 1)), rtol=1e-6)
+
+
+def test_a_range_of_zero_is_refused() -> None:
+    with pytest.raises(InputError, match="position_scale"):
+        make("go1gate", impl="c", control="position", position_scale=0.0)
 
 
 def motors_of(name: str) -> Motors:
