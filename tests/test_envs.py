@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make, replay
+from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make, register_task, replay
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
@@ -212,6 +212,13 @@ def test_parameters_are_made_by_keyword() -> None:
         GateParams(gate_width=0)
     env = make("go1gate", impl="c", control="position", gate_width=np.float32(0.5), solver_iterations=np.int64(2))
     assert env.params.gate_width == 0.5 and env.params.solver_iterations == 2
+
+
+def test_a_taken_or_missing_id_is_refused() -> None:
+    with pytest.raises(ValueError, match="the id 'go1gate' is already registered by Go1Gate"):
+        register_task(type("Other", (TASKS["go1plane"],), {"name": "go1gate"}))
+    with pytest.raises(ValueError, match="its `name` is empty"):
+        register_task(type("Nameless", (TASKS["go1plane"],), {"name": ""}))
 
 
 def test_making_and_stepping_imports_no_foreign_learning_library() -> None:

@@ -1,4 +1,4 @@
-"""Scripted policies on observations made by hand; actions in the `command` mode, forward, left, turn."""
+"""Scripted policies: the registry of them, and actions in the `command` mode on observations made by hand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.envs import PLANNERS, TASKS
+from mqe_jax.errors import InputError
+from mqe_jax.planners import planner_of
 from mqe_jax.planners.cooperative import plan_seesaw
 from mqe_jax.planners.matches import plan_tug
 from mqe_jax.walk_policy import COMMANDS
@@ -46,3 +49,12 @@ def test_the_climber_enters_the_plank_centred() -> None:
 def test_the_climber_leaves_the_low_end_of_the_plank_at_its_edge_and_goes_on_higher_up() -> None:
     assert climb(3.8, 0.4)[0, 0] < 0
     assert climb(5.0, 0.4)[0, 0] == 1
+
+
+def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> None:
+    """All tasks but the plane have one, of a module of their own package."""
+    assert set(TASKS) - set(PLANNERS) == {"go1plane"}
+    for task in PLANNERS:
+        assert planner_of(task).__module__.startswith("mqe_jax.planners.")
+    with pytest.raises(InputError, match=r"go1plane has no scripted policy; allowed for: go1gate, "):
+        planner_of("go1plane")
