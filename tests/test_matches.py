@@ -251,6 +251,16 @@ def test_wrestling_rewards_result_and_end() -> None:
     assert result(env, ring(env, inside, [3.1, 0.6, 0.15])) == (1, 0)
 
 
+def test_wrestling_has_terms_for_pushing_and_approach_that_only_training_weighs() -> None:
+    env = made("go1wrestling")
+    before, after = ring(env, [3.1, -0.5, 0.7], [3.1, 0.6, 0.7]), ring(env, [3.1, 0.1, 0.7], [3.1, 1.0, 0.7])
+    terms, reward = terms_of(env, before, after)
+    np.testing.assert_allclose(reward, [0, 0])
+    # The first robot came 0.4 m nearer to the centre and pushed the other 0.4 m away from it.
+    np.testing.assert_allclose(terms["push"], [0.4, -0.4], rtol=1e-4)
+    assert float(terms["approach"]) == pytest.approx(1.1 - 0.9, rel=1e-4)
+
+
 def test_the_ring_carries_robots_and_its_platform_is_as_large_as_listed() -> None:
     env = made("go1wrestling")
     geom = env.compiled.model.geom(env.objects["platform"].geom)

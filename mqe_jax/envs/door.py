@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +15,6 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
-
-if TYPE_CHECKING:
-    pass
 
 _WALL_LENGTH = 1.0  # m along x, of the block with the door at its centre
 

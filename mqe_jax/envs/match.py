@@ -26,7 +26,7 @@ from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 class Match(QuadrupedEnv[S, P]):
     """Base of the competitive tasks.
 
-    Reward: zero-sum; each term is the team's own minus the opponents'.
+    Reward: zero-sum; each term is the team's own minus the opponents', but for those whose weight is 0 by default.
     Result: an `eliminated` team (by default one with a fallen robot) loses unless both are; otherwise the `leading`
     team wins, and it is a draw if both or neither lead.
     Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended in this step; they are

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 
@@ -17,9 +15,6 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import Positive, fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
-
-if TYPE_CHECKING:
-    pass
 
 
 @record

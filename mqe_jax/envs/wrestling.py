@@ -20,10 +20,14 @@ from mqe_jax.terrain import Plane, SpawnArea, Track
 
 @record
 class WrestlingRewards:
-    """Weights of the reward terms; each is a robot's own term minus the opponent's."""
+    """Weights of the reward terms; `win` is zero-sum, the others are for training alone."""
 
     win: float = 10.0
-    """When the opponent falls or leaves the ring, which ends the episode."""
+    """When the opponent falls or leaves the ring, which ends the episode; minus the same of the opponent."""
+    push: float = 0.0
+    """Per m of increase of the opponent's distance from the ring's centre."""
+    approach: float = 0.0
+    """Per m of decrease of the distance between the robots."""
 
 
 @record
@@ -59,7 +63,7 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
 
     - Scene: a platform with a ring of 3.4 m diameter marked on it; the robots face each other, 2 m apart.
     - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
-    - Reward: see `WrestlingRewards`; zero-sum.
+    - Reward: see `WrestlingRewards`.
     - End: a robot has fallen or left the ring, or 15 s. Win: only the opponent has.
 
     Source: paper, section III.
@@ -86,14 +90,20 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        return {"win": self.zero_sum(self.wins(after.state, after.robots))}
+        outward = self.distance(after.robots) - self.distance(before.robots)
+        apart = [jnp.linalg.norm(now.robots.position_w[0] - now.robots.position_w[1]) for now in (before, after)]
+        wins = self.zero_sum(self.wins(after.state, after.robots))
+        return {"win": wins, "push": outward[::-1], "approach": apart[0] - apart[1]}
+
+    def distance(self, robot_state: RobotState) -> jax.Array:
+        """Returns each robot's horizontal distance from the ring's centre (2,), m."""
+        return jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
 
     def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots have fallen or left the ring (2,) bool."""
         params = self.params
-        apart = jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
         below = robot_state.position_w[:, 2] < params.platform.center[2] - params.ring_depth
-        return self.fallen(robot_state) | (apart > params.ring_radius) | below
+        return self.fallen(robot_state) | (self.distance(robot_state) > params.ring_radius) | below
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends when a robot has fallen or left the ring."""

@@ -120,7 +120,7 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
     width, length = robot.walk.stance_width, robot.walk.stance_length
     rest = [
         vary(-0.12, 0.06, default[3]),
-        vary(2.0, 4.2, default[4]),
+        vary(1.8, 4.2, default[4]),
         *gait,
         default[8],
         vary(0.03, 0.16, default[9]),

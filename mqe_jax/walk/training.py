@@ -19,7 +19,7 @@ from mqe_jax.walk.task import WalkTask
 WALK = TrainConfig(
     task="walk",
     num_envs=8192,
-    total_steps=280_000_000,
+    total_steps=240_000_000,
     rollout_steps=24,
     stagger_episodes=True,
     seed=1,
