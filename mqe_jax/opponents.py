@@ -18,6 +18,9 @@ from mqe_jax.settings import fail
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.types import Memory, PyTree
 
+OUTCOMES = ("win", "draw", "loss")
+"""Outcomes of an episode for team 0, in the order of `Opponent.outcomes`."""
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,8 @@ class Opponent:
     """Environments whose episode is still against the opponent before the change (B,) bool."""
     memory: Memory
     """Recurrent state, leading axis B."""
+    outcomes: jax.Array
+    """Episodes that team 0 won, drew and lost against it (3,) int32."""
 
 
 @jax.tree_util.register_dataclass
@@ -96,8 +101,9 @@ class Versus(OneTeam):
     opponents: tuple[Policy, ...]
     """Opponent of each block at the start."""
 
-    def __init__(self, matches: VectorEnv, opponents: Sequence[Policy]) -> None:
+    def __init__(self, matches: VectorEnv, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
         super().__init__(matches, matches.num_envs)
+        self.draw_reward = draw_reward
         if not opponents or self.num_envs % len(opponents):
             fail("opponents", len(opponents), f"a number that divides the number of environments, {self.num_envs}")
         for policy in opponents:
@@ -117,7 +123,8 @@ class Versus(OneTeam):
         for policy in self.opponents:
             arrays = _arrays(policy)
             waiting = jnp.zeros((self._size,), bool)
-            opponents.append(Opponent(arrays, arrays, waiting, policy.initial_memory(self._size)))
+            memory = policy.initial_memory(self._size)
+            opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
         action = jnp.zeros((self.num_envs, self.matches.num_agents, self.action_size))
         return self._seen(match, action, tuple(opponents), key)
 
@@ -138,7 +145,11 @@ class Versus(OneTeam):
         both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.concatenate(others)], axis=1)
         match = self._stepped(state, both)
         done = match.terminated | match.truncated
-        started = tuple(self._restarted(i, opponent, done[self._block(i)]) for i, opponent in enumerate(opponents))
+        ended = jnp.stack([done & (match.metrics[f"team0/{name}"] > 0) for name in OUTCOMES], axis=-1)
+        match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2])
+        started = tuple(
+            self._restarted(i, o, done[self._block(i)], ended[self._block(i)]) for i, o in enumerate(opponents)
+        )
         return self._seen(match, both, started, key)
 
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
@@ -164,24 +175,19 @@ class Versus(OneTeam):
             raise InputError(
                 f"policy: of another architecture than block {block}: {policy.architecture}, not {first.architecture}"
             )
-        arrays = _arrays(policy)
-        pending = jnp.any(opponent.waiting)
-        before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
-        waiting = jnp.where(pending, opponent.waiting, True)
-        if at_once:
-            before, waiting = arrays, jnp.zeros_like(opponent.waiting)
-        changed = dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)
+        changed = exchanged(opponent, _arrays(policy), at_once=at_once)
         opponents = (*state.opponents[:block], changed, *state.opponents[block + 1 :])
         return dataclasses.replace(state, opponents=opponents)
 
     def _block(self, index: int) -> slice:
         return slice(index * self._size, (index + 1) * self._size)
 
-    def _restarted(self, index: int, opponent: Opponent, done: jax.Array) -> Opponent:
-        """Resets the recurrent state, and ends the waiting, of environments whose episode ended."""
+    def _restarted(self, index: int, opponent: Opponent, done: jax.Array, ended: jax.Array) -> Opponent:
+        """Counts the outcomes `ended` (B, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
         first = self.opponents[index].initial_memory(self._size)
         memory = jax.tree.map(lambda start, now: _where(done, start, now), first, opponent.memory)
-        return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done)
+        outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
+        return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
 
     def _seen(self, match: State, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array) -> TeamState:
         own = slice(0, self.num_agents)
@@ -203,7 +209,7 @@ class Versus(OneTeam):
         )
 
 
-def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path]) -> Versus:
+def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
     The environments come in equal blocks, one for each opponent, in their order. Trained policies sample their actions,
@@ -212,12 +218,13 @@ def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path]) -> Versus:
     Args:
         env: the matches.
         opponents: policies, or what `load_policy` accepts; their number divides the number of environments.
+        draw_reward: added to the reward of a step that ends an episode with a draw.
 
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
     """
     policies = [load_opponent(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
-    return Versus(env, policies)
+    return Versus(env, policies, draw_reward)
 
 
 class Mirror(OneTeam):
@@ -276,6 +283,17 @@ class Mirror(OneTeam):
             opponents=(),
             key=jnp.zeros((2,), jnp.uint32),
         )
+
+
+def exchanged(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:
+    """Returns the opponent of a block with other arrays; see `Versus.change`."""
+    if at_once:
+        waiting = jnp.zeros_like(opponent.waiting)
+        return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=waiting)
+    pending = jnp.any(opponent.waiting)
+    before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
+    waiting = jnp.where(pending, opponent.waiting, True)
+    return dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)
 
 
 def _arrays(policy: Policy) -> PyTree:

@@ -61,7 +61,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 @pytest.fixture
 def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The task `fake` in addition to the real ones, for `mqe`, and an empty working folder."""
-    import fake_program
+    import fake_env
 
     from mqe_jax.cli import setup
 
@@ -69,6 +69,6 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     real = setup.make_env
 
     def make_env(task: str, *arguments: Any, **named: Any) -> Any:
-        return (fake_program.make_env if task == "fake" else real)(task, *arguments, **named)
+        return (fake_env.make_env if task == "fake" else real)(task, *arguments, **named)
 
     monkeypatch.setattr(setup, "make_env", make_env)

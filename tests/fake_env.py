@@ -1,10 +1,11 @@
-"""A task without physics, for tests of command line, rendering and benchmark.
+"""A task without physics, for tests of command line, rendering and benchmark; as a program, `mqe` with it as `fake`.
 
 Its `mj_model` has two jointed boxes that rendering treats as robots, between a fixed wall and two moving ones.
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+
+from mqe_jax.cli import main, setup
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 """Flags of a training that ends within seconds."""
@@ -149,3 +152,14 @@ class FakeVectorEnv:
             )
 
         return jax.vmap(one)(state, action)
+
+
+def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
+    """Replaces `mqe_jax.cli.setup.make_env`."""
+    env = FakeEnv()
+    return env, FakeVectorEnv(env, num_envs)
+
+
+if __name__ == "__main__":
+    setattr(setup, "make_env", make_env)  # noqa: B010
+    sys.exit(main())

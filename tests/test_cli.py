@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import fake_program
+import fake_env
 import jax
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(setup, "make_env", fake_program.make_env)
+        patch.setattr(setup, "make_env", fake_env.make_env)
         assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     return folder
 

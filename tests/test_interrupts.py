@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import fake_program
+import fake_env
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -26,7 +26,7 @@ ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: te
 SIGNALS = pytest.mark.parametrize("number", list(ENDS), ids=lambda number: number.name)
 FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-steps", str(300 * 16)]
 FAKE += ["--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "4", "--checkpoint.every", "100000"]
-PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_program.py"))]
+PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_env.py"))]
 GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
 GATE += ["--num-envs", "4", "--rollout-steps", "8", "--ppo.minibatches", "2", "--checkpoint.every", "100000"]
 GATE += ["--total-steps", str(100 * 32)]
@@ -102,7 +102,7 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
 
 def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped between its regular checkpoints, it equals an uninterrupted one bit for bit."""
-    monkeypatch.setattr(setup, "make_env", fake_program.make_env)
+    monkeypatch.setattr(setup, "make_env", fake_env.make_env)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])
     wait_for(lambda: updates(stopped) >= 3, process)

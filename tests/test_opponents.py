@@ -189,6 +189,7 @@ def test_a_mirrored_match_shows_both_teams() -> None:
 def test_the_command_line_plays_two_runs_against_each_other(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     task = ["go1revolvingdoor", "--impl", "c", "--control", "position", "--set", "episode_length=0.2"]
     small = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "32", "--ppo.minibatches", "1"]
+    small += ["--config", "paper/mappo"]
     runs = [str(tmp_path / name) for name in "ab"]
     for seed, run in enumerate(runs):
         assert cli.main(["train", *task, *small, "--seed", str(seed), "--run-dir", run]) == 0
@@ -238,7 +239,7 @@ def test_random_weights_win_as_often_as_they_lose_in_every_match(task: str) -> N
 
 TINY = ["train", "go1tug", "--impl", "c", "--set", "control=position", "--set", "episode_length=0.1", "--num-envs", "4"]
 TINY += ["--rollout-steps", "4", "--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "8"]
-TINY += ["--checkpoint.every", "2", "--total-steps", "64"]
+TINY += ["--checkpoint.every", "2", "--total-steps", "64", "--config", "paper/mappo"]
 AGAINST = ["--opponent", "idle", "--opponent", "random"]
 
 

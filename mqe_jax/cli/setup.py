@@ -12,8 +12,10 @@ import yaml
 
 from mqe_jax.cli.output import echo
 from mqe_jax.demonstrations import Demonstrated
-from mqe_jax.envs import PLANNERS, VectorEnv, make
+from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.envs.match import Match
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.league.league import MOVING, League
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.settings import fail, override
@@ -99,8 +101,11 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
         return batch(config.num_envs), eval_env
     if config.num_envs % 2 and not opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
-    learning = Mirror(batch(config.num_envs // 2)) if not opponents else versus(batch(config.num_envs), opponents)
-    return learning, None if eval_env is None else versus(eval_env, opponents or [_reference(eval_env.env)])
+    learning = League(batch(config.num_envs), opponents, config) if opponents else Mirror(batch(config.num_envs // 2))
+    if eval_env is not None:
+        fixed = [opponent for opponent in opponents if opponent not in MOVING]
+        eval_env = versus(eval_env, fixed or [_reference(eval_env.env)])
+    return learning, eval_env
 
 
 def _reference(env: Any) -> str:
@@ -136,7 +141,8 @@ def find_config(name: str) -> Path:
 def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
     """Returns the settings of a file or a shipped name, with the algorithm's preset.
 
-    The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else paper/mappo.
+    The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
+    paper/mappo for other tasks. league trains with the rewards of `Match.shaping`.
 
     Raises:
         InputError: for a file or an algorithm that is not allowed.
@@ -144,9 +150,15 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
     changes = {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:
         return load_config(find_config(f"paper/{algorithm}"))
+    match = TASKS.get(task)
+    match = match if match is not None and issubclass(match, Match) else None
     if name is None:
-        name = f"tuned/{task}" if (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file() else "paper/mappo"
-    return override(load_config(find_config(name)), changes)
+        tuned = (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file()
+        name = f"tuned/{task}" if tuned else "league" if match else "paper/mappo"
+    config = load_config(find_config(name), changes)
+    if name == "league" and match:
+        config = override(config, {"train_env": {f"rewards.{term}": weight for term, weight in match.shaping.items()}})
+    return config
 
 
 def for_task(config: TrainConfig, task: str, env: Mapping[str, Any] | None = None) -> TrainConfig:

@@ -6,6 +6,7 @@ The field extends from x 2 to 12; the goals are gaps in the thick walls behind b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import jax
@@ -155,6 +156,8 @@ class FootballMatch(Football[None, F], Match[None, F]):
 
     Source: paper, section III; the released system leaves rewards and observations undefined.
     """
+
+    shaping = MappingProxyType({"progress": 3.0, "approach": 1.0})
 
     @property
     def center(self) -> tuple[float, float]:

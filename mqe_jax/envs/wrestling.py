@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +73,7 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
     name = "go1wrestling"
     title = "Sumo Wrestling"
     Params = WrestlingParams
+    shaping = MappingProxyType({"push": 3.0, "approach": 1.0})
 
     @property
     def center(self) -> tuple[float, float]:

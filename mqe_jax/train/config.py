@@ -111,6 +111,20 @@ class Normalization:
 
 
 @record
+class LeagueSettings:
+    """The pool of earlier policies that `opponents` draw from."""
+
+    members: PositiveInt = 16
+    """Policies in the pool; when it is full, the one beaten most leaves."""
+    snapshot_steps: PositiveInt = 3_000_000
+    """Environment steps after which the policy becomes a member."""
+    snapshot_win_rate: Fraction = 0.7
+    """Mean win rate against the members from which it becomes one already after a quarter of these steps."""
+    episodes: PositiveInt = 200
+    """Episodes of a block of environments against a member until it plays another one."""
+
+
+@record
 class Checkpointing:
     """Checkpoints of the complete learner state."""
 
@@ -149,7 +163,12 @@ class TrainConfig:
     """Further overrides during training only, not in evaluation."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
     """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, a run folder or a policy
-    file. Several have equal shares of the environments. Without, both teams of each match learn."""
+    file; in training also newest (the policy itself), older (a member of the league's pool, more often one that is
+    hard to beat) or uniform (any member). Several have equal shares of the environments. Without, both teams of each
+    match learn."""
+    draw_reward: float = 0.0
+    """Added to the reward where an episode against opponents ends in a draw, during training only."""
+    league: LeagueSettings = LeagueSettings()
     seed: Seed = 0
     """Random seed."""
     num_envs: PositiveInt = 500

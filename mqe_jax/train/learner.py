@@ -6,6 +6,7 @@ differ in the ratio that PPO clips, the value (per agent or per team) and the ne
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ from mqe_jax.train.normalize import (
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
 from mqe_jax.train.schedules import Scheduled, scheduled
-from mqe_jax.train.types import Batch, Params, TraceStep, Transition, VectorEnv, replace_fields
+from mqe_jax.train.types import Batch, LearnerHook, Params, PyTree, TraceStep, Transition, VectorEnv, replace_fields
 
 Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -56,6 +57,8 @@ class TrainState:
     """Raw uint32 random key."""
     updates: jax.Array
     """Updates done () int32."""
+    extra: PyTree = ()
+    """State of the environment's learner hook (`mqe_jax.train.types.LearnerHook`); empty without one."""
 
 
 class Learner(NamedTuple):
@@ -89,6 +92,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
     dims = env_dims(env, config)
     network = config.network.build(dims)
     check_divisible(config, network)
+    hook: LearnerHook | None = getattr(env, "learner_hook", None)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
     def init(key: jax.Array) -> TrainState:
@@ -97,7 +101,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
         if config.stagger_episodes:
             env_state = _stagger(env, env_state, stagger_key)
         params = network.init(params_key)
-        return _strongly_typed(
+        state = _strongly_typed(
             TrainState(
                 params=params,
                 optimizer=optimizer.init(params),
@@ -117,6 +121,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
                 updates=jnp.zeros((), jnp.int32),
             )
         )
+        return state if hook is None else dataclasses.replace(state, extra=hook.begin(state))
 
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
@@ -152,7 +157,11 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
             rollout=rollout_state,
             key=key,
             updates=state.updates + 1,
+            extra=state.extra,
         )
+        if hook is not None:
+            new_state, counted = hook.after(new_state)
+            metrics |= counted
         metrics |= {"assistance": now.assistance, "entropy_coef": now.entropy_coef}
         return _strongly_typed(new_state), {**metrics, **batch_metrics, **loss_metrics}
 

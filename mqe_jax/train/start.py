@@ -64,6 +64,7 @@ def learned(state: TrainState) -> dict[str, Any]:
         "obs_normalizer": state.obs_normalizer,
         "value_normalizer": state.value_normalizer,
         "learning_rate": state.learning_rate,
+        "extra": state.extra,
     }
 
 

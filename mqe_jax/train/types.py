@@ -56,7 +56,7 @@ class VectorEnv(Protocol):
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
-    which `curriculum.assistance` sets (see `replace_fields`).
+    which `curriculum.assistance` sets (see `replace_fields`); `learner_hook` (a `LearnerHook`).
     """
 
     @property
@@ -73,6 +73,16 @@ class VectorEnv(Protocol):
     def action_size(self) -> int: ...
     def reset(self, key: jax.Array) -> Any: ...
     def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
+class LearnerHook(Protocol):
+    """What an environment does between updates with the learner state, a `TrainState`; pure, and compiled with them.
+
+    `begin(state)` returns the first value of `TrainState.extra`; `after(state) -> (state, metrics)` follows an update.
+    """
+
+    def begin(self, state: Any) -> PyTree: ...
+    def after(self, state: Any) -> tuple[Any, dict[str, jax.Array]]: ...
 
 
 class Trace(NamedTuple):

@@ -1,0 +1,171 @@
+"""A match against a pool of the learner's earlier policies, kept in the learner state between updates.
+
+Source: prioritised fictitious self-play (AlphaStar, doi 10.1038/s41586-019-1724-z).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs import VectorEnv
+from mqe_jax.league import pool
+from mqe_jax.league.pool import Pool
+from mqe_jax.opponents import OUTCOMES, Versus, exchanged, versus
+from mqe_jax.policies import load_opponent
+from mqe_jax.settings import fail
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import TrainState, env_dims
+from mqe_jax.train.normalize import running_init
+from mqe_jax.train.policy import PolicyArrays, TrainedPolicy
+
+NEWEST, OLDER, UNIFORM = "newest", "older", "uniform"
+DRAWN = (OLDER, UNIFORM)
+"""Opponents that are members of the pool."""
+MOVING = (NEWEST, *DRAWN)
+"""Opponents that exist in training only."""
+
+_FADE = 0.95  # of the counts behind the metrics, per update
+_GAIN = 1.0  # Elo points per game
+_SWING = 30.0  # Elo points per update, at most
+
+
+class LeagueState(NamedTuple):
+    """The league's part of the learner state; K blocks of environments."""
+
+    pool: Pool
+    """Earlier policies."""
+    member: jax.Array
+    """Member that each block plays (K,) int32; of meaning for blocks of `DRAWN`."""
+    played: jax.Array
+    """Episodes of each block against it (K,) int32."""
+    rating: jax.Array
+    """The learner's rating (), Elo points; the scripted policy has 0."""
+    snapshot: jax.Array
+    """Update of the last snapshot () int32."""
+    recent: jax.Array
+    """Recent wins, draws and losses of each block (K, 3)."""
+    key: jax.Array
+    """Random key."""
+
+
+class League(Versus):
+    """`Versus` whose blocks also play the newest policy and members of a pool; a learner hook."""
+
+    def __init__(self, matches: VectorEnv, opponents: Sequence[str], config: TrainConfig) -> None:
+        """Creates the matches of a training run; `opponents` are those of `TrainConfig.opponents`."""
+        dims = env_dims(versus(matches, ["idle"]), config)
+        self._network, self._config, self.sources = config.network.build(dims), config, tuple(opponents)
+        drawn = sum(source in DRAWN for source in opponents)
+        if drawn and config.league.members <= drawn:
+            fail("league.members", config.league.members, f"more than the blocks that play members, {drawn}")
+        params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
+        first = TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": matches.name})
+        policies = [first if source in MOVING else load_opponent(source, matches.env) for source in opponents]
+        super().__init__(matches, policies, config.draw_reward)
+        self._members = config.league.members if drawn else 1
+        self._moving = np.array([source in DRAWN for source in opponents])
+        self._scripted = np.array([source == "scripted" for source in opponents])
+
+    @property
+    def learner_hook(self) -> League:
+        """The hook that plays the pool."""
+        return self
+
+    def begin(self, state: TrainState) -> LeagueState:
+        """Returns the first state: the initial policy is the only member."""
+        blocks = len(self.sources)
+        return LeagueState(
+            pool=pool.new_pool(self._own(state), self._members),
+            member=jnp.zeros((blocks,), jnp.int32),
+            played=jnp.zeros((blocks,), jnp.int32),
+            rating=jnp.zeros(()),
+            snapshot=jnp.zeros((), jnp.int32),
+            recent=jnp.zeros((blocks, 3)),
+            key=jax.random.fold_in(state.key, 1),
+        )
+
+    def after(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        """Records the results of an update, takes a snapshot when due, and gives the blocks their opponents."""
+        env_state, own = state.rollout.env_state, self._own(state)
+        league = self._recorded(state.extra, env_state.opponents)
+        league = self._snapshot(league, own, state.updates)
+        league, redrawn = self._redrawn(league, env_state.opponents)
+        opponents = []
+        for i, (source, opponent) in enumerate(zip(self.sources, env_state.opponents, strict=True)):
+            if source == NEWEST:
+                opponent = exchanged(opponent, own, at_once=True)
+            elif source in DRAWN:
+                arrays = jax.tree.map(lambda x: x[league.member[i]], league.pool.arrays)  # noqa: B023
+                other = exchanged(opponent, arrays)
+                same = dataclasses.replace(opponent, arrays=arrays)  # also after a resume with new environments
+                opponent = jax.tree.map(lambda a, b: jnp.where(redrawn[i], a, b), other, same)  # noqa: B023
+            opponents.append(dataclasses.replace(opponent, outcomes=jnp.zeros_like(opponent.outcomes)))
+        env_state = dataclasses.replace(env_state, opponents=tuple(opponents))
+        state = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state), extra=league)
+        return state, self._metrics(league)
+
+    def _own(self, state: TrainState) -> PolicyArrays:
+        """Returns the arrays of the learner's policy."""
+        scale = jnp.float32(self._config.action_scale)
+        return PolicyArrays(self._network.policy_params(state.params), state.obs_normalizer.obs, scale)
+
+    def _recorded(self, league: LeagueState, opponents: Sequence[Any]) -> LeagueState:
+        """Adds the outcomes since the last update."""
+        counts = jnp.stack([opponent.outcomes for opponent in opponents]).astype(jnp.float32)
+        games, score = jnp.sum(counts, axis=1), counts[:, 0] + 0.5 * counts[:, 1]
+        members = jnp.where(self._moving, games, 0.0)
+        rated = jnp.where(self._moving | self._scripted, games, 0.0)
+        theirs = jnp.where(self._scripted, 0.0, league.pool.rating[league.member])
+        expected = 1.0 / (1.0 + 10.0 ** ((theirs - league.rating) / 400.0))
+        gain = jnp.sum(jnp.where(rated > 0, score - games * expected, 0.0))
+        return league._replace(
+            pool=pool.record(league.pool, league.member, jnp.where(self._moving, score, 0.0), members),
+            played=league.played + games.astype(jnp.int32),
+            rating=league.rating + jnp.clip(_GAIN * gain, -_SWING, _SWING),
+            recent=_FADE * league.recent + counts,
+        )
+
+    def _snapshot(self, league: LeagueState, own: PolicyArrays, updates: jax.Array) -> LeagueState:
+        """Makes the policy a member when it is due."""
+        settings = self._config.league
+        every = -(-settings.snapshot_steps // self._config.steps_per_update)
+        since = updates - league.snapshot
+        early = (since >= -(-every // 4)) & (pool.mean_win_rate(league.pool) >= settings.snapshot_win_rate)
+        due = (since >= every) | early
+        busy = jnp.any((jnp.arange(self._members) == league.member[:, None]) & self._moving[:, None], axis=0)
+        grown = pool.add(league.pool, own, updates, league.rating, busy)
+        return league._replace(
+            pool=jax.tree.map(lambda new, old: jnp.where(due, new, old), grown, league.pool),
+            snapshot=jnp.where(due, updates, league.snapshot),
+        )
+
+    def _redrawn(self, league: LeagueState, opponents: Sequence[Any]) -> tuple[LeagueState, jax.Array]:
+        """Draws another member for blocks that have played enough; returns which did (K,) bool."""
+        waiting = jnp.stack([jnp.any(opponent.waiting) for opponent in opponents])
+        enough = self._moving & (league.played >= self._config.league.episodes) & ~waiting
+        key, *keys = jax.random.split(league.key, 1 + len(self.sources))
+        drawn = [
+            jax.random.categorical(k, pool.chances(league.pool, source == UNIFORM))
+            for k, source in zip(keys, self.sources, strict=True)
+        ]
+        member = jnp.where(enough, jnp.stack(drawn).astype(jnp.int32), league.member)
+        return league._replace(member=member, played=jnp.where(enough, 0, league.played), key=key), jnp.asarray(enough)
+
+    def _metrics(self, league: LeagueState) -> dict[str, jax.Array]:
+        metrics = {
+            "league/rating": league.rating,
+            "league/members": jnp.sum(league.pool.born >= 0),
+            "league/win_rate": pool.mean_win_rate(league.pool),
+        }
+        for source in dict.fromkeys(self.sources):
+            of_source = np.array([other == source for other in self.sources])
+            recent = jnp.sum(league.recent[of_source], axis=0)
+            for i, outcome in enumerate(OUTCOMES):
+                metrics[f"{outcome}/{source}"] = recent[i] / jnp.maximum(jnp.sum(recent), 1.0)
+        return metrics

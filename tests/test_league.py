@@ -1,0 +1,187 @@
+"""Leagues: the pool of earlier policies, who plays whom in training, and runs with a pool that are resumed."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from mqe_jax import cli
+from mqe_jax.cli.setup import base_config
+from mqe_jax.errors import InputError
+from mqe_jax.league import pool
+from mqe_jax.league.league import League
+from mqe_jax.opponents import versus
+from mqe_jax.settings import build
+from mqe_jax.train.checkpoint import list_checkpoints
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import TrainState, env_dims, make_learner
+from tests.test_opponents import KEY, SETTINGS, matches
+
+SOURCES = ("newest", "older", "uniform", "idle")
+SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}
+
+
+def filled(*games: tuple[float, float]) -> pool.Pool:
+    """A pool of one place more than given members, with the learner's score and games against each."""
+    result = pool.new_pool({"x": jnp.zeros(2)}, len(games) + 1)
+    score, count = jnp.array([*games, (0.0, 0.0)]).T
+    born = jnp.array([*range(len(games)), -1])
+    return result._replace(born=born, score=score, games=count)
+
+
+def test_win_rates_start_at_a_half_and_follow_the_games() -> None:
+    now = filled((0.0, 0.0), (96.0, 96.0))
+    np.testing.assert_allclose(pool.win_rate(now)[:2], [0.5, 0.98])
+    assert float(pool.mean_win_rate(now)) == pytest.approx(0.74)
+    now = pool.record(now, jnp.array([0, 0, 1]), jnp.array([1.0, 2.0, 0.0]), jnp.array([4.0, 4.0, 0.0]))
+    np.testing.assert_allclose(now.games, [8, 96, 0])
+    np.testing.assert_allclose(now.score, [3, 96, 0])  # a member that is not met keeps its games
+    again = pool.record(now, jnp.array([0]), jnp.array([0.0]), jnp.array([2.0]))
+    assert 9 < float(again.games[0]) < 10 and float(again.score[0]) < 3  # earlier games fade
+
+
+def test_members_that_resist_play_more_often() -> None:
+    now = filled((0.0, 1e6), (0.9e6, 1e6), (1e6, 1e6))
+    older = jax.nn.softmax(pool.chances(now, uniform=False))
+    np.testing.assert_allclose(older, [1 / 1.01, 0.01 / 1.01, 0, 0], atol=2e-4)
+    np.testing.assert_allclose(jax.nn.softmax(pool.chances(now, uniform=True)), [1 / 3, 1 / 3, 1 / 3, 0], atol=1e-6)
+
+
+def test_a_new_member_takes_a_free_place_then_that_of_the_member_beaten_most() -> None:
+    new, nobody = {"x": jnp.ones(2)}, jnp.zeros(3, bool)
+    now = pool.add(filled((1.0, 9.0), (9.0, 9.0)), new, jnp.int32(7), jnp.float32(50.0), nobody)
+    assert now.born.tolist() == [0, 1, 7] and now.rating.tolist() == [0, 0, 50]
+    np.testing.assert_array_equal(now.arrays["x"], [[0, 0], [0, 0], [1, 1]])
+    full = pool.add(now, new, jnp.int32(8), jnp.float32(60.0), nobody)
+    assert full.born.tolist() == [0, 8, 7] and full.games.tolist() == [9, 0, 0]
+    busy = pool.add(now, new, jnp.int32(8), jnp.float32(60.0), nobody.at[1].set(True))
+    assert busy.born.tolist() == [0, 1, 8]
+
+
+def config_of(sources: tuple[str, ...] = SOURCES, **settings: Any) -> TrainConfig:
+    whole = {**SETTINGS, "num_envs": 8, "total_steps": 512, "opponents": sources, "league": SMALL, **settings}
+    return build(TrainConfig, whole)
+
+
+@pytest.fixture(scope="module")
+def history() -> list[TrainState]:
+    """States of a training after each update; episodes have ten steps, a rollout four, a snapshot is due every one."""
+    config = config_of()
+    env = League(matches(num_envs=8), SOURCES, config)
+    learner = make_learner(env, config)
+    update, states = jax.jit(learner.update), [jax.jit(learner.init)(KEY)]
+    for _ in range(9):
+        states.append(update(states[-1])[0])
+    return states
+
+
+def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainState]) -> None:
+    assert [int(jnp.sum(state.extra.pool.born >= 0)) for state in history[:5]] == [1, 2, 3, 4, 4]
+    network = config_of().network.build(env_dims(versus(matches(), ["idle"]), config_of()))
+    for state in history[1:]:
+        newest, older, uniform, idle = state.rollout.env_state.opponents
+        jax.tree.map(np.testing.assert_array_equal, newest.arrays.params, network.policy_params(state.params))
+        assert not bool(newest.waiting.any()) and idle.arrays == ()
+        for block, opponent in ((1, older), (2, uniform)):
+            member = int(state.extra.member[block])
+            assert int(state.extra.pool.born[member]) >= 0
+            of_pool = jax.tree.map(lambda x: x[member], state.extra.pool.arrays)  # noqa: B023
+            jax.tree.map(np.testing.assert_array_equal, opponent.arrays, of_pool)
+
+
+def test_a_block_plays_another_member_after_its_episodes(history: list[TrainState]) -> None:
+    """All episodes end in steps 10, 20 and 30: in updates 3, 5 and 8."""
+    waiting = [bool(state.rollout.env_state.opponents[1].waiting.any()) for state in history]
+    assert waiting[3] and not waiting[2]
+    assert not waiting[5]  # their episodes ended, and those against the new member have begun
+    games = [float(jnp.sum(state.extra.pool.games)) for state in history]
+    assert games[2] == 0 and games[3] == pytest.approx(4) and games[8] > games[5]
+    assert all(not bool(o.outcomes.any()) for state in history[1:] for o in state.rollout.env_state.opponents)
+
+
+def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
+    env = versus(matches(), ["idle", "forward"], draw_reward=-2.0)
+    step, still = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    state = env.reset(KEY)
+    for i in range(10):
+        state = step(state, still)
+        np.testing.assert_allclose(state.reward - state.match.reward[:, :1], 0.0)
+        assert float(state.reward.min()) < -1.0 if i == 9 else float(state.reward.min()) > -1.0
+    assert [opponent.outcomes.tolist() for opponent in state.opponents] == [[0, 2, 0], [0, 2, 0]]
+    waiting = dataclasses.replace(state.opponents[0], waiting=jnp.ones(2, bool))
+    state = dataclasses.replace(state, opponents=(waiting, state.opponents[1]))
+    for _ in range(10):
+        state = step(state, still)
+    assert [opponent.outcomes.tolist() for opponent in state.opponents] == [[0, 2, 0], [0, 4, 0]]
+
+
+def test_the_rating_follows_results_against_the_scripted_policy() -> None:
+    sources = ("scripted", "older")
+    config = config_of(sources, num_envs=2, total_steps=64)
+    env = League(matches(num_envs=2, control="command"), sources, config)
+    learner = make_learner(env, config)
+    state = jax.jit(learner.init)(KEY)
+    scripted, older = state.rollout.env_state.opponents
+
+    def after(wins: int, losses: int) -> float:
+        beaten = dataclasses.replace(scripted, outcomes=jnp.array([wins, 0, losses]))
+        env_state = dataclasses.replace(state.rollout.env_state, opponents=(beaten, older))
+        changed = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state))
+        now, metrics = env.after(changed)
+        assert float(metrics["win/scripted"]) == pytest.approx(wins / (wins + losses))
+        return float(now.extra.rating)
+
+    assert after(3, 1) == pytest.approx(1.0) and after(2, 2) == 0.0 and after(0, 500) == -30.0
+
+
+def test_a_pool_too_small_for_its_blocks_is_refused() -> None:
+    config = config_of(league={**SMALL, "members": 2})
+    with pytest.raises(InputError, match=r"league.members: 2 .*more than the blocks that play members, 2"):
+        League(matches(num_envs=8), SOURCES, config)
+
+
+def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    """Two seeds in one program; pool, ratings and weights are the same bit for bit."""
+    arguments = ["train", "go1tug", "--impl", "c", "--set", "control=position", "--set", "episode_length=0.1"]
+    arguments += ["--num-envs", "4", "--rollout-steps", "4", "--ppo.minibatches", "1", "--ppo.epochs", "1"]
+    arguments += ["--network.hidden-sizes", "8", "--checkpoint.every", "2", "--total-steps", "96", "--num-seeds", "2"]
+    arguments += [
+        "--config",
+        "paper/mappo",
+        "--league.snapshot-steps",
+        "16",
+        "--league.episodes",
+        "1",
+        "--league.members",
+        "3",
+    ]
+    for source in SOURCES:
+        arguments += ["--opponent", source]
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    assert cli.main([*arguments, "--run-dir", str(whole)]) == 0
+    assert cli.main([*arguments, "--run-dir", str(halves)]) == 0
+    for seed in ("seed0", "seed1"):
+        max(list_checkpoints(halves / seed)).unlink()
+    assert cli.main([*arguments, "--run-dir", str(halves), "--resume"]) == 0
+    for seed in ("seed0", "seed1"):
+        expected, resumed = (load_file(max(list_checkpoints(run / seed))) for run in (whole, halves))
+        assert expected.keys() == resumed.keys() and "extra/pool/rating" in expected
+        for name, value in expected.items():
+            np.testing.assert_array_equal(value, resumed[name], err_msg=name)
+    header = (whole / "seed0" / "metrics.csv").read_text().splitlines()[0].split(",")
+    assert {"win/newest", "loss/idle", "league/rating", "league/members"} <= set(header)
+
+
+@pytest.mark.parametrize("task", ["go1wrestling", "go1tug"])
+def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> None:
+    config = base_config(task, None)
+    assert {"newest", "older", "scripted"} <= set(config.opponents) and config.draw_reward < 0
+    assert dict(config.train_env) == ({"rewards.push": 3.0, "rewards.approach": 1.0} if "wrestling" in task else {})
+    assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
