@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from safetensors.numpy import load_file
 from mqe_jax import cli
 from mqe_jax.cli.setup import base_config
 from mqe_jax.errors import InputError
-from mqe_jax.league import pool
+from mqe_jax.league import pool, tournament
 from mqe_jax.league.league import League
 from mqe_jax.opponents import versus
 from mqe_jax.settings import build
@@ -135,7 +136,7 @@ def test_the_rating_follows_results_against_the_scripted_policy() -> None:
         env_state = dataclasses.replace(state.rollout.env_state, opponents=(beaten, older))
         changed = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state))
         now, metrics = env.after(changed)
-        assert float(metrics["win/scripted"]) == pytest.approx(wins / (wins + losses))
+        assert float(metrics["league/win/scripted"]) == pytest.approx(wins / (wins + losses))
         return float(now.extra.rating)
 
     assert after(3, 1) == pytest.approx(1.0) and after(2, 2) == 0.0 and after(0, 500) == -30.0
@@ -176,7 +177,7 @@ def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
         for name, value in expected.items():
             np.testing.assert_array_equal(value, resumed[name], err_msg=name)
     header = (whole / "seed0" / "metrics.csv").read_text().splitlines()[0].split(",")
-    assert {"win/newest", "loss/idle", "league/rating", "league/members"} <= set(header)
+    assert {"league/win/newest", "league/loss/idle", "league/rating", "league/members"} <= set(header)
 
 
 @pytest.mark.parametrize("task", ["go1wrestling", "go1tug"])
@@ -185,3 +186,33 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
     assert {"newest", "older", "scripted"} <= set(config.opponents) and config.draw_reward < 0
     assert dict(config.train_env) == ({"rewards.push": 3.0, "rewards.approach": 1.0} if "wrestling" in task else {})
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
+
+
+def test_ratings_recover_the_strengths_behind_many_games() -> None:
+    """Odds of 3 are 191 points; a draw counts half."""
+    games = np.zeros((3, 3, 3), int)
+    games[0, 1] = games[0, 2] = [3000, 0, 1000]
+    games[1, 0] = games[2, 0] = [1000, 0, 3000]
+    games[1, 2] = games[2, 1] = [0, 4000, 0]
+    ratings = tournament.rate(games, anchor=1)
+    np.testing.assert_allclose(ratings.value, [190.8, 0, 0], atol=1.0)
+    assert ratings.low[0] < 190.8 < ratings.high[0] and ratings.high[0] - ratings.low[0] < 30
+    np.testing.assert_allclose(tournament.scores(games)[0], [0, 6000, 6000])
+
+
+def test_a_tournament_meets_every_pair_on_both_sides(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """One who walks ahead passes the door that nobody else passes in time; nobody beats itself more often than not."""
+    capfd.readouterr()
+    arguments = ["go1revolvingdoor", "forward", "--impl", "c", "--set", "line_x=0.8", "--episodes", "4"]
+    assert cli.main(["tournament", *arguments, "-o", str(tmp_path), "--json"]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["policies"] == ["forward", "scripted", "idle", "random"]
+    won = np.array(result["results"])[..., 0]
+    assert np.array(result["results"]).sum(axis=-1).tolist() == [[4] * 4] * 4
+    assert won[0, 2] == 4 and won[2, 0] == 0 and won[1, 2] == 4
+    assert {row["policy"]: row["value"] for row in result["ratings"]}["scripted"] == 0
+    assert (tmp_path / "tournament.png").stat().st_size > 5000
+    rows = (tmp_path / "tournament.csv").read_text().splitlines()
+    assert len(rows) == 17 and rows[3].startswith("forward,idle,4,0,0,")
+    assert cli.main(["tournament", "go1gate", "idle", "--impl", "c"]) == 2
+    assert "one team" in capfd.readouterr().err

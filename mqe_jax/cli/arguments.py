@@ -37,6 +37,7 @@ COMMANDS: dict[str, Any] = {
     "walk convert": walk.WalkConvert,
     "sweep": study.Sweep,
     "report": study.Report,
+    "tournament": study.Tournament,
 }
 """Arguments by command, or what it does: the arguments in `mqe_jax.cli.train` need the trainer's settings."""
 

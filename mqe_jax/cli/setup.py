@@ -104,13 +104,13 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     learning = League(batch(config.num_envs), opponents, config) if opponents else Mirror(batch(config.num_envs // 2))
     if eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
-        eval_env = versus(eval_env, fixed or [_reference(eval_env.env)])
+        eval_env = versus(eval_env, fixed or anchors(eval_env.env)[:1])
     return learning, eval_env
 
 
-def _reference(env: Any) -> str:
-    """Returns the name of the opponent against which policies are evaluated during training."""
-    return "scripted" if env.name in PLANNERS and env.control == "command" else "idle"
+def anchors(env: Any) -> list[str]:
+    """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
+    return [*(["scripted"] if env.name in PLANNERS and env.control == "command" else []), "idle", "random"]
 
 
 def platform() -> str:

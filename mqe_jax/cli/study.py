@@ -1,4 +1,4 @@
-"""The commands `sweep` and `report`."""
+"""The commands `sweep`, `report` and `tournament`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from mqe_jax import interrupts
-from mqe_jax.cli.options import Impl, Json, Repeated
+from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
 from mqe_jax.cli.output import echo
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import record
+from mqe_jax.settings import PositiveInt, fail, record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
@@ -96,6 +96,52 @@ class Report:
         files = reports.report(self.folder, reference)
         echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
         return {"report": [str(file) for file in files]}
+
+
+@record
+class Tournament(TaskOptions):
+    """Play policies of a match against each other, and rate them: table, CSV and picture."""
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    """Id of a match, such as go1wrestling."""
+    policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME|RUN|FILE")]
+    """Policies; scripted, idle and random play too. Ratings are relative to scripted, or idle without it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("runs/tournament")
+    """Folder of tournament.csv and tournament.png."""
+    episodes: PositiveInt = 64
+    """Episodes of each pair on each side."""
+    deterministic: bool = False
+    """Use mean actions of trained policies; otherwise they are sampled, as in training."""
+    seed: Seed = 0
+    json: Json = False
+
+    def run(self) -> dict[str, Any]:
+        """Plays all pairs; prints a table, or returns the object for `--json`."""
+        import jax
+
+        from mqe_jax.cli.setup import anchors, make_env
+        from mqe_jax.league import tournament
+        from mqe_jax.policies import load_policy
+
+        env, _ = make_env(self.task, self.impl, self.overrides(), 1)
+        if len(env.teams) < 2:
+            fail("task", self.task, "a match: it has one team")
+        names = list(dict.fromkeys([*self.policies, *anchors(env)]))
+        _, matches = make_env(self.task, self.impl, self.overrides(), len(names) * self.episodes)
+        policies = {name: load_policy(name, matches.env, deterministic=self.deterministic) for name in names}
+        results = tournament.round_robin(matches, policies, jax.random.PRNGKey(self.seed))
+        ratings = tournament.rate(results, names.index(anchors(env)[0]))
+        tournament.save(self.output, names, results, ratings)
+        echo(f"mqe: wrote {self.output / tournament.CSV} and {tournament.PICTURE}")
+        share = tournament.scores(results) / (2 * self.episodes)
+        order = sorted(range(len(names)), key=lambda i: -ratings.value[i])
+        if not self.json:
+            for i in order:
+                row = " ".join(f"{100 * share[i, j]:4.0f}" if i != j else "    " for j in order)
+                low, value, high = (x[i] for x in (ratings.low, ratings.value, ratings.high))
+                print(f"{names[i]:<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
+        rows = [{"policy": names[i], **{k: float(x[i]) for k, x in ratings._asdict().items()}} for i in order]
+        return {"task": self.task, "ratings": rows, "policies": names, "results": results.tolist()}
 
 
 def _estimate(seconds: list[float], jobs: list[sweeps.Job]) -> dict[str, Any]:

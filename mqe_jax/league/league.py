@@ -167,5 +167,5 @@ class League(Versus):
             of_source = np.array([other == source for other in self.sources])
             recent = jnp.sum(league.recent[of_source], axis=0)
             for i, outcome in enumerate(OUTCOMES):
-                metrics[f"{outcome}/{source}"] = recent[i] / jnp.maximum(jnp.sum(recent), 1.0)
+                metrics[f"league/{outcome}/{source}"] = recent[i] / jnp.maximum(jnp.sum(recent), 1.0)
         return metrics

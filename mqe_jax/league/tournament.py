@@ -1,0 +1,134 @@
+"""Round robins of policies of a match, and ratings from their results."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from mqe_jax.envs import VectorEnv
+from mqe_jax.files import replacing, write_atomically
+from mqe_jax.opponents import OUTCOMES, Versus
+from mqe_jax.train.policy import Policy
+
+Array = NDArray[np.float64]
+CSV, PICTURE = "tournament.csv", "tournament.png"
+
+_POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
+_ITERATIONS = 500
+
+
+class Ratings(NamedTuple):
+    """Ratings of P policies in Elo points, with the bounds of their 95% intervals (P,)."""
+
+    value: Array
+    low: Array
+    high: Array
+
+
+def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
+    """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `OUTCOMES`.
+
+    Args:
+        matches: N environments, in K equal blocks with one opponent each.
+        policy: of team 0.
+        opponents: the K opponents, as team 1.
+        key: random key.
+    """
+    env = Versus(matches, opponents)
+
+    def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
+        state, memory, finished, outcome = carry
+        action, memory = policy.act(state.obs, memory, key)
+        state = env.step(state, action)
+        done = state.terminated | state.truncated
+        now = jnp.stack([state.metrics[f"team0/{name}"] > 0 for name in OUTCOMES], axis=-1)
+        outcome = jnp.where((done & ~finished)[:, None], now, outcome)
+        return (state, memory, finished | done, outcome), None
+
+    @jax.jit
+    def run(key: jax.Array) -> jax.Array:
+        key, reset_key = jax.random.split(key)
+        count = matches.num_envs
+        nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
+        start = env.reset(reset_key), policy.initial_memory(count), *nothing
+        (_, _, _, outcome), _ = jax.lax.scan(advance, start, jax.random.split(key, matches.max_episode_steps))
+        return outcome
+
+    return np.asarray(run(key)).reshape(len(opponents), -1, 3).sum(axis=1)
+
+
+def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
+    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `OUTCOMES`."""
+    keys = jax.random.split(key, len(policies))
+    teams = list(policies.values())
+    return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
+
+
+def scores(results: NDArray[np.int64]) -> Array:
+    """Returns the points of each policy against each, as both teams together, in games; a draw counts half (P, P)."""
+    points = results[..., 0] + 0.5 * results[..., 1]
+    return points + (results.sum(axis=-1) - points).T
+
+
+def rate(results: NDArray[np.int64], anchor: int, samples: int = 200, seed: int = 0) -> Ratings:
+    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0; intervals by bootstrap.
+
+    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite.
+    """
+    games = results.sum(axis=-1, keepdims=True)
+    random = np.random.default_rng(seed)
+    drawn = random.multinomial(games[..., 0], results / np.maximum(games, 1), (samples, *games.shape[:2]))
+    resampled = np.stack([_strengths(scores(again), anchor) for again in drawn])
+    low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
+    return Ratings(_strengths(scores(results), anchor), low, high)
+
+
+def _strengths(points: Array, anchor: int) -> Array:
+    """Returns the maximum-likelihood ratings (P,) of points (P, P), by minorisation and maximisation."""
+    points = points + 0.5 * (1 - np.eye(len(points)))
+    np.fill_diagonal(points, 0.0)
+    games, strength = points + points.T, np.ones(len(points))
+    for _ in range(_ITERATIONS):
+        strength = points.sum(axis=1) / (games / (strength[:, None] + strength)).sum(axis=1)
+        strength /= strength[anchor]
+    return _POINTS * np.log(strength)
+
+
+def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings: Ratings) -> None:
+    """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("team0", "team1", *OUTCOMES, "rating_of_team0", "low", "high"))
+    for i, j in itertools.product(range(len(names)), repeat=2):
+        writer.writerow((names[i], names[j], *results[i, j], *(f"{x[i]:.1f}" for x in ratings)))
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / CSV, text.getvalue().encode())
+    _draw(names, results, folder / PICTURE)
+
+
+def _draw(names: Sequence[str], results: NDArray[np.int64], path: Path) -> None:
+    """Draws each policy's points per game against each, rows against columns."""
+    from matplotlib.figure import Figure
+
+    share = scores(results) / np.maximum(results.sum(axis=-1) + results.sum(axis=-1).T, 1)
+    size = 2.2 + 0.6 * len(names)
+    figure = Figure((size + 0.8, size), dpi=120, layout="constrained")
+    axes = figure.add_subplot()
+    axes.imshow(share, cmap="RdYlGn", vmin=0, vmax=1)
+    for (row, column), value in np.ndenumerate(share):
+        if row != column:
+            axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=9)
+    axes.set_xticks(range(len(names)), names, rotation=45, ha="right")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_title("points of 100 games, row against column", loc="left", fontsize=10)
+    with replacing(path) as temporary:
+        figure.savefig(temporary)

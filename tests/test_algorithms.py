@@ -1,0 +1,192 @@
+"""Algorithms by name: their settings, and games that distinguish them; the multi-agent transformer's network."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+from probes import Probe
+
+from mqe_jax.cli.setup import base_config
+from mqe_jax.errors import InputError
+from mqe_jax.settings import override
+from mqe_jax.train.actor_critic import ActorCritic
+from mqe_jax.train.algorithms import ALGORITHMS, preset
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import make_learner
+from mqe_jax.train.mat import Mat, log_std_of
+from mqe_jax.train.networks import EnvDims, Network
+from mqe_jax.train.types import NetworkMemory, Params, VectorEnv
+
+SMALL = {
+    "num_envs": 32,
+    "total_steps": 100_000,
+    "rollout_steps": 8,
+    "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
+    "optimizer": {"learning_rate": 1e-2},
+}
+PLAIN = {"network": {"recurrent": False, "hidden_sizes": [16], "log_std_init": -1.0}}
+
+
+def settings(algorithm: str, *changes: dict[str, Any]) -> TrainConfig:
+    """An algorithm's preset with settings that learn a probe in seconds."""
+    config = override(override(TrainConfig(), SMALL), preset(algorithm))
+    for change in changes:
+        config = override(config, change)
+    return config
+
+
+def learn(env: VectorEnv, config: TrainConfig, updates: int, last: int) -> float:
+    """Trains and returns the mean reward per step over the last updates."""
+    learner = make_learner(env, config)
+    state = jax.jit(learner.init)(jax.random.PRNGKey(1))
+    update = jax.jit(learner.update)
+    rewards = []
+    for _ in range(updates):
+        state, metrics = update(state)
+        rewards.append(float(metrics["average_step_reward"]))
+    return float(np.mean(rewards[-last:]))
+
+
+@pytest.mark.parametrize(("algorithm", "cooperates"), [("jrpo", True), ("ippo", False)])
+def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, cooperates: bool) -> None:
+    """Individual ratios converge to the Nash equilibrium, -0.5 each; the joint ratio contributes all, +0.5 each."""
+    env = Probe(probes.show_hidden, probes.pay_public_good, num_envs=32)
+    reward = learn(env, settings(algorithm, PLAIN), 50, 5)
+    assert reward >= 0.45 if cooperates else reward <= -0.45
+
+
+def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
+    """The loss is two variances for independent agents, and one if the second is conditioned on the first."""
+    log_std = -1.2
+    fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
+    env = Probe(probes.show_hidden, probes.pay_meeting, num_envs=32)
+    small = {"network": {"width": 16, "deviation": "free"}, "optimizer": {"learning_rate": 3e-3}}
+    variance = math.exp(2 * log_std)
+    assert -learn(env, settings("mat", small, fixed), 100, 20) / variance <= 1.2
+    assert -learn(env, settings("mappo", PLAIN, fixed), 30, 10) / variance >= 1.8
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
+    """A name means the same as a preset and as the paper's file: the preset changes nothing in the file."""
+    config = base_config("go1gate", None, algorithm)
+    again = override(config, preset(algorithm))
+    assert again == config, algorithm
+    assert config.action_scale == 0.5 and config.num_envs == 500 and config.total_steps == 40_000_000
+    assert isinstance(config.network, Mat if algorithm == "mat" else ActorCritic)
+
+
+def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
+    demo, joint = base_config("go1gate", "demo"), base_config("go1gate", "demo", "jrpo")
+    assert (joint.ppo.ratio, joint.ppo.value) == ("joint", "joint") and joint.network == demo.network
+    assert base_config("go1gate", "demo", "mat").network == Mat()
+
+
+def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
+    assert base_config("go1gate", None) == base_config("go1gate", "tuned/go1gate")
+    assert base_config("go1plane", None) == base_config("go1plane", "paper/mappo")
+
+
+def test_unknown_names_get_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"algorithm: 'mapo'.*did you mean 'mappo'"):
+        base_config("go1gate", "demo", "mapo")
+    with pytest.raises(InputError, match=r"config: unknown name 'deno' \(did you mean 'demo'"):
+        base_config("go1gate", "deno")
+
+
+def test_every_algorithm_has_the_papers_settings() -> None:
+    folder = Path(__file__).parent.parent / "configs"
+    assert {path.stem for path in (folder / "paper").glob("*.yaml")} == set(ALGORITHMS)
+
+
+# -- the multi-agent transformer: sequential acting, parallel evaluation, deviation ----------------------------------
+
+KEY = jax.random.PRNGKey(0)
+NO_MEMORY = NetworkMemory((), ())
+
+
+def dims(agents: int) -> EnvDims:
+    """Sizes with 5 observations and 2 actions per agent."""
+    return EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents)
+
+
+def made(agents: int, **settings: Any) -> tuple[Network, Params, jax.Array]:
+    """A network with strong weights, so that every path counts, and observations (4, A, 5)."""
+    network = Mat(gain=1.0, width=8, **settings).build(dims(agents))
+    network = network._replace(init=jax.jit(network.init), act=jax.jit(network.act), evaluate=jax.jit(network.evaluate))
+    return network, network.init(KEY), jax.random.normal(KEY, (4, agents, 5))
+
+
+def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Array) -> np.ndarray:
+    """Parallel log-probabilities (N, A, D)."""
+    first = jnp.zeros(obs.shape[:1], bool)
+    return np.asarray(network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], action).log_prob)
+
+
+@pytest.mark.parametrize(
+    ("agents", "settings"), [(3, {}), (4, {"blocks": 2, "heads": 4, "deviation": "free"}), (1, {})]
+)
+def test_parallel_log_probabilities_equal_sequential_ones(agents: int, settings: dict) -> None:
+    network, params, obs = made(agents, **settings)
+    action, sequential, _ = network.act(network.policy_params(params), (), obs, KEY)
+    np.testing.assert_allclose(log_probs(network, params, obs, action), sequential, atol=1e-5)
+    assert float(jnp.std(action)) > 0.1
+    mean, density, _ = network.act(network.policy_params(params), (), obs, None)
+    np.testing.assert_allclose(log_probs(network, params, obs, mean), density, atol=1e-5)
+
+
+def test_later_actions_change_no_earlier_log_probability() -> None:
+    network, params, obs = made(3)
+    action = jax.random.normal(KEY, (4, 3, 2))
+    before = log_probs(network, params, obs, action)
+    later = log_probs(network, params, obs, action.at[:, 2].set(action[::-1, 2]))
+    np.testing.assert_allclose(later[:, :2], before[:, :2], atol=1e-6)
+    earlier = log_probs(network, params, obs, action.at[:, 0].set(action[::-1, 0]))
+    assert np.abs(earlier[:, 1:] - before[:, 1:]).max() > 1e-3
+
+
+def test_the_deviation_starts_as_openrl_has_it_or_free() -> None:
+    for settings, deviation in (
+        ({}, 0.5 / (1 + np.exp(-1))),
+        ({"deviation": "free", "log_std_init": -1.0}, np.exp(-1)),
+    ):
+        network, params, obs = made(3, **settings)
+        mean, density, _ = network.act(network.policy_params(params), (), obs, None)
+        np.testing.assert_allclose(density, -np.log(deviation * np.sqrt(2 * np.pi)), rtol=1e-5)
+        assert mean.shape == (4, 3, 2)
+
+
+def test_a_free_deviation_beyond_its_bounds_gets_the_gradient_that_leads_back() -> None:
+    settings = Mat(deviation="free", log_std_init=-2.0, log_std_max=-1.0, log_std_min=-3.0)
+
+    def log_std(parameter: jax.Array) -> jax.Array:
+        return jnp.sum(log_std_of({"deviation": parameter}, settings))
+
+    beyond = jnp.array([0.0, -2.0, -4.0])
+    np.testing.assert_allclose(log_std_of({"deviation": beyond}, settings), [-1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(jax.grad(log_std)(beyond), [1.0, 1.0, 0.0])
+    np.testing.assert_array_equal(jax.grad(lambda x: -log_std(x))(beyond), [0.0, -1.0, -1.0])
+    with pytest.raises(InputError, match=r"log_std_init: 0.0 is not allowed; it must be at most log_std_max"):
+        Mat(deviation="free", log_std_max=-1.0)
+
+
+def test_actions_start_small_and_acting_needs_no_value_head() -> None:
+    network = Mat().build(dims(3))
+    params = jax.jit(network.init)(KEY)
+    mean, _, _ = jax.jit(network.act)(network.policy_params(params), (), jax.random.normal(KEY, (4, 3, 5)), None)
+    assert float(jnp.abs(mean).max()) < 0.1
+    assert "value_head" not in network.policy_params(params)
+
+
+def test_settings_that_do_not_fit_are_named() -> None:
+    with pytest.raises(InputError, match="heads: 3"):
+        Mat(heads=3)
+    with pytest.raises(InputError, match=r"ppo\.value"):
+        Mat().build(dims(3)._replace(values=1))
