@@ -14,7 +14,7 @@ from mqe_jax import interrupts
 from mqe_jax.cli.commands import Demo
 from mqe_jax.cli.output import echo
 from mqe_jax.cli.render import draw
-from mqe_jax.cli.setup import base_config, for_task, make_env
+from mqe_jax.cli.setup import base_config, environments, for_task, make_env
 from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
@@ -36,7 +36,7 @@ def demo(arguments: Demo) -> None:
     config = for_task(base_config(DEMO_TASK, arguments.config), DEMO_TASK)
     check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
-    _, training_env = make_env(DEMO_TASK, arguments.impl, config.training_env, config.num_envs)
+    training_env, _ = environments(arguments.impl, config, 1)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
