@@ -11,6 +11,7 @@ from typing import Any, overload
 import jax
 import jax.numpy as jnp
 
+from mqe_jax import zoo
 from mqe_jax.envs import TaskParams
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
@@ -83,12 +84,14 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
     """Returns the policy of a name, a run folder or a policy file.
 
     Args:
-        source: one of `NAMES`, or a path; a folder with one of these names is given as ./NAME.
+        source: one of `NAMES`, a task with a shipped policy (`mqe_jax.zoo`), or a path; a folder with one of these
+            names is given as ./NAME.
         env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
-        deterministic: whether a trained policy acts with its mean actions.
+        deterministic: whether a trained policy acts with its mean actions; a shipped one does so too where its card
+            declares it.
 
     Returns:
-        A `TrainedPolicy` for a path, else a `SimplePolicy`.
+        A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.
 
     Raises:
         InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
@@ -98,11 +101,15 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
         if env is None:
             raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
         return SimplePolicy(env.name, team_size(env), _plan(str(source), env))
-    if not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
-        hint = nearest(str(source), NAMES)
-        allowed = f"{', '.join(NAMES)}, a run folder, or a policy file"
+    if str(source) in zoo.names():
+        policy = zoo.load(str(source))
+    elif not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
+        hint = nearest(str(source), (*NAMES, *zoo.names()))
+        allowed = f"{', '.join(NAMES)}, {', '.join(zoo.names())}, a run folder, or a policy file"
         raise InputError(f"policy: unknown {str(source)!r}{hint}; allowed: {allowed}")
-    policy = dataclasses.replace(read_policy(source), deterministic=deterministic)
+    else:
+        policy = read_policy(source)
+    policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
     if env is not None:
         check_policy(policy, env, str(source))
     return policy

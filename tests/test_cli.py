@@ -13,7 +13,7 @@ import pytest
 from fake_env import SMALL, FakeEnv
 
 import mqe_jax
-from mqe_jax import cli
+from mqe_jax import cli, zoo
 from mqe_jax.cli import arguments, setup
 from mqe_jax.cli.train import parse_train, parse_walk_train
 from mqe_jax.envs import QuadrupedEnv
@@ -200,7 +200,7 @@ def test_the_best_of_several_episodes_is_rendered(
 def test_evaluation_clip_and_viewer_run_the_same_policy(
     command: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run's sampled actions unless --deterministic is given; a task's scripted policy, forward without one."""
+    """A run's sampled actions unless --deterministic is given; a task's shipped policy, forward without any."""
     played: list[tuple[str, bool]] = []
 
     def load(source: str, env: Any, *, deterministic: bool) -> None:
@@ -214,7 +214,7 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
         for more in ([], ["--deterministic"]):
             assert cli.main([command, target, *flags, *more]) == 2
     assert [deterministic for _, deterministic in played] == [False, True] * 3
-    assert [policy for policy, _ in played[::2]] == [str(run_folder), "scripted", "forward"]
+    assert [policy for policy, _ in played[::2]] == [str(run_folder), "go1gate", "forward"]
 
 
 def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
@@ -292,5 +292,5 @@ print(load_mjx().__name__)
 
 
 def test_a_policy_file_knows_its_task() -> None:
-    file = Path(__file__).parents[1] / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned.safetensors"
+    file = zoo.file_of("go1gate")
     assert load_policy(file).config.task == "go1gate"

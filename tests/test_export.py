@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from test_skills import StandAndLean
 
-from mqe_jax import cli, load_policy, make
+from mqe_jax import cli, load_policy, make, zoo
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.settings import build
@@ -34,7 +34,7 @@ from mqe_jax.export.check import errors, record  # noqa: E402
 from mqe_jax.export.policy import input_shapes, policy_step, shapes, to_onnx  # noqa: E402
 
 POLICIES = Path(__file__).parents[1] / "results" / "paper" / "policies"
-GATE = POLICIES / "go1gate" / "mappo+tuned.safetensors"
+GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
 
 
@@ -172,7 +172,7 @@ def test_a_registered_network_is_exported_with_all_its_recurrent_states(monkeypa
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("run", sorted(POLICIES.glob("*/*.safetensors")), ids=str)
+@pytest.mark.parametrize("run", sorted([*POLICIES.glob("*/*.safetensors"), *zoo.FOLDER.glob("*.safetensors")]), ids=str)
 def test_every_published_policy_agrees_on_a_thousand_steps(run: Path) -> None:
     policy = load_policy(run)
     env = make(str(policy.config.task), impl="c", num_envs=1, **policy.config.env)

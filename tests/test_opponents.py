@@ -271,10 +271,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     "one team": (["train", "go1gate", "--opponent", "idle"], ["opponents", "go1gate"]),
     "unknown": ([*TINY, "--opponent", "idel"], ["opponent", "'idel'", "idle"]),
     "shares": ([*TINY, *AGAINST, "--opponent", "idle"], ["num_envs: 4", "3"]),
-    "another task's": (
-        [*TINY, "--opponent", "results/paper/policies/go1gate/mappo+tuned.safetensors"],
-        ["opponent", "go1gate", "go1tug"],
-    ),
+    "another task's": ([*TINY, "--opponent", "go1gate"], ["opponent", "go1gate", "go1tug"]),
 }
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 CACHE = ROOT / ".cache" / "play"
-RUN = ROOT / "results" / "paper" / "policies" / "go1gate" / "mappo+tuned.safetensors"
+RUN = ROOT / "mqe_jax" / "zoo" / "go1gate.safetensors"
 
 
 # npm packages of the page: name and version, SHA-256 of the archive, files in it that the page needs.

@@ -14,7 +14,7 @@ FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 
 First steps:
   mqe tasks                                   list the tasks
-  mqe render go1gate -o gate.gif              render a task
+  mqe render go1gate -o gate.gif              render a task, with its shipped policy (mqe zoo)
   mqe train go1gate --config demo             train two robots at a gate (minutes on a CPU)
   mqe eval runs/go1gate                       evaluate the trained policy
   mqe render runs/go1gate -o gate.mp4         render the trained policy
@@ -24,6 +24,7 @@ First steps:
 `mqe COMMAND --help` explains every argument."""
 COMMANDS: dict[str, Any] = {
     "tasks": commands.Tasks,
+    "zoo": commands.Zoo,
     "train": "Train a policy on a task, into a run folder.",
     "eval": commands.Eval,
     "render": render.Render,

@@ -1,4 +1,4 @@
-"""The commands `tasks`, `eval`, `replay`, `bench`, `demo`.
+"""The commands `tasks`, `zoo`, `eval`, `replay`, `bench`, `demo`.
 
 Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 """
@@ -50,8 +50,28 @@ class Tasks:
 
 
 @record
+class Zoo:
+    """List the shipped policies, with what they reach and how they were trained."""
+
+    json: Json = False
+
+    def run(self) -> dict[str, Any]:
+        """Lists the cards of all shipped policies."""
+        from mqe_jax import zoo
+        from mqe_jax.settings import to_mapping
+
+        cards = {task: to_mapping(zoo.card(task)) for task in zoo.names()}
+        if not self.json:
+            for task, card in cards.items():
+                rates = ", ".join(f"{name} {100 * value:.1f}%" for name, value in card["results"].items())
+                print(f"{task:<22} {rates} ({card['mode']}, {card['episodes']} episodes)")
+                print(f"{'':<22} {card['command']} ({card['date']}; {card['note']})")
+        return {"policies": cards}
+
+
+@record
 class Eval(PolicyOptions):
-    """Evaluate a trained run, or a task's scripted policy, over complete episodes from fresh resets."""
+    """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from fresh resets."""
 
     json: Json = False
     episodes: PositiveInt = 512

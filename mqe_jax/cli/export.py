@@ -19,8 +19,8 @@ from mqe_jax.settings import record
 class Export:
     """Write a trained policy, together with the walk policy, as one ONNX graph."""
 
-    run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Run folder, or policy file."""
+    run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK|RUN")]
+    """Task with a shipped policy, run folder, or policy file."""
     onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write (.onnx)."""
     json: Json = False

@@ -62,29 +62,36 @@ class PolicyOptions(TaskOptions):
     """Id of a task, or run folder."""
     policy: PolicyName = None
     """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
-    a run folder, or a policy file. Default: that of the given run; of a task: scripted if it has one, else forward."""
+    a task with a shipped policy, a run folder, or a policy file. Default: that of the given run; of a task: the shipped
+    one (see `mqe zoo`), else scripted, else forward."""
     opponent: PolicyName = None
-    """Policy of team 1 in a match: what --policy accepts. Default: idle."""
+    """Policy of team 1 in a match: what --policy accepts. Default: the same as team 0 where that is the shipped one by
+    default, else idle."""
     deterministic: bool = False
-    """Use a trained policy's mean actions; otherwise they are sampled, as in training."""
+    """Use a trained policy's mean actions; otherwise they are sampled, as in training, or as a shipped policy's card
+    declares."""
     seed: Seed = 0
 
     def environments(self, num_envs: int) -> tuple[Any, Any, Policy]:
         """Returns task and vectorised environment as `make_env`, and the policy of all agents.
 
-        A run has its own task, parameters and policy; a task has its scripted policy, or forward if it has none.
+        A run has its own task, parameters and policy; a task has its shipped policy, if its parameters are the default
+        ones, its scripted policy, or forward if it has neither.
         """
+        from mqe_jax import zoo
         from mqe_jax.cli import setup
         from mqe_jax.envs import ALIASES, PLANNERS
         from mqe_jax.policies import all_agents, load_opponent, load_policy
 
         task, params = ALIASES.get(self.target, self.target), self.overrides()
-        name = self.policy or ("scripted" if task in PLANNERS else "forward")
+        shipped = task in zoo.names() and not params and self.policy is None
+        name = task if shipped else self.policy or ("scripted" if task in PLANNERS else "forward")
         if os.sep in self.target or Path(self.target).exists():
             config = setup.run_config(self.target)
             task, params, name = config.task, {**config.env, **params}, self.policy or self.target
         env, vector_env = setup.make_env(task, self.impl, params, num_envs)
-        own, opponent = load_policy(name, env, deterministic=self.deterministic), None
+        own = load_policy(name, env, deterministic=self.deterministic)
+        opponent = own if shipped and len(env.teams) > 1 else None
         if self.opponent is not None:
             opponent = load_opponent(self.opponent, env, deterministic=self.deterministic)
         return env, vector_env, all_agents(env, own, opponent)

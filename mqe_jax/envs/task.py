@@ -29,6 +29,8 @@ class Task(Generic[S, P]):
 
     name: ClassVar[str] = ""
     """Id of the task."""
+    version: ClassVar[int] = 1
+    """Version of scene, observation and reward: policies of another one are outdated (`mqe_jax.zoo`)."""
     title: ClassVar[str] = ""
     """Display title: the paper's name if the task is in the paper."""
     Params: ClassVar[type[Any]] = TaskParams

@@ -1,0 +1,80 @@
+"""Shipped policies: one file per task, with a card of how it was trained and what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge
+
+from mqe_jax.envs import TASKS
+from mqe_jax.errors import InputError
+from mqe_jax.settings import NonNegative, PositiveInt, build, record, to_mapping
+from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
+
+FOLDER = Path(__file__).parent
+
+
+@record
+class Card:
+    """How a shipped policy was trained, and its results."""
+
+    version: PositiveInt
+    """Version of the task (`QuadrupedEnv.version`)."""
+    mode: Literal["deterministic", "sampled"]
+    """How it is meant to act."""
+    command: str
+    """Command that trained it."""
+    date: str
+    """Of the training, year-month-day."""
+    note: str
+    """Hardware, what shared it, how the policy was chosen."""
+    gpu_minutes: NonNegative | None
+    """Time on one GPU, min; none where it was not recorded."""
+    episodes: Annotated[int, Ge(1)]
+    """Episodes behind each result."""
+    results: Mapping[str, float]
+    """Rates in fresh episodes, such as success, or win/scripted and loss/scripted."""
+
+
+def names() -> list[str]:
+    """Returns the tasks that have a shipped policy."""
+    return sorted(file.stem for file in FOLDER.glob("*.safetensors"))
+
+
+def file_of(task: str) -> Path:
+    """Returns the file of a task's shipped policy, whether or not there is one."""
+    return FOLDER / f"{task}.safetensors"
+
+
+def card(task: str) -> Card:
+    """Returns the card of a task's shipped policy.
+
+    Raises:
+        InputError: where there is none, or it was trained on another version of the task.
+    """
+    if task not in names():
+        raise InputError(f"policy: none is shipped for {task!r}; shipped: {', '.join(names())}")
+    about = build(Card, read_metadata(file_of(task), kind="policy")["card"])
+    if about.version != TASKS[task].version:
+        raise InputError(
+            f"policy: the shipped one of {task} was trained on version {about.version} of the task, which has version "
+            f"{TASKS[task].version} now; train one: mqe train {task}"
+        )
+    return about
+
+
+def load(task: str) -> TrainedPolicy:
+    """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
+    about = card(task)
+    policy = read_policy(file_of(task))
+    return TrainedPolicy(**{**vars(policy), "deterministic": about.mode == "deterministic"})
+
+
+def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
+    """Writes a policy with its card, its parameters as float16; returns the file."""
+    metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
+    shipped = TrainedPolicy(**{**vars(policy), "metadata": metadata})
+    return save_policy(folder, shipped, file_of(policy.task).name, half=True)
