@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from browser import open_page
+from viewer import open_page
 
 from mqe_jax import make
 from mqe_jax.export.scene import scene_settings, scene_xml

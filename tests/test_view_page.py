@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import open_page
-from viewer import Client, Panel, bad_frames, free_port
+from viewer import Client, Panel, bad_frames, free_port, open_page
 
 STARTUP = 240.0  # s, on a loaded machine without compiled programs
 

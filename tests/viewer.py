@@ -1,8 +1,11 @@
-"""For the tests of the viewer: a session without physics, a client that is no browser, and messages to refuse."""
+"""For tests of viewer and docs/play: a page in Chromium, a session without physics, a client, messages to refuse."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import shutil
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -12,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import skills
@@ -255,3 +259,20 @@ def _raw(rng: np.random.Generator, panel: Panel) -> bytes | str:
         lambda: '{"type": "ViewerCameraMessage"}',
     )
     return _pick(rng, makers)()
+
+
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+
+
+@contextlib.contextmanager
+def open_page(width: int, height: int) -> Iterator[Any]:
+    """Opens an empty page of width x height pixels; without Chromium or playwright the test is skipped."""
+    program = os.environ.get("MQE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+    if program is None:
+        pytest.skip("no Chromium here (tools/install.sh chromium installs Debian's)")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=FLAGS)
+        yield browser.new_page(viewport={"width": width, "height": height})
+        browser.close()
