@@ -6,6 +6,11 @@ One scene has every kind of object; the soak compares all tasks. `python -m test
 from __future__ import annotations
 
 import dataclasses
+import gc
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,6 +21,7 @@ import pytest
 
 from mqe_jax import engines
 from mqe_jax.engines import Engine
+from mqe_jax.engines.host_call import host_call
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
 from mqe_jax.robots import read_robots
@@ -210,3 +216,72 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
     lifted = after.data.qpos.at[:, env.index.base_qpos[0, 2]].add(1.0)
     after = step(dataclasses.replace(after, data=after.data.replace(qpos=lifted)), jnp.zeros((3, 1, 12)))
     assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
+
+
+# -- host functions in compiled programs, and programs that are stored ---------------------------------------------
+
+
+class Owner:
+    """Keeps its functions alive."""
+
+
+def called(function: Any, number: int, owner: Owner) -> Any:
+    """A compiled program that calls a host function of two arrays (3,)."""
+    result = jax.ShapeDtypeStruct((3,), jnp.float32)
+    return jax.jit(jax.vmap(lambda x, y: host_call(number, owner, function, result, (x, y))))
+
+
+def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change() -> None:
+    seen = []
+
+    def add(owner: Owner, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        seen.append((x.shape, y.dtype.name, x.flags.writeable))
+        return x + y
+
+    owner = Owner()
+    x, y = jnp.arange(6.0).reshape(2, 3), jnp.array([[1, 2, 3], [4, 5, 6]], jnp.int32)
+    np.testing.assert_array_equal(called(add, 1, owner)(x, y), x + y)
+    assert seen == [((2, 3), "int32", False)]
+
+
+def test_what_a_host_function_raises_ends_the_program() -> None:
+    def fail(owner: Owner, *arrays: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt
+
+    owner = Owner()
+    with pytest.raises(jax.errors.JaxRuntimeError, match="KeyboardInterrupt"):
+        called(fail, 2, owner)(jnp.zeros((2, 3)), jnp.zeros((2, 3))).block_until_ready()
+
+
+def test_a_program_without_its_environment_says_so() -> None:
+    owner = Owner()
+    program = called(lambda owner, x, y: x + y, 3, owner).lower(jnp.zeros((1, 3)), jnp.zeros((1, 3))).compile()
+    np.testing.assert_array_equal(program(jnp.ones((1, 3)), jnp.ones((1, 3))), jnp.full((1, 3), 2.0))
+    del owner
+    gc.collect()
+    with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="no longer exists"):
+        program(jnp.ones((1, 3)), jnp.ones((1, 3))).block_until_ready()
+
+
+SECOND_START = """
+import jax, mqe_jax
+hits = []
+jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.rsplit("/", 1)[-1]))
+env = mqe_jax.VectorEnv(mqe_jax.make("go1plane", impl="c", control="position"), 2)
+state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+for _ in range(3):
+    state = jax.jit(env.step)(state, jax.numpy.full((2, env.num_agents, 12), 0.3))
+print(hits.count("cache_hits"), hits.count("cache_misses"), float(state.data.qpos.sum()))
+"""
+
+
+def test_a_second_process_compiles_no_step_of_the_c_engine(tmp_path: Path) -> None:
+    """It loads what the first one compiled, and computes the same."""
+    keep = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    run = [sys.executable, "-c", SECOND_START]
+    first, second = (
+        subprocess.run(run, env={**os.environ, **keep}, capture_output=True, text=True, check=True).stdout.split()
+        for _ in range(2)
+    )
+    assert int(first[1]) >= 2 and int(second[1]) == 0 and int(second[0]) == int(first[0]) + int(first[1])
+    assert first[2] == second[2]

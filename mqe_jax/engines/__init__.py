@@ -3,7 +3,7 @@
 | name (`impl`) | engine | hardware |
 |---|---|---|
 | `warp` | MJX, Warp implementation | NVIDIA GPU (CPU for tests) |
-| `c` | MuJoCo's own C engine on all cores, called through `jax.pure_callback` | CPU |
+| `c` | MuJoCo's own C engine on all cores, called through XLA's foreign function interface | CPU |
 | `jax` | MJX, JAX implementation | CPU, GPU, TPU |
 """
 

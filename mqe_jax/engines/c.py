@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -14,6 +16,7 @@ from mujoco.batch import Batch
 
 from mqe_jax.engines import private
 from mqe_jax.engines.engine import Engine
+from mqe_jax.engines.host_call import host_call
 from mqe_jax.robots.motors import CLAMP, Motors
 
 if TYPE_CHECKING:
@@ -32,6 +35,9 @@ class CEngine(Engine):
         self._model = model.__copy__()
         # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        content = np.zeros(mujoco.mj_sizeModel(self._model), np.uint8)
+        mujoco.mj_saveModel(self._model, None, content)
+        self._content = content.tobytes()
         self._batches: dict[tuple[int, tuple[str, ...], bool], Batch] = {}
         self._rows: dict[int, tuple[Motors, np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
@@ -59,21 +65,12 @@ class CEngine(Engine):
         forces = (data.xfrc_applied,) if forced else ()
         mocap = (data.mocap_pos, data.mocap_quat) if self.model.nmocap else ()
 
-        def call(qpos: Any, *rest: Any) -> np.ndarray:
-            return self._call(names, forced, num_substeps, qpos, *rest)
+        def call(engine: CEngine, *arrays: np.ndarray) -> np.ndarray:
+            return engine._call(names, forced, num_substeps, *arrays)
 
-        row = jax.pure_callback(
-            call,
-            out,
-            data.qpos,
-            data.qvel,
-            data.qacc_warmstart,
-            data.ctrl,
-            *mocap,
-            *forces,
-            *(fields[name] for name in names),
-            vmap_method="broadcast_all",
-        )
+        start = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)
+        arguments = (*start, *mocap, *forces, *(fields[name] for name in names))
+        row = host_call(self._number(names, forced, num_substeps), self, call, out, arguments)
         qpos, qvel, warmstart, sensordata = jnp.split(row, np.cumsum(self._sizes)[:-1])
         data = data.replace(
             qpos=qpos,
@@ -84,8 +81,15 @@ class CEngine(Engine):
         )
         return data, jnp.zeros((), bool)
 
-    def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: Any) -> np.ndarray:
-        qpos, *rest = (np.asarray(array) for array in arrays)
+    def _number(self, *options: Any) -> int:
+        """Returns a number that names the physics with these options: of its content, not of this process."""
+        motors = () if self.motors is None else dataclasses.astuple(self.motors)
+        content = hashlib.sha256(self._content)
+        content.update(repr((*options, [np.asarray(value).tolist() for value in motors])).encode())
+        return int.from_bytes(content.digest()[:8], "little", signed=True)
+
+    def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray) -> np.ndarray:
+        qpos, *rest = arrays
         lead = qpos.shape[:-1]
         count = int(np.prod(lead)) if lead else 1
         flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])

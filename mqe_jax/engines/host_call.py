@@ -1,0 +1,175 @@
+"""Host functions called from compiled programs by name and number, so that JAX's compilation cache can store them.
+
+JAX does not store programs that contain its own callbacks, since those hold addresses of this process. Here a program
+holds a number that a function has in every process; XLA calls one handler, a C function made by ctypes, which finds the
+function by that number. The structures are those of XLA's stable C interface (`jax.ffi.include_dir()`,
+xla/ffi/api/c_api.h, version 0.3).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Callable, Sequence
+from ctypes import POINTER, Structure, c_char_p, c_int, c_int64, c_size_t, c_void_p
+from typing import Any
+
+import jax
+import numpy as np
+
+TARGET = "mqe_jax_host_call"
+_VERSION = 0, 3
+_METADATA, _EXECUTE, _INTERNAL = 1, 3, 13
+_DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 11: np.float32, 12: np.float64}
+
+HostFunction = Callable[..., np.ndarray]
+"""Maps arrays to one array; it must not keep the arrays, whose memory belongs to XLA."""
+
+
+class _Extension(Structure):
+    pass
+
+
+_Extension._fields_ = [("struct_size", c_size_t), ("type", c_int), ("next", POINTER(_Extension))]
+
+
+class _Version(Structure):
+    _fields_ = [("struct_size", c_size_t), ("extension", c_void_p), ("major", c_int), ("minor", c_int)]
+
+
+class _Metadata(Structure):
+    _fields_ = [("struct_size", c_size_t), ("version", _Version)]
+
+
+class _MetadataExtension(Structure):
+    _fields_ = [("base", _Extension), ("metadata", POINTER(_Metadata))]
+
+
+class _Buffer(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t),
+        ("extension", c_void_p),
+        ("dtype", c_int),
+        ("data", c_void_p),
+        ("rank", c_int64),
+        ("dims", POINTER(c_int64)),
+    ]
+
+
+class _Scalar(Structure):
+    _fields_ = [("dtype", c_int), ("value", POINTER(c_int64))]
+
+
+class _List(Structure):
+    """XLA_FFI_Args and XLA_FFI_Rets."""
+
+    _fields_ = [
+        ("struct_size", c_size_t),
+        ("extension", c_void_p),
+        ("size", c_int64),
+        ("types", c_void_p),
+        ("items", POINTER(POINTER(_Buffer))),
+    ]
+
+
+class _Attributes(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t),
+        ("extension", c_void_p),
+        ("size", c_int64),
+        ("types", c_void_p),
+        ("names", c_void_p),
+        ("items", POINTER(POINTER(_Scalar))),
+    ]
+
+
+class _ErrorArguments(Structure):
+    _fields_ = [("struct_size", c_size_t), ("extension", c_void_p), ("message", c_char_p), ("code", c_int)]
+
+
+class _Api(Structure):
+    """The beginning of XLA_FFI_Api."""
+
+    _fields_ = [
+        ("struct_size", c_size_t),
+        ("extension", c_void_p),
+        ("version", _Version),
+        ("internal", c_void_p),
+        ("create_error", ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
+    ]
+
+
+class _Frame(Structure):
+    _fields_ = [
+        ("struct_size", c_size_t),
+        ("extension", POINTER(_Extension)),
+        ("api", POINTER(_Api)),
+        ("context", c_void_p),
+        ("stage", c_int),
+        ("arguments", _List),
+        ("results", _List),
+        ("attributes", _Attributes),
+    ]
+
+
+_owners: dict[int, weakref.WeakKeyDictionary[Any, HostFunction]] = {}
+"""Functions of each number by their owners; they do the same, so any that lives will do."""
+
+
+def host_call(
+    number: int, owner: Any, function: HostFunction, result: jax.ShapeDtypeStruct, arguments: Sequence[jax.Array]
+) -> jax.Array:
+    """Returns the result of a host function in a compiled program; batched with all its arguments by `vmap`.
+
+    Args:
+        number: of the function, the same in every process (64 bits); functions of one number do the same.
+        owner: an object that must live as long as the program is called.
+        function: called with an owner of this number, and the arguments as arrays; it must not reference the owner.
+        result: shape and dtype of its result without batch axes.
+        arguments: arrays.
+    """
+    _owners.setdefault(number, weakref.WeakKeyDictionary())[owner] = function
+    call = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")
+    out = call(*arguments, number=np.int64(number))
+    assert isinstance(out, jax.Array)
+    return out
+
+
+def _array(buffer: _Buffer, *, writable: bool = False) -> np.ndarray:
+    shape = tuple(buffer.dims[i] for i in range(buffer.rank))
+    dtype = np.dtype(_DTYPES[buffer.dtype])
+    size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    memory: Any = (ctypes.c_char * size).from_address(buffer.data) if size else bytearray()
+    array = np.frombuffer(memory, dtype).reshape(shape)
+    array.flags.writeable = writable
+    return array
+
+
+def _execute(frame: _Frame) -> None:
+    number = frame.attributes.items[0].contents.value[0]
+    owner, function = next(iter(_owners.get(number, {}).items()), (None, None))
+    if function is None:
+        raise RuntimeError("the environment of this compiled program no longer exists")
+    arguments = [_array(frame.arguments.items[i].contents) for i in range(frame.arguments.size)]
+    np.copyto(_array(frame.results.items[0].contents, writable=True), function(owner, *arguments))
+
+
+@ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
+def _handler(pointer: Any) -> int | None:
+    frame = pointer.contents
+    if frame.extension and frame.extension.contents.type == _METADATA:
+        about = ctypes.cast(frame.extension, POINTER(_MetadataExtension)).contents.metadata.contents
+        about.version.major, about.version.minor = _VERSION
+        return None
+    if frame.stage != _EXECUTE:
+        return None
+    try:
+        _execute(frame)
+    except BaseException as error:  # an exception does not cross the C function
+        message = f"{type(error).__name__}: {error}".encode()
+        arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
+        return frame.api.contents.create_error(ctypes.byref(arguments))
+    return None
+
+
+jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
