@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from mqe_jax import zoo
 from mqe_jax.envs import TaskParams
+from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
 from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
@@ -84,8 +85,8 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
     """Returns the policy of a name, a run folder or a policy file.
 
     Args:
-        source: one of `NAMES`, a task with a shipped policy (`mqe_jax.zoo`), or a path; a folder with one of these
-            names is given as ./NAME.
+        source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy (`mqe_jax.zoo`), or a path;
+            a folder with one of these names is given as ./NAME.
         env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
         deterministic: whether a trained policy acts with its mean actions; a shipped one does so too where its card
             declares it.
@@ -97,15 +98,16 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
         InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
             scripted policy.
     """
-    if str(source) in NAMES:
+    further = () if env is None else tuple(NAMED_PLANNERS.get(env.name, ()))
+    if str(source) in (*NAMES, *further):
         if env is None:
             raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
         return SimplePolicy(env.name, team_size(env), _plan(str(source), env))
     if str(source) in zoo.names():
         policy = zoo.load(str(source))
     elif not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
-        hint = nearest(str(source), (*NAMES, *zoo.names()))
-        allowed = f"{', '.join(NAMES)}, {', '.join(zoo.names())}, a run folder, or a policy file"
+        hint = nearest(str(source), (*NAMES, *further, *zoo.names()))
+        allowed = f"{', '.join((*NAMES, *further, *zoo.names()))}, a run folder, or a policy file"
         raise InputError(f"policy: unknown {str(source)!r}{hint}; allowed: {allowed}")
     else:
         policy = read_policy(source)
@@ -159,8 +161,8 @@ def all_agents(env: Any, policy: Policy, opponent: Policy | None = None) -> Poli
 
 def _plan(name: str, env: Any) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Returns the function of observations (N, A, O) and a key that is the policy of a name."""
-    if name == "scripted":
-        scripted = _scripted(env)
+    if name not in NAMES or name == "scripted":
+        scripted = _scripted(env, name)
         return lambda obs, key: scripted(obs)
     shape = (team_size(env), env.action_size)
     if name == "random":
@@ -169,14 +171,14 @@ def _plan(name: str, env: Any) -> Callable[[jax.Array, jax.Array], jax.Array]:
     return lambda obs, key: jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
 
 
-def _scripted(env: Any) -> Callable[[jax.Array], jax.Array]:
-    """Returns the task's scripted policy for a batch: observations (N, A, O) to actions (N, A, 3)."""
-    plan = scripted_policy(env)
+def _scripted(env: Any, name: str) -> Callable[[jax.Array], jax.Array]:
+    """Returns a scripted policy of the task for a batch: observations (N, A, O) to actions (N, A, 3)."""
+    plan = scripted_policy(env, name)
     if env.control != "command":
         raise InputError(
-            f"policy: 'scripted' outputs walk commands; control must be 'command', not {env.control!r}; "
+            f"policy: {name!r} outputs walk commands; control must be 'command', not {env.control!r}; "
             "with it give --policy random or idle"
         )
     if tuple(env.params.commands) != TaskParams.commands:
-        raise InputError(f"commands: {env.params.commands}; policy 'scripted' outputs {TaskParams.commands}")
+        raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")
     return jax.vmap(plan)

@@ -14,6 +14,7 @@ import pytest
 from mqe_jax import cli, zoo
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
 from mqe_jax.errors import InputError
 from mqe_jax.planners import planner_of
 from mqe_jax.planners.cooperative import plan_seesaw
@@ -135,3 +136,20 @@ def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> Non
         assert planner_of(task).__module__.startswith("mqe_jax.planners.")
     with pytest.raises(InputError, match=r"go1plane has no scripted policy; allowed for: go1gate, "):
         planner_of("go1plane")
+
+
+def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ahead(obs: dict[str, jax.Array]) -> jax.Array:
+        return jnp.zeros((len(obs["base"]), 3)).at[:, 0].set(0.7)
+
+    monkeypatch.setitem(NAMED_PLANNERS, "go1wrestling", {})
+    register_planner("go1wrestling", "ahead", ahead)
+    env = make("go1wrestling", impl="c", num_envs=1)
+    action, _ = load_policy("ahead", env).act(jnp.zeros((2, 1, 12)), (), jax.random.PRNGKey(0))
+    np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
+    with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1gate"):
+        load_policy("ahead", make("go1tug", impl="c", num_envs=1))
+    with pytest.raises(InputError, match="already registered for go1wrestling"):
+        register_planner("go1wrestling", "ahead", lambda obs: obs["base"])
+    with pytest.raises(InputError, match="unknown task 'go1sumo'"):
+        register_planner("go1sumo", "ahead", ahead)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeVar
 
-import mqe_jax.walk_policy  # noqa: F401  (registers itself)
-from mqe_jax import robots, skills
+from mqe_jax import robots, skills, walk_policy  # noqa: F401  (a skill registers itself)
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, Range, fail, record

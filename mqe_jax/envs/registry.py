@@ -31,6 +31,9 @@ _SHIPPED: tuple[tuple[str, str | None], ...] = (
     ("football:Go1Football2vs2", "football:plan_2vs2"),
 )
 
+# Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.planners.
+_NAMED: list[tuple[str, str, str]] = []
+
 # Alternative ids, from the released system.
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
@@ -39,6 +42,22 @@ TASKS: dict[str, type[QuadrupedEnv]] = {}
 
 PLANNERS: dict[str, Planner | str] = {}
 """Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
+
+
+NAMED_PLANNERS: dict[str, dict[str, Planner | str]] = {}
+"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`), as those of `PLANNERS`."""
+
+
+def register_planner(task: str, name: str, planner: Planner | str) -> None:
+    """Registers a further scripted policy of a task under a name.
+
+    Raises:
+        InputError: if the task is unknown, or another one has the name.
+    """
+    if task not in TASKS:
+        raise InputError(f"planner {name!r}: unknown task {task!r}; allowed: {', '.join(TASKS)}")
+    if NAMED_PLANNERS.setdefault(task, {}).setdefault(name, planner) is not planner:
+        raise InputError(f"planner: the name {name!r} is already registered for {task}")
 
 
 def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
@@ -68,3 +87,5 @@ def load(package: str, path: str) -> Any:
 
 for _task, _planner in _SHIPPED:
     register_task(load("mqe_jax.envs", _task), _planner)
+for _id, _name, _path in _NAMED:
+    register_planner(_id, _name, _path)
