@@ -29,7 +29,7 @@ FAKE += ["--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes"
 PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_env.py"))]
 GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
 GATE += ["--num-envs", "4", "--rollout-steps", "8", "--ppo.minibatches", "2", "--checkpoint.every", "100000"]
-GATE += ["--total-steps", str(100 * 32), "--evaluation.every", "None"]
+GATE += ["--total-steps", str(100 * 32)]
 
 
 def start(command: list[str]) -> subprocess.Popen[str]:
@@ -241,7 +241,6 @@ def start_training(run_dir: Path, *flags: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
     command += ["--run-dir", str(run_dir), "--num-envs", str(ENVS), "--rollout-steps", str(ROLLOUT)]
     command += ["--total-steps", str(STEPS * ENVS * ROLLOUT), "--ppo.minibatches", "2", "--checkpoint.every", "1"]
-    command += ["--evaluation.every", "None"]
     return subprocess.Popen([*command, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
 
 

@@ -22,7 +22,6 @@ from mqe_jax.train import evaluate as evaluation
 from mqe_jax.train import runner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import env_dims, make_learner
-from mqe_jax.train.monitor import EvaluationLog
 from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy
 from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
@@ -37,7 +36,7 @@ def demo(arguments: Demo) -> None:
     config = for_task(base_config(DEMO_TASK, arguments.config), DEMO_TASK)
     check_folder(run_dir)
     env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
-    training_env, eval_env = environments(arguments.impl, config, 1)
+    training_env, _ = environments(arguments.impl, config, 1)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
 
@@ -49,10 +48,8 @@ def demo(arguments: Demo) -> None:
     table = {"before": _measure(vector_env, before, arguments.episodes, config)}
     print(f"before training: {_summary(table['before'])}", flush=True)
     with interrupts.before_exit(lambda: "the same command resumes from here"):
-        runner.train(training_env, config, run_dir, resume=True, eval_env=eval_env)
+        runner.train(training_env, config, run_dir, resume=True)
     after = read_policy(run_dir)
-    if eval_env is not None:  # the best of the evaluations during training, in fresh episodes
-        after, _ = EvaluationLog(run_dir, config.num_updates * config.steps_per_update).best_policy()
     table["after"] = _measure(vector_env, after, arguments.episodes, config)
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
     curves.draw_curve([run_dir], run_dir / "curve.png", DEMO_TASK, "Narrow Gate, trained on the CPU")
