@@ -119,23 +119,23 @@ def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Propr
     ).astype(jnp.float32)
 
 
-def _mlp(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array) -> jax.Array:
+def _mlp(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str) -> jax.Array:
     """Applies a Sequential of linear layers (named 0, 2, 4, ...; weight (out, in)) with ELU between them."""
     names = sorted(layers, key=int)
     for name in names:
-        x = jnp.matmul(x, layers[name]["weight"].T, precision="highest") + layers[name]["bias"]
+        x = jnp.matmul(x, layers[name]["weight"].T, precision=precision) + layers[name]["bias"]
         x = x if name == names[-1] else jax.nn.elu(x)
     return x
 
 
-def infer_latent(params: Params, history: jax.Array) -> jax.Array:
+def infer_latent(params: Params, history: jax.Array, *, precision: str = "highest") -> jax.Array:
     """Estimates the latent (..., 2) from flattened histories (..., 2100)."""
-    return _mlp(params["adaptation"], history)
+    return _mlp(params["adaptation"], history, precision)
 
 
-def infer_action(params: Params, history: jax.Array, latent: jax.Array) -> jax.Array:
+def infer_action(params: Params, history: jax.Array, latent: jax.Array, *, precision: str = "highest") -> jax.Array:
     """Computes unclipped actions (..., 12) from flattened histories (..., 2100) and latents (..., 2)."""
-    return _mlp(params["body"], jnp.concatenate([history, latent], axis=-1))
+    return _mlp(params["body"], jnp.concatenate([history, latent], axis=-1), precision)
 
 
 @register

@@ -24,6 +24,7 @@ from mqe_jax.walk.task import LATENT_TARGET
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 _CRITIC = (512, 256, 128)
+_PRECISION = "tensorfloat32"  # full float32 products over 2100 numbers would take most of an update on a GPU
 
 
 @register_network("walk")
@@ -85,8 +86,9 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         return NetworkMemory(jnp.zeros((num_envs, HISTORY - 1, OBSERVATION_SIZE)), ())
 
     def mean_of(params: Params, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-        latent = walk_policy.infer_latent(params["policy"], flat)
-        return walk_policy.infer_action(params["policy"], flat, jax.lax.stop_gradient(latent)), latent
+        policy = params["policy"]
+        latent = walk_policy.infer_latent(policy, flat, precision=_PRECISION)
+        return walk_policy.infer_action(policy, flat, jax.lax.stop_gradient(latent), precision=_PRECISION), latent
 
     def act(
         params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
@@ -100,7 +102,7 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
     def value(
         params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
     ) -> tuple[jax.Array, Memory]:
-        return nn.mlp(params["critic"], privileged, jax.nn.elu), memory
+        return nn.mlp(params["critic"], privileged, jax.nn.elu, precision=_PRECISION), memory
 
     def evaluate(
         params: Params,
@@ -116,7 +118,9 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
         losses = {"adaptation": settings.adaptation_coef * error}
         if settings.symmetry_coef > 0:
-            losses["symmetry"] = settings.symmetry_coef * symmetry_loss(params["policy"], flat, mean)
+            losses["symmetry"] = settings.symmetry_coef * symmetry_loss(
+                params["policy"], flat, mean, precision=_PRECISION
+            )
         return Evaluation(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),
             entropy(log_std)[..., None],

@@ -44,15 +44,18 @@ def mirror_action(action: jax.Array) -> jax.Array:
     return action[..., MIRRORED_JOINTS] * MIRRORED_SIGNS
 
 
-def symmetry_loss(params: walk_policy.Params, flat: jax.Array, mean: jax.Array) -> jax.Array:
+def symmetry_loss(
+    params: walk_policy.Params, flat: jax.Array, mean: jax.Array, *, precision: str = "highest"
+) -> jax.Array:
     """Returns the mean square difference () between the actions of mirrored histories and the mirrored actions.
 
     Args:
         params: weights of the walk policy.
         flat: histories (B, 2100).
         mean: actions (B, 12) of `flat`.
+        precision: of matrix products.
     """
     mirrored = mirror_history(flat)
-    latent = jax.lax.stop_gradient(walk_policy.infer_latent(params, mirrored))
-    other = walk_policy.infer_action(params, mirrored, latent)
+    latent = jax.lax.stop_gradient(walk_policy.infer_latent(params, mirrored, precision=precision))
+    other = walk_policy.infer_action(params, mirrored, latent, precision=precision)
     return jnp.mean(jnp.square(other - mirror_action(mean)))

@@ -133,7 +133,7 @@ def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Ar
     angle = uniform(-jnp.pi, jnp.pi)
     slope = jnp.where(chance(task.slope_share), uniform(0.0, task.slope), 0.0) * difficulty
     direction = uniform(-jnp.pi, jnp.pi)
-    force = jnp.where(chance(0.4), uniform(0.0, task.force), 0.0) * difficulty
+    force = jnp.where(chance(0.5), uniform(0.0, task.force), 0.0) * difficulty
     return EpisodeSpec(
         commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
         slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),

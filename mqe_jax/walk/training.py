@@ -19,13 +19,13 @@ from mqe_jax.walk.task import WalkTask
 WALK = TrainConfig(
     task="walk",
     num_envs=8192,
-    total_steps=240_000_000,
+    total_steps=360_000_000,
     rollout_steps=24,
     stagger_episodes=True,
     seed=1,
     ppo=PPO(epochs=5, minibatches=4, huber_delta=None, value_coef=2.0),
     optimizer=OptimizerSettings(
-        learning_rate=1e-3, schedule="linear", anneal=0.25, target_kl=0.01, eps=1e-8, max_grad_norm=1.0
+        learning_rate=1e-3, schedule="linear", anneal=0.3, target_kl=0.01, eps=1e-8, max_grad_norm=1.0
     ),
     network=WalkNetwork(),
     curriculum=Curriculum(assistance=1.0, assistance_until=0.3),
