@@ -66,7 +66,7 @@ def error_on_random_inputs(policy: TrainedPolicy, env: Any) -> float:
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
     """The command compares the graph with JAX on episodes, and prints the largest error."""
-    run, file = POLICIES / "go1football-defender" / "mappo+tuned.safetensors", tmp_path / "football.onnx"
+    run, file = zoo.file_of("go1football-defender"), tmp_path / "football.onnx"
     assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
     assert 0.0 < said["largest_error"] < 1e-5

@@ -59,7 +59,7 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     assert isinstance(policy_of("go1gate", policy="scripted"), SimplePolicy)
     assert isinstance(policy_of("go1gate", robot="go2"), SimplePolicy)  # trained on the Go1
     assert isinstance(policy_of("go1gate", set=["gate_width=0.8"]), SimplePolicy)
-    assert isinstance(policy_of("go1football-defender"), SimplePolicy)  # none is shipped
+    assert isinstance(policy_of("go1football-1vs1").first, SimplePolicy)  # none is shipped
     both = policy_of("go1tug")
     assert isinstance(both, BothTeams) and both.first is both.second and isinstance(both.first, TrainedPolicy)
     alone = policy_of("go1tug", opponent="idle")
@@ -147,7 +147,7 @@ def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeyp
     env = make("go1wrestling", impl="c", num_envs=1)
     action, _ = load_policy("ahead", env).act(jnp.zeros((2, 1, 12)), (), jax.random.PRNGKey(0))
     np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
-    with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1gate"):
+    with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"):
         load_policy("ahead", make("go1tug", impl="c", num_envs=1))
     with pytest.raises(InputError, match="already registered for go1wrestling"):
         register_planner("go1wrestling", "ahead", lambda obs: obs["base"])
