@@ -69,7 +69,7 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd:
     run, file = zoo.file_of("go1football-defender"), tmp_path / "football.onnx"
     assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
-    assert 0.0 < said["largest_error"] < 1e-5
+    assert 0.0 < said["largest_error"] < 3e-5
     model = onnx.load(file)
     sizes = shapes(model)
     assert sizes["inputs"]["obs"] == ["N", 2, 20] and sizes["outputs"]["joint_target"] == ["N", 2, 12]
@@ -177,7 +177,7 @@ def test_every_published_policy_agrees_on_a_thousand_steps(run: Path) -> None:
     policy = load_policy(run)
     env = make(str(policy.config.task), impl="c", num_envs=1, **policy.config.env)
     found = errors(to_onnx(policy, env), *record(policy, env, 1000))
-    assert max(found.values()) < 1e-5, found
+    assert max(found.values()) < 3e-5, found
 
 
 def test_the_graph_of_a_match_is_that_of_one_team() -> None:
