@@ -212,8 +212,8 @@ class Versus(OneTeam):
 def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
-    The environments come in equal blocks, one for each opponent, in their order. Trained policies sample their actions,
-    and can be exchanged (`Versus.change`); others are fixed.
+    The environments come in equal blocks, one for each opponent, in their order. Trained policies act as they are
+    loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`); others are fixed.
 
     Args:
         env: the matches.

@@ -94,7 +94,7 @@ def task_page(task: Any) -> str:
     """Returns the page of a task."""
     env, name = task(num_envs=1, impl="c"), task.name
     body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
-    clip = f"The scripted policy (`mqe render {name}`):\n\n![{task.title}]({_clip(name)})"
+    clip = f"The scripted policy (`mqe render {name} --policy scripted`):\n\n![{task.title}]({_clip(name)})"
     media = [clip] if _clip(name) else []
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",

@@ -3,7 +3,7 @@
 `python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and evaluations.csv.gz in
 results/paper, thinned, and writes the policies of their cells' best seeds (by the absolute metric) that match
 `--policies` to results/paper/policies, with parameters as float16. It then regenerates the figures and tables of
-docs/results/paper.md from these files alone; without a SWEEP only this.
+docs/results/paper.md from results/ alone; without a SWEEP only this.
 
 `python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.
 """

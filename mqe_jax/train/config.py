@@ -162,10 +162,10 @@ class TrainConfig:
     train_env: Annotated[Mapping[str, Any], tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
     """Further overrides during training only, not in evaluation."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
-    """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, a run folder or a policy
-    file; in training also newest (the policy itself), older (a member of the league's pool, more often one that is
-    hard to beat) or uniform (any member). Several have equal shares of the environments. Without, both teams of each
-    match learn."""
+    """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, another scripted policy of
+    the task, the task itself (its shipped policy), a run folder or a policy file; in training also newest (the policy
+    itself), older (a member of the league's pool, more often one that is hard to beat) or uniform (any member). Several
+    have equal shares of the environments. Without, both teams of each match learn."""
     draw_reward: float = 0.0
     """Added to the reward where an episode against opponents ends in a draw, during training only."""
     league: LeagueSettings = LeagueSettings()
