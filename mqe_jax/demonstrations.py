@@ -1,4 +1,7 @@
-"""Training episodes that start in states of a demonstrator's episodes: a curriculum for rewards that are rarely met."""
+"""Training episodes that start in states of a demonstrator's episodes: a curriculum for rewards that are rarely met.
+
+Source: resets to demonstrated states, moved backwards as success permits (Tao et al., arXiv 2405.03379).
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,8 @@ EPISODES = 128
 """Environments in which the demonstrator acts."""
 MOMENTS = 16
 """States recorded of each, evenly spaced over the time limit."""
+WINDOW = 0.25
+"""Range of the phases from which episodes start."""
 
 
 @jax.tree_util.register_dataclass
@@ -26,20 +31,25 @@ class DemonstratedState(State[Any]):
     """States of N environments, and M states in which episodes can start."""
 
     demonstrations: PyTree
-    """Fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`."""
+    """Fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`. With `backward`
+    also `phase`, by which they are in order: of a state before the success of its episode its share of the time until
+    then, infinite of others."""
 
 
 class Demonstrated(VectorEnv):
-    """A batch of environments whose episodes start, with the probability `assistance`, in states of a demonstrator's.
+    """A batch of environments whose episodes start in states of a demonstrator's.
 
-    The time of such a state counts, so its episode has the time that was left to the demonstrator. The states are the
-    same in all runs of a task. Source: resets to demonstrated states, as in arXiv 2405.03379.
+    They do with the probability `assistance`, in any state; or, `backward`, always, in states whose phase is up to
+    `WINDOW` below the assistance. The time of such a state counts, so its episode has the time that was left to the
+    demonstrator. The states are the same in all runs of a task.
     """
 
-    def __init__(self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1) -> None:
-        """Creates the batch; `demonstrator` acts for all agents, the other arguments are those of `VectorEnv`."""
+    def __init__(
+        self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1, *, backward: bool = False
+    ) -> None:
+        """Creates the batch; `demonstrator` acts for all agents, `num_envs` and `copies` are those of `VectorEnv`."""
         super().__init__(env, num_envs, copies)
-        self.demonstrator = demonstrator
+        self.demonstrator, self.backward = demonstrator, backward
         self._guide = VectorEnv(self.env, EPISODES)
 
     def reset(self, key: jax.Array) -> DemonstratedState:
@@ -51,15 +61,18 @@ class Demonstrated(VectorEnv):
         self.check_action(action)
         assert isinstance(state, DemonstratedState), "a state of this batch"
         demonstrations = state.demonstrations
-        size = len(demonstrations["step"])
+        fields = {name: x for name, x in demonstrations.items() if name != "phase"}
 
         def start(key: jax.Array, assistance: jax.Array) -> State:
             fresh_key, choice_key, index_key = jax.random.split(key, 3)
             fresh = self.env.reset(fresh_key, assistance)
-            index = jax.random.randint(index_key, (), 0, size)
-            chosen = jax.random.bernoulli(choice_key, assistance)
+            if self.backward:
+                index, chosen = _earlier(demonstrations["phase"], assistance, index_key)
+            else:
+                index = jax.random.randint(index_key, (), 0, len(fields["step"]))
+                chosen = jax.random.bernoulli(choice_key, assistance)
             return _with_fields(
-                fresh, jax.tree.map(lambda x, y: jnp.where(chosen, x[index], y), demonstrations, _fields(fresh))
+                fresh, jax.tree.map(lambda x, y: jnp.where(chosen, x[index], y), fields, _fields(fresh))
             )
 
         def one(state: State, action: jax.Array) -> State:
@@ -69,26 +82,51 @@ class Demonstrated(VectorEnv):
         return DemonstratedState(**vars(jax.vmap(one)(plain, action)), demonstrations=demonstrations)
 
     def _record(self) -> PyTree:
-        """Returns the fields of the demonstrator's states."""
+        """Returns the fields of the demonstrator's states; with `backward` in the order of their phases."""
         guide, policy = self._guide, self.demonstrator
         first = policy.initial_memory(EPISODES)
 
-        def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], None]:
+        def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Any]:
             state, memory = carry
             action, memory = policy.act(state.obs, memory, key)
             state = guide.step(state, action)
             done = state.terminated | state.truncated
             keep = lambda start, now: jnp.where(done.reshape(-1, *(1,) * (now.ndim - 1)), start, now)  # noqa: E731
-            return (state, jax.tree.map(keep, first, memory)), None
+            decided = jnp.maximum(state.metrics["success"], state.metrics.get("team1/win", 0.0))
+            return (state, jax.tree.map(keep, first, memory)), (decided, done)
 
         def moment(carry: tuple[State, Any], keys: jax.Array) -> tuple[tuple[State, Any], PyTree]:
-            carry, _ = jax.lax.scan(advance, carry, keys)
-            return carry, _fields(carry[0])
+            carry, seen = jax.lax.scan(advance, carry, keys)
+            return carry, (_fields(carry[0]), seen)
 
         reset_key, key = jax.random.split(jax.random.PRNGKey(0))
         keys = jax.random.split(key, (MOMENTS, self.max_episode_steps // MOMENTS))
-        _, fields = jax.lax.scan(moment, (guide.reset(reset_key), first), keys)
-        return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), fields)
+        _, (fields, (decided, done)) = jax.lax.scan(moment, (guide.reset(reset_key), first), keys)
+        if self.backward:
+            fields = {**fields, "phase": _phases(decided, done)}
+        fields = jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), fields)
+        return jax.tree.map(lambda x: x[jnp.argsort(fields["phase"])], fields) if self.backward else fields
+
+
+def _earlier(phase: jax.Array, assistance: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the index () of a state with a phase (M,), in order, of up to `WINDOW` below the assistance, if any."""
+    low, high = jnp.searchsorted(phase, jnp.stack([assistance - WINDOW, assistance]))
+    return jax.random.randint(key, (), low, jnp.maximum(high, low + 1)), high > low
+
+
+def _phases(decided: jax.Array, done: jax.Array) -> jax.Array:
+    """Returns the phases of the states after each group of steps (M, E), from the steps of all (M, S, E).
+
+    Each environment's first episode counts, if it is `decided`: success of it, or of a match either team's win. The
+    moment of success is the first at which the measure of success has its largest value.
+    """
+    moments, stride = decided.shape[:2]
+    decided, done = (x.reshape(moments * stride, -1) for x in (decided, done))
+    first = jnp.cumsum(done, axis=0) - done == 0
+    decided = jnp.where(first, decided, 0.0)
+    end = jnp.argmax(decided, axis=0) + 1
+    steps = stride * jnp.arange(1, moments + 1)[:, None]
+    return jnp.where((steps < end) & (jnp.max(decided, axis=0) > 0), steps / end, jnp.inf)
 
 
 def _fields(state: State) -> dict[str, Any]:

@@ -101,9 +101,12 @@ class Versus(OneTeam):
     opponents: tuple[Policy, ...]
     """Opponent of each block at the start."""
 
-    def __init__(self, matches: VectorEnv, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
+    def __init__(
+        self, matches: VectorEnv, opponents: Sequence[Policy], draw_reward: float = 0.0, time_limit_ends: bool = False
+    ) -> None:
         super().__init__(matches, matches.num_envs)
-        self.draw_reward = draw_reward
+        self.draw_reward, self.time_limit_ends = draw_reward, time_limit_ends
+        self.privileged_observation_size += time_limit_ends
         if not opponents or self.num_envs % len(opponents):
             fail("opponents", len(opponents), f"a number that divides the number of environments, {self.num_envs}")
         for policy in opponents:
@@ -126,7 +129,7 @@ class Versus(OneTeam):
             memory = policy.initial_memory(self._size)
             opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
         action = jnp.zeros((self.num_envs, self.matches.num_agents, self.action_size))
-        return self._seen(match, action, tuple(opponents), key)
+        return self._seen(match, action, tuple(opponents), key, match.step)
 
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D); resets those that ended.
@@ -150,7 +153,7 @@ class Versus(OneTeam):
         started = tuple(
             self._restarted(i, o, done[self._block(i)], ended[self._block(i)]) for i, o in enumerate(opponents)
         )
-        return self._seen(match, both, started, key)
+        return self._seen(match, both, started, key, state.step + 1)
 
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
         """Returns the state with another opponent in a block.
@@ -189,18 +192,27 @@ class Versus(OneTeam):
         outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
         return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
 
-    def _seen(self, match: State, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array) -> TeamState:
+    def _seen(
+        self, match: State, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array, reached: jax.Array
+    ) -> TeamState:
+        """Returns the state of team 0; `reached` (N,) are the steps of the episodes at the end of the last step."""
         own = slice(0, self.num_agents)
+        ends = match.truncated & self.time_limit_ends
+
+        def timed(privileged: jax.Array, step: jax.Array) -> jax.Array:
+            left = 1.0 - step[:, None] / self.max_episode_steps
+            return jnp.concatenate([privileged, left], axis=1) if self.time_limit_ends else privileged
+
         return TeamState(
             match=match,
             action=action,
             obs=match.obs[:, own],
-            privileged_obs=match.privileged_obs,
+            privileged_obs=timed(match.privileged_obs, match.step),
             final_obs=match.final_obs[:, own],
-            final_privileged_obs=match.final_privileged_obs,
+            final_privileged_obs=timed(match.final_privileged_obs, reached),
             reward=match.reward[:, own],
-            terminated=match.terminated,
-            truncated=match.truncated,
+            terminated=match.terminated | ends,
+            truncated=match.truncated & ~ends,
             metrics={name: value for name, value in match.metrics.items() if not name.startswith("team1/")},
             step=match.step,
             assistance=match.assistance,
@@ -209,7 +221,9 @@ class Versus(OneTeam):
         )
 
 
-def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0) -> Versus:
+def versus(
+    env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0, time_limit_ends: bool = False
+) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
     The environments come in equal blocks, one for each opponent, in their order. Trained policies act as they are
@@ -219,12 +233,13 @@ def versus(env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_rew
         env: the matches.
         opponents: policies, or what `load_policy` accepts; their number divides the number of environments.
         draw_reward: added to the reward of a step that ends an episode with a draw.
+        time_limit_ends: as in `TrainConfig`.
 
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
     """
     policies = [load_opponent(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
-    return Versus(env, policies, draw_reward)
+    return Versus(env, policies, draw_reward, time_limit_ends)
 
 
 class Mirror(OneTeam):

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +84,7 @@ def history() -> list[TrainState]:
     update, states = jax.jit(learner.update), [jax.jit(learner.init)(KEY)]
     for _ in range(9):
         states.append(update(states[-1])[0])
-    return states
+    return jax.block_until_ready(states)  # while the environment exists
 
 
 def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainState]) -> None:
@@ -123,6 +127,19 @@ def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
     assert [opponent.outcomes.tolist() for opponent in state.opponents] == [[0, 2, 0], [0, 4, 0]]
 
 
+def test_the_time_limit_may_end_episodes_for_the_learner() -> None:
+    env = versus(matches(), ["idle"], time_limit_ends=True)
+    step, still = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    state = jax.jit(env.reset)(KEY)
+    assert state.privileged_obs.shape[1] == env.privileged_observation_size
+    for i in range(10):
+        np.testing.assert_allclose(state.privileged_obs[:, -1], 1.0 - 0.1 * i, atol=1e-6)
+        state = step(state, still)
+        np.testing.assert_allclose(state.final_privileged_obs[:, -1], 0.9 - 0.1 * i, atol=1e-6)
+        assert not state.truncated.any() and bool(state.terminated.all()) == (i == 9)
+    np.testing.assert_allclose(state.privileged_obs[:, -1], 1.0)
+
+
 def test_the_rating_follows_results_against_the_scripted_policy() -> None:
     sources = ("scripted", "older")
     config = config_of(sources, num_envs=2, total_steps=64)
@@ -148,23 +165,26 @@ def test_a_pool_too_small_for_its_blocks_is_refused() -> None:
         League(matches(num_envs=8), SOURCES, config)
 
 
-def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """Two seeds in one program; pool, ratings and weights are the same bit for bit."""
+def training(steps: int, *more: str) -> list[str]:
+    """Arguments of a training of `go1tug` in a league, with a snapshot every update of 16 steps."""
     arguments = ["train", "go1tug", "--impl", "c", "--set", "control=position", "--set", "episode_length=0.1"]
     arguments += ["--num-envs", "4", "--rollout-steps", "4", "--ppo.minibatches", "1", "--ppo.epochs", "1"]
-    arguments += ["--network.hidden-sizes", "8", "--checkpoint.every", "2", "--total-steps", "96", "--num-seeds", "2"]
-    arguments += [
-        "--config",
-        "paper/mappo",
-        "--league.snapshot-steps",
-        "16",
-        "--league.episodes",
-        "1",
-        "--league.members",
-        "3",
-    ]
-    for source in SOURCES:
-        arguments += ["--opponent", source]
+    arguments += ["--network.hidden-sizes", "8", "--config", "paper/mappo", "--total-steps", str(steps)]
+    arguments += ["--league.snapshot-steps", "16", "--league.episodes", "1", "--league.members", "3", *more]
+    return arguments + [word for source in SOURCES for word in ("--opponent", source)]
+
+
+def assert_same_end(expected: Path, resumed: Path) -> None:
+    """The last checkpoints, with pool, ratings, weights and environments, are the same bit for bit."""
+    first, second = (load_file(max(list_checkpoints(run))) for run in (expected, resumed))
+    assert first.keys() == second.keys() and "extra/pool/rating" in first
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
+
+
+def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    """Two seeds in one program."""
+    arguments = training(96, "--checkpoint.every", "2", "--num-seeds", "2")
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     assert cli.main([*arguments, "--run-dir", str(whole)]) == 0
     assert cli.main([*arguments, "--run-dir", str(halves)]) == 0
@@ -172,12 +192,34 @@ def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
         max(list_checkpoints(halves / seed)).unlink()
     assert cli.main([*arguments, "--run-dir", str(halves), "--resume"]) == 0
     for seed in ("seed0", "seed1"):
-        expected, resumed = (load_file(max(list_checkpoints(run / seed))) for run in (whole, halves))
-        assert expected.keys() == resumed.keys() and "extra/pool/rating" in expected
-        for name, value in expected.items():
-            np.testing.assert_array_equal(value, resumed[name], err_msg=name)
+        assert_same_end(whole / seed, halves / seed)
     header = (whole / "seed0" / "metrics.csv").read_text().splitlines()[0].split(",")
     assert {"league/win/newest", "league/loss/idle", "league/rating", "league/members"} <= set(header)
+
+
+@pytest.mark.soak
+def test_a_league_killed_five_times_ends_as_if_never_killed(tmp_path: Path) -> None:
+    """SIGKILL at random moments: while an update runs, a row or a checkpoint is written."""
+    random, updates = np.random.default_rng(), 400
+    arguments = [sys.executable, "-m", "mqe_jax.cli", *training(16 * updates, "--checkpoint.every", "3", "--resume")]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run([*arguments, "--run-dir", str(whole)], check=True, capture_output=True)
+    table = killed / "metrics.csv"
+
+    def rows() -> int:
+        return len(table.read_text().splitlines()) if table.is_file() else 0
+
+    moments = [*np.sort(random.choice(np.arange(2, updates - 40), 5, replace=False)), None]
+    for moment in moments:
+        with subprocess.Popen([*arguments, "--run-dir", str(killed)], stderr=subprocess.DEVNULL) as process:
+            while moment is not None and rows() < moment and process.poll() is None:
+                time.sleep(0.001)
+            if moment is not None:
+                time.sleep(random.uniform(0.0, 0.02))
+                process.send_signal(signal.SIGKILL)
+        assert process.returncode == (0 if moment is None else -signal.SIGKILL), moments
+    assert_same_end(whole, killed)
+    assert (whole / "policy.safetensors").read_bytes() == (killed / "policy.safetensors").read_bytes()
 
 
 @pytest.mark.parametrize("task", ["go1wrestling", "go1tug"])

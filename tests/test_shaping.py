@@ -11,15 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.demonstrations import Demonstrated
-from mqe_jax.envs import State, make
+from mqe_jax.demonstrations import Demonstrated, _earlier, _phases
+from mqe_jax.envs import Moment, State, make
+from mqe_jax.envs.reward import faded
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
 from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
 from tests.states import terms_of
 
-BOX, BALL = "go1pushbox", "go1football-defender"
+BOX, BALL, DUEL, SUMO = "go1pushbox", "go1football-defender", "go1football-1vs1", "go1wrestling"
 GOAL = np.array([12.0, 0.0])
 
 
@@ -78,6 +79,25 @@ def test_ball_and_robots_start_nearer_to_the_goal() -> None:
     np.testing.assert_array_equal(states.data.qpos[:, defender], plain.data.qpos[:, defender])
 
 
+def test_ball_and_attackers_start_nearer_to_either_goal() -> None:
+    env, states = resets(DUEL, 1.0, head_start=0.8)
+    plain = resets(DUEL, 0.0, head_start=0.8)[1]
+    moved = (object_xy(env, states, "ball") - object_xy(env, plain, "ball"))[:, 0]
+    assert moved.min() < -3.0 and moved.max() > 3.0 and abs(moved).max() <= 4.0
+    expected = np.where(moved[:, None] > 0, [1.0, 0.0], [0.0, 1.0]) * moved[:, None]
+    np.testing.assert_allclose(robots_x(env, states) - robots_x(env, plain), expected, atol=1e-6)
+
+
+def test_wrestlers_start_nearer_to_the_edge() -> None:
+    env, states = resets(SUMO, 1.0, head_start=0.5)
+    plain = resets(SUMO, 0.0, head_start=0.5)[1]
+    moved = (states.data.qpos - plain.data.qpos)[:, env.index.base_qpos[:, 1]]
+    np.testing.assert_allclose(moved[:, 0], moved[:, 1], atol=1e-6)
+    assert -0.5 <= moved.min() < -0.4 and 0.4 < moved.max() <= 0.5
+    with pytest.raises(InputError, match=r"head_start: 0.7 .* at most 0.60"):
+        make(SUMO, impl="c", head_start=0.7)
+
+
 def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
     """Reward terms of a step in which some coordinates take new values."""
     data = state.data.replace(qpos=state.data.qpos.at[jnp.asarray(columns)].set(jnp.asarray(values)))
@@ -111,6 +131,64 @@ def test_shaping_terms_of_football() -> None:
     near = lambda point: np.linalg.norm(robots - point, axis=1).min()  # noqa: E731
     assert terms["approach"] == pytest.approx(near(here) - near(moved), abs=1e-4)
     assert env.params.rewards.progress == env.params.rewards.approach == 0
+
+
+def test_one_sided_shaping_of_a_football_match() -> None:
+    """The ball advances for a team where it is nearer to the goal than ever; both teams are paid for their chase."""
+    env, states = resets(DUEL, 0.0)
+    state = jax.tree.map(lambda x: x[0], states)
+    ball = jnp.asarray(env.objects["ball"].qpos[:1])
+
+    def moved(state: State, x: float) -> tuple[State, np.ndarray]:
+        after = dataclasses.replace(state, data=state.data.replace(qpos=state.data.qpos.at[ball].set(x)))
+        now = Moment(after, env.read(after.data))
+        after = dataclasses.replace(after, task=env.step_task(Moment(state, now.robots), now))
+        return after, np.asarray(terms_of(env, state, after)[0]["advance"])
+
+    there, first = moved(state, 8.0)
+    back, second = moved(there, 6.5)
+    _, third = moved(back, 8.25)
+    np.testing.assert_allclose([first, second, third], [[1.0, 0.0], [0.0, 0.5], [0.25, 0.0]], atol=1e-4)
+    robot = jnp.asarray(env.index.base_qpos[:, 0])
+    near = dataclasses.replace(
+        state, data=state.data.replace(qpos=state.data.qpos.at[robot].add(jnp.array([0.5, 0.0])))
+    )
+    np.testing.assert_allclose(terms_of(env, state, near)[0]["chase"], [0.5, 0.0], atol=1e-2)
+
+
+def test_a_goal_of_both_needs_touches_of_both() -> None:
+    """A robot beside the ball touches it where its velocity changes."""
+    env, states = resets(BALL, 0.0)
+    state = jax.tree.map(lambda x: x[0], states)
+    ball, speed = env.objects["ball"].qpos[:2], env.objects["ball"].qvel[0]
+
+    def kicked(state: State, robot: int, change: float, apart: float = 0.4, x: float = 6.0) -> State:
+        qpos = state.data.qpos.at[jnp.asarray(ball)].set(jnp.array([x, 0.0]))
+        places = jnp.array([[2.5, 3.0], [2.5, -3.0], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
+        qpos = qpos.at[jnp.asarray(env.index.base_qpos[:, :2])].set(places)
+        after = dataclasses.replace(
+            state, data=state.data.replace(qpos=qpos, qvel=state.data.qvel.at[speed].add(change))
+        )
+        moments = [Moment(each, env.read(each.data)) for each in (state, after)]
+        return dataclasses.replace(after, task=env.step_task(*moments))
+
+    first = kicked(state, 0, 0.5)
+    assert first.task.touched.tolist() == [True, False]
+    for nothing in (kicked(state, 0, 0.05), kicked(state, 0, 0.5, apart=0.8), kicked(state, 2, 0.5)):
+        assert not nothing.task.touched.any()
+    alone, both = kicked(first, 0, 0.5, x=12.1), kicked(kicked(first, 1, 0.5), 2, 0.0, x=12.1)
+    late = kicked(alone, 1, 0.5, x=12.1)  # after the goal
+    for end, together in ((alone, False), (both, True), (late, False)):
+        outcome = env.outcome(end, env.read(end.data), jnp.array(False))
+        assert bool(outcome["success"]) and bool(outcome["success/both_touched"]) == together
+        assert bool(terms_of(env, first, end)[0]["both_touched"]) == together
+
+
+def test_shaping_terms_fade_to_their_floor() -> None:
+    terms = {"win": jnp.float32(1.0), "push": jnp.array([2.0, 3.0]), "approach": jnp.float32(4.0)}
+    scaled = faded(terms, make(SUMO, impl="c").params.rewards, 0.25)
+    assert float(scaled["win"]) == 1.0 and float(scaled["approach"]) == 1.0
+    np.testing.assert_allclose(scaled["push"], [0.5, 0.75])
 
 
 @pytest.mark.parametrize("task", [BOX, BALL])
@@ -183,3 +261,27 @@ def test_a_demonstrator_needs_assistance() -> None:
     """A demonstrator that would never be used is refused."""
     with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
         build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})
+
+
+def test_phases_end_at_the_success_of_the_first_episode() -> None:
+    """Eight steps in moments of two; episodes: decided in step 5, never, decided in step 7 after an end in step 3."""
+    success = np.zeros((8, 4))
+    success[4:, 0] = 1.0
+    success[6, 2] = 1.0
+    success[:, 3] = [0, 0.2, 0.2, 0.6, 0.6, 0.6, 0.6, 0.6]  # partly, from step 4 on
+    ended = np.zeros((8, 4), bool)
+    ended[2, 2] = True
+    phases = _phases(jnp.asarray(success).reshape(4, 2, 4), jnp.asarray(ended).reshape(4, 2, 4))
+    none = [np.inf] * 4
+    np.testing.assert_allclose(phases.T, [[0.4, 0.8, np.inf, np.inf], none, none, [0.5, *none[:3]]])
+
+
+def test_backward_starts_follow_the_assistance() -> None:
+    """The states of a start have phases in the quarter below the assistance; without such a state there is none."""
+    phase = jnp.array([0.1, 0.3, 0.5, 0.6, 0.8, 0.95, jnp.inf, jnp.inf])
+    keys = jax.random.split(jax.random.PRNGKey(0), 64)
+    for assistance, expected in ((1.0, {0.8, 0.95}), (0.7, {0.5, 0.6}), (0.4, {0.3}), (0.2, {0.1}), (0.05, set())):
+        level = jnp.float32(assistance)
+        index, chosen = jax.vmap(lambda key: _earlier(phase, level, key))(keys)  # noqa: B023
+        found = {round(float(phase[i]), 3) for i, yes in zip(index, chosen, strict=True) if yes}
+        assert found == expected and bool(chosen.all()) == bool(expected)

@@ -24,7 +24,7 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import adam
-from mqe_jax.train.schedules import scheduled
+from mqe_jax.train.schedules import next_assistance, scheduled
 
 KEY = jax.random.PRNGKey(0)
 
@@ -111,6 +111,22 @@ def test_schedules_by_hand() -> None:
     }
     for updates, values in expected.items():
         np.testing.assert_allclose(jnp.stack(scheduled(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
+
+
+def test_the_assistance_follows_success_below_its_annealed_value() -> None:
+    config = TrainConfig(curriculum=Curriculum(assistance=0.8, assistance_step=0.1))
+    fixed = TrainConfig(curriculum=Curriculum(assistance=0.8))
+    for success, before, after in (
+        (0.9, 0.5, 0.4),
+        (0.5, 0.5, 0.5),
+        (0.1, 0.5, 0.6),
+        (math.nan, 0.5, 0.5),
+        (1.0, 0.05, 0.0),
+        (0.0, 0.75, 0.8),
+    ):
+        now = jnp.float32(before), jnp.float32(success)
+        assert float(next_assistance(config, *now)) == pytest.approx(after)
+        assert float(next_assistance(fixed, *now)) == pytest.approx(0.8)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:

@@ -314,6 +314,16 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     assert result.episodes == 8 and result.episode_length == 4.0
 
 
+def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+    run_dir, trained = straight
+    state = train(PROBE, settings(start=str(run_dir), optimizer__learning_rate=1e-12, total_steps=16), tmp_path / "a")
+    for name in ("actor", "log_std"):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.params[name], trained.params[name])
+    assert float(state.obs_normalizer.obs.samples) > float(trained.obs_normalizer.obs.samples)
+    with pytest.raises(InputError, match=rf"start: {run_dir} has a policy of probe; allowed: .* this run's network"):
+        train(PROBE, settings(start=str(run_dir), network__hidden_sizes=(8,)), tmp_path / "b")
+
+
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"policy.safetensors: no such file"):
         read_policy(tmp_path)

@@ -25,7 +25,7 @@ from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
-from mqe_jax.envs.reward import weigh
+from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
@@ -250,6 +250,8 @@ class QuadrupedEnv(Task[S, P]):
         collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
         state = dataclasses.replace(state, task=self.step_task(before, Moment(state, robot_state)))
         terms = self.rewards(before, Moment(state, robot_state), collision)
+        if (floor := self.params.shaping_floor) < 1.0:
+            terms = faded(terms, vars(self.Params())["rewards"], floor + (1.0 - floor) * state.assistance)
         reward, logged = weigh(terms, self.weights, self.num_agents)
         failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
         terminated = failed | self.ending(state, robot_state)

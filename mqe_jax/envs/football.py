@@ -5,8 +5,8 @@ The field extends from x 2 to 12; the goals are gaps in the thick walls behind b
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import jax
@@ -21,7 +21,7 @@ from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.objects import Ball
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.settings import Fraction, NonNegative, Positive, PositiveInt, record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 # Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
 _GOAL_DEPTH = 1.0  # m
+_REACH = 0.6  # m; from a trunk's centre to that of a ball that the robot touches
+_IMPULSE = 0.1  # m/s; change of the ball's velocity in a step that only a touch causes
 
 BALL_BLOCKS = (Block("ball", 3, "centre, m"), Block("ball_velocity", 3, "m/s"))
 
@@ -49,6 +51,11 @@ class FootballParams(TaskParams):
     """The ball."""
     ball_noise: NonNegative = 0.0
     """Half-width of the uniform noise on the ball's position at reset, m."""
+    head_start: Fraction = 0.0
+    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match that of a team
+    drawn at random, and the robots that attack it as far forward, so that agents first learn to score from near.
+    Inactive at assistance 0.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,11 +94,33 @@ class Football(QuadrupedEnv[S, F]):
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the ball's initial position about its spot."""
+        """Samples the ball's initial position about its spot, and moves ball and robots by the head start."""
         params = self.params
+        key, start_key = jax.random.split(key) if params.head_start else (key, key)
         noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)
         position = jnp.array([*self.ball_spot, params.ball.radius]).at[:2].add(noise)
-        return qpos.at[self.objects["ball"].qpos[:3]].set(position), qvel
+        qpos = qpos.at[self.objects["ball"].qpos[:3]].set(position)
+        if params.head_start:
+            goal, attackers = self.attack(jax.random.fold_in(start_key, 1))
+            start = params.head_start * assistance * jax.random.uniform(start_key)
+            way = start * (goal - position[:2])
+            forward = jnp.where(attackers, way[0], 0.0)
+            qpos = qpos.at[self.objects["ball"].qpos[:2]].add(way).at[self.index.base_qpos[:, 0]].add(forward)
+        return qpos, qvel
+
+    def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the midpoint of a goal line (2,), m, of a head start, and which robots attack that goal (R,) bool."""
+        raise NotImplementedError(f"{type(self).__name__}: attack() is not defined")
+
+    def touches(self, before: Moment, after: Moment) -> jax.Array:
+        """Returns which robot touched the ball in a step (R,) bool: the nearest one, if the ball's velocity changed.
+
+        Contacts themselves are not read, since the engines give them in different forms.
+        """
+        changed = jnp.linalg.norm((self.ball_velocity(after.state.data) - self.ball_velocity(before.state.data))[:2])
+        apart = jnp.linalg.norm(after.robots.position_w[:, :2] - self.ball(after.state.data)[:2], axis=-1)
+        nearest = jnp.arange(len(apart)) == jnp.argmin(apart)
+        return nearest & (apart < _REACH) & (changed > _IMPULSE)
 
     def ball(self, data: mjx.Data) -> jax.Array:
         """Returns the ball's position (3,), m."""
@@ -113,7 +142,7 @@ class Football(QuadrupedEnv[S, F]):
 
 @record
 class FootballMatchRewards:
-    """Weights of the reward terms; each is a team's own term minus the opponents'.
+    """Weights of the reward terms; each is a team's own term minus the opponents', but the last two are its own alone.
 
     The released system defines no rewards for these matches; all terms except the goal are this package's.
     """
@@ -126,6 +155,19 @@ class FootballMatchRewards:
     """Per m of decrease of the distance between the ball and the team's nearest robot."""
     fall: float = -10.0
     """When a robot of the team has fallen, which ends the match as a loss."""
+    advance: float = 0.0
+    """Per m by which the ball comes nearer to that goal than before in the episode. For training alone."""
+    chase: float = 0.0
+    """As `approach`, but the opponents' is not subtracted. For training alone."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class FootballMatchState:
+    """The task's own state."""
+
+    nearest: jax.Array
+    """Smallest distance of the ball to the goal that each team attacks in this episode (2,), m."""
 
 
 @record
@@ -145,7 +187,7 @@ class Football2vs2Params(FootballParams):
     """Weights of the reward terms."""
 
 
-class FootballMatch(Football[None, F], Match[None, F]):
+class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F]):
     """Base of the football matches.
 
     - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at x 2.
@@ -157,12 +199,22 @@ class FootballMatch(Football[None, F], Match[None, F]):
     Source: paper, section III; the released system leaves rewards and observations undefined.
     """
 
-    shaping = MappingProxyType({"progress": 3.0, "approach": 1.0})
-
     @property
     def center(self) -> tuple[float, float]:
         """The centre of the field, m."""
         return float(GOALS[:, 0].mean()), 0.0
+
+    def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        side = jax.random.randint(key, (), 0, 2)
+        return jnp.asarray(GOALS)[side], jnp.asarray(self.team_of) == side
+
+    def reset_task(
+        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array
+    ) -> FootballMatchState:
+        return FootballMatchState(self.goal_distance(data))
+
+    def step_task(self, before: Moment[FootballMatchState], after: Moment[FootballMatchState]) -> FootballMatchState:
+        return FootballMatchState(jnp.minimum(before.state.task.nearest, self.goal_distance(after.state.data)))
 
     def distances(self, now: Moment) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal that each team attacks and to each team's nearest robot (2,), m."""
@@ -206,6 +258,8 @@ class FootballMatch(Football[None, F], Match[None, F]):
             "progress": self.zero_sum(goal_before - goal),
             "approach": self.zero_sum(robot_before - robot),
             "fall": self.zero_sum(self.eliminated(after.robots)),
+            "advance": (before.state.task.nearest - after.state.task.nearest)[self.team_of],
+            "chase": (robot_before - robot)[self.team_of],
         }
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:

@@ -14,7 +14,7 @@ from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
-from mqe_jax.settings import Fraction, record
+from mqe_jax.settings import record
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -32,6 +32,8 @@ class DefenderRewards:
     """Per m of decrease of the ball's distance to the goal's midpoint. Not in the paper: shaping."""
     approach: float = 0.0
     """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper: shaping."""
+    both_touched: float = 0.0
+    """In steps in which the ball is in the goal, if both robots touched it before the first goal. Not in the paper."""
 
 
 @record
@@ -40,10 +42,6 @@ class DefenderParams(FootballParams):
 
     defender_idle: bool = False
     """Whether the defender stands still."""
-    head_start: Fraction = 0.0
-    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to the goal, the two robots as far
-    forward, so that agents first learn to score from near. Inactive at assistance 0.
-    """
     rewards: DefenderRewards = DefenderRewards()
     """Weights of the reward terms."""
 
@@ -55,6 +53,8 @@ class DefenderState:
 
     scored: jax.Array
     """Whether the ball has been in the goal in this episode () bool."""
+    touched: jax.Array
+    """Which of the two robots touched the ball before that (2,) bool."""
 
 
 class Go1FootballDefender(Football[DefenderState, DefenderParams]):
@@ -86,23 +86,15 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
-        return DefenderState(jnp.zeros((), bool))
+        return DefenderState(jnp.zeros((), bool), jnp.zeros((2,), bool))
 
     def step_task(self, before: Moment[DefenderState], after: Moment[DefenderState]) -> DefenderState:
-        return DefenderState(before.state.task.scored | self.in_goal(after.state.data)[0])
+        was = before.state.task
+        touched = was.touched | (self.touches(before, after)[:2] & ~was.scored)
+        return DefenderState(was.scored | self.in_goal(after.state.data)[0], touched)
 
-    def reset_objects(
-        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Samples the ball's initial position, and moves ball and robots forward by the head start."""
-        if not self.params.head_start:
-            return super().reset_objects(key, qpos, qvel, assistance)
-        key, start_key = jax.random.split(key)
-        qpos, qvel = super().reset_objects(key, qpos, qvel, assistance)
-        ball = self.objects["ball"].qpos[:2]
-        start = self.params.head_start * assistance * jax.random.uniform(start_key)
-        way = start * (jnp.asarray(GOALS[0]) - qpos[ball])
-        return qpos.at[ball].add(way).at[self.index.base_qpos[:2, 0]].add(way[0]), qvel
+    def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.asarray(GOALS[0]), jnp.array([True, True, False])
 
     def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal's midpoint and to the nearest of the two robots (), m."""
@@ -124,13 +116,16 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         self, before: Moment[DefenderState], after: Moment[DefenderState], collision: jax.Array
     ) -> dict[str, jax.Array]:
         (goal_before, robot_before), (goal, robot) = self.distances(before), self.distances(after)
+        scoring = self.in_goal(after.state.data)[0]
         return {
-            "goal": self.in_goal(after.state.data)[0],
+            "goal": scoring,
             "nearness": jnp.exp(-goal / 3.0),
             "progress": goal_before - goal,
             "approach": robot_before - robot,
+            "both_touched": scoring & jnp.all(after.state.task.touched),
         }
 
     def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: a goal at any time in this episode."""
-        return {"success": state.task.scored}
+        """Success: a goal at any time in this episode; `success/both_touched`: one after touches by both robots."""
+        task = state.task
+        return {"success": task.scored, "success/both_touched": task.scored & jnp.all(task.touched)}

@@ -35,8 +35,6 @@ class Match(QuadrupedEnv[S, P]):
 
     symmetry: ClassVar[str] = "turn"
     """Symmetry that maps one team's frame to the other's: 'turn' or 'reflect'."""
-    shaping: ClassVar[Mapping[str, float]] = {}
-    """Weights of reward terms with which `configs/league.yaml` trains, in training only."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
 
     @property

@@ -7,7 +7,7 @@ from typing import Literal, TypeVar
 from mqe_jax import robots, skills, walk_policy  # noqa: F401  (a skill registers itself)
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, Range, fail, record
+from mqe_jax.settings import Fraction, NonNegative, Positive, PositiveInt, Range, fail, record
 
 
 @record
@@ -82,6 +82,9 @@ class TaskParams:
     """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
     first learn sequential subtasks one at a time. Inactive at assistance 0.
     """
+
+    shaping_floor: Fraction = 1.0
+    """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""
 
     def __post_init__(self) -> None:
         skills.make(self.skill, robots.get(self.robot)).check_commands(self.commands)

@@ -36,6 +36,11 @@ def weigh(terms: Mapping[str, jax.Array], weights: Any, num_agents: int) -> tupl
     return total, logged
 
 
+def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
+    """Returns the terms, those of weight 0 in the record `weights` times a factor ()."""
+    return {name: term if getattr(weights, name) else factor * term for name, term in terms.items()}
+
+
 def past(position_x: jax.Array, line_x: jax.Array | float, margin: float = 0.0) -> jax.Array:
     """Number of entities more than `margin` metres past the line x = `line_x`: (N,) -> ()."""
     return jnp.sum(position_x > line_x + margin).astype(jnp.float32)

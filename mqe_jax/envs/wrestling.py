@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, record
+from mqe_jax.settings import NonNegative, Positive, fail, record
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -51,12 +50,19 @@ class WrestlingParams(TaskParams):
     """Distance of a trunk below the platform's top at which the robot counts as out, m."""
     spawn_y: NonNegative = 1.0
     """Distance of the robots from the ring's centre, m; the first robot is on the side of negative y."""
+    head_start: NonNegative = 0.0
+    """Curriculum: both robots start up to head_start x `State.assistance` further along y, m, to a side drawn at
+    random, so that one is near the edge of the ring. Inactive at assistance 0.
+    """
     rewards: WrestlingRewards = WrestlingRewards()
     """Weights of the reward terms."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_above(self.spawn_height, self.platform.center[2], self.robot)
+        room = self.ring_radius - self.spawn_y - self.spawn_noise
+        if self.head_start > max(room, 0.0):
+            fail("head_start", self.head_start, f"at most {room:.2f}, the distance of the robots from the ring's edge")
 
 
 class Go1Wrestling(Duel[None, WrestlingParams]):
@@ -73,7 +79,6 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
     name = "go1wrestling"
     title = "Sumo Wrestling"
     Params = WrestlingParams
-    shaping = MappingProxyType({"push": 3.0, "approach": 1.0})
 
     @property
     def center(self) -> tuple[float, float]:
@@ -90,6 +95,15 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
         """Facing each other across the ring."""
         (x, y), apart = self.center, self.params.spawn_y
         return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
+
+    def reset_objects(
+        self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Moves both robots by the head start."""
+        if not self.params.head_start:
+            return qpos, qvel
+        side = self.params.head_start * assistance * jax.random.uniform(key, minval=-1.0)
+        return qpos.at[self.index.base_qpos[:, 1]].add(side), qvel
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         outward = self.distance(after.robots) - self.distance(before.robots)

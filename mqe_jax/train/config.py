@@ -86,9 +86,15 @@ class Curriculum:
     """Initial assistance of the environment (its state's `assistance`), annealed linearly to 0."""
     assistance_until: Positive = 0.5
     """Fraction of training after which the assistance is 0."""
+    assistance_step: Fraction = 0.0
+    """Change of the assistance per update by success: down where more than 80% of the update's episodes succeed, up
+    where fewer than 20% do, but never above the annealed value; 0 leaves it at that value."""
     demonstrator: str | None = None
     """Policy in states of whose episodes training episodes start, with the probability `assistance`: scripted, a run
     folder or a policy file; none starts all as the task does."""
+    backward: bool = False
+    """Start in states of the demonstrator's successful episodes (of a match: the decided ones) alone, all of them: at
+    assistance 1 in the last quarter before the success, at less in earlier ones, at 0 as the task does."""
     failure_bootstrap: Fraction = 0.0
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
@@ -168,7 +174,13 @@ class TrainConfig:
     have equal shares of the environments. Without, both teams of each match learn."""
     draw_reward: float = 0.0
     """Added to the reward where an episode against opponents ends in a draw, during training only."""
+    time_limit_ends: bool = False
+    """Whether the time limit of an episode against opponents ends it for the learner too: no value follows, and the
+    critic's privileged observation includes the time left."""
     league: LeagueSettings = LeagueSettings()
+    start: str | None = None
+    """Run folder or policy file whose policy the run starts from: its parameters and observation statistics; none
+    starts from nothing."""
     seed: Seed = 0
     """Random seed."""
     num_envs: PositiveInt = 500
@@ -195,6 +207,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.curriculum.demonstrator is not None and not self.curriculum.assistance:
             fail("curriculum.assistance", self.curriculum.assistance, "above 0 where curriculum.demonstrator is set")
+        if self.curriculum.backward and self.curriculum.demonstrator is None:
+            fail("curriculum.backward", True, "false where curriculum.demonstrator is not set")
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":
             fail("ppo.value", self.ppo.value, "'joint' when ppo.ratio is 'joint'")
         shares = len(self.opponents) or 1

@@ -30,7 +30,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
-from mqe_jax.train.schedules import Scheduled, scheduled
+from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
 from mqe_jax.train.types import Batch, LearnerHook, Params, PyTree, TraceStep, Transition, VectorEnv, replace_fields
 
 Metrics = dict[str, Any]
@@ -52,6 +52,8 @@ class TrainState:
     value_normalizer: ValueStatistics
     learning_rate: jax.Array
     """Learning rate before the schedule () float32."""
+    assistance: jax.Array
+    """Assistance of the next update () float32, unless its annealed value is below."""
     rollout: RolloutState
     key: jax.Array
     """Raw uint32 random key."""
@@ -110,6 +112,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
                 ),
                 value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
+                assistance=jnp.float32(config.curriculum.assistance),
                 rollout=RolloutState(
                     env_state=env_state,
                     memory=network.initial_memory(env.num_envs),
@@ -126,6 +129,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
         now = scheduled(config, state.updates)
+        now = now._replace(assistance=jnp.minimum(now.assistance, state.assistance))
         rollout_state, transitions, metrics = rollout(
             env,
             network,
@@ -154,6 +158,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
             obs_normalizer=obs_normalizer,
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
+            assistance=next_assistance(config, now.assistance, metrics.get("success", now.assistance)),
             rollout=rollout_state,
             key=key,
             updates=state.updates + 1,

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 
 from mqe_jax.train.config import TrainConfig
 
+_FAILING, _SUCCEEDING = 0.2, 0.8
+
 
 class Scheduled(NamedTuple):
     """Values of the scheduled settings in one update, () float32 each."""
@@ -50,3 +52,18 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
         actor_coef=(progress >= ppo.critic_warmup).astype(jnp.float32) if ppo.critic_warmup else 1.0,
         learning_rate_factor=factor,
     )
+
+
+def next_assistance(config: TrainConfig, assistance: jax.Array, success: jax.Array) -> jax.Array:
+    """Returns the assistance () after an update, before annealing, by `curriculum.assistance_step`.
+
+    Args:
+        config: settings.
+        assistance: of the update ().
+        success: rate of success of the episodes that ended in it (); NaN without any, which leaves the assistance.
+    """
+    curriculum = config.curriculum
+    if not curriculum.assistance_step:
+        return jnp.float32(curriculum.assistance)
+    up = (success < _FAILING).astype(jnp.float32) - (success > _SUCCEEDING)
+    return jnp.clip(assistance + curriculum.assistance_step * up, 0.0, curriculum.assistance)

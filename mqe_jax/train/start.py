@@ -15,6 +15,7 @@ from mqe_jax.settings import to_mapping
 from mqe_jax.train.checkpoint import load_checkpoint, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import Learner, TrainState
+from mqe_jax.train.policy import read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
 from mqe_jax.train.types import PyTree, VectorEnv
 
@@ -32,7 +33,7 @@ def first_state(
 ) -> tuple[TrainState, float]:
     """Returns the initial or restored state and the seconds already spent; `shared` as in `Seeds`."""
     if checkpoint is None:
-        return jax.jit(learner.init)(initial_key(config)), 0.0
+        return _from_policy(env, jax.jit(learner.init)(initial_key(config)), config), 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
@@ -51,6 +52,20 @@ def first_state(
     return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))
 
 
+def _from_policy(env: VectorEnv, state: TrainState, config: TrainConfig) -> TrainState:
+    """Returns an initial state with the policy that `config.start` names."""
+    if config.start is None:
+        return state
+    policy = read_policy(config.start)
+    shapes = jax.tree.map(jnp.shape, {name: state.params.get(name) for name in policy.params})
+    if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != env.name:
+        raise InputError(
+            f"start: {config.start} has a policy of {policy.task}; allowed: one of {env.name} with this run's network"
+        )
+    normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
+    return dataclasses.replace(state, params={**state.params, **policy.params}, obs_normalizer=normalizer)
+
+
 def without_environments(state: TrainState) -> dict[str, Any]:
     """Returns the contents of a checkpoint without environment states."""
     return {**learned(state), "key": state.key, "updates": state.updates}
@@ -64,6 +79,7 @@ def learned(state: TrainState) -> dict[str, Any]:
         "obs_normalizer": state.obs_normalizer,
         "value_normalizer": state.value_normalizer,
         "learning_rate": state.learning_rate,
+        "assistance": state.assistance,
         "extra": state.extra,
     }
 
