@@ -85,7 +85,8 @@ def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
 
 def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
     demo, joint = base_config("go1gate", "demo"), base_config("go1gate", "demo", "jrpo")
-    assert (joint.ppo.ratio, joint.ppo.value) == ("joint", "joint") and joint.network == demo.network
+    assert (joint.ppo.ratio, joint.ppo.value) == ("joint", "joint")
+    assert joint.network == override(demo, {"network.critic_input": "observations"}).network
     assert base_config("go1gate", "demo", "mat").network == Mat()
 
 

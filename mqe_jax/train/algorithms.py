@@ -8,17 +8,20 @@ from typing import Any
 from mqe_jax.errors import nearest
 from mqe_jax.settings import fail
 
-_TEAM = {"name": "actor_critic", "share_policy": True, "critic_input": "privileged"}
+_MAPPO = {"name": "actor_critic", "share_policy": True, "critic_input": "own"}
 
 ALGORITHMS: Mapping[str, Mapping[str, Any]] = {
-    "mappo": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None}, "network": _TEAM},
-    "jrpo": {"ppo": {"ratio": "joint", "value": "joint", "dual_clip": None}, "network": _TEAM},
+    "mappo": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None}, "network": _MAPPO},
+    "jrpo": {
+        "ppo": {"ratio": "joint", "value": "joint", "dual_clip": None},
+        "network": {**_MAPPO, "critic_input": "observations"},
+    },
     "mat": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None}, "network": {"name": "mat"}},
     "ippo": {
         "ppo": {"ratio": "dimension", "value": "agent", "dual_clip": None},
         "network": {"name": "actor_critic", "share_policy": False, "critic_input": "own"},
     },
-    "dual-clip": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": 3.0}, "network": _TEAM},
+    "dual-clip": {"ppo": {"ratio": "dimension", "value": "agent", "dual_clip": 3.0}, "network": _MAPPO},
 }
 """Presets of settings: multi-agent PPO, joint-ratio PPO, multi-agent transformer, independent PPO, dual-clip MAPPO."""
 
