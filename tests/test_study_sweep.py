@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import json
 import re
+import tarfile
 from pathlib import Path
 from typing import Any
 
 import probes
 import pytest
+import yaml
 from probes import Probe
+from safetensors.numpy import load_file
 
-from mqe_jax import cli
+from mqe_jax import cli, zoo
 from mqe_jax.cli import setup
 from mqe_jax.errors import InputError
 from mqe_jax.files import locked
-from mqe_jax.settings import build, override
+from mqe_jax.settings import build, override, to_mapping
+from mqe_jax.study import pack as packing
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig
 
+CONFIGS = Path(__file__).parents[1] / "configs"
 PROBE = Probe(probes.show_hidden, probes.pay_near_hidden, num_envs=4)
 FILE = """
 tasks: [go1gate]
@@ -93,7 +98,7 @@ def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) ->
 
 
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
-    """A cell locked by another process is skipped; one that it has finished since is not trained again."""
+    """A run locked by another process is skipped; one that it has finished since is not trained again."""
     sweep, folder = load(tmp_path), tmp_path / "study"
     jobs = sweeps.plan(sweep, folder, config_of)
     trained: list[str] = []
@@ -102,13 +107,72 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
         trained.append(config.ppo.ratio)
         return PROBE, PROBE
 
-    (folder / "runs" / jobs[0].cell.path).mkdir(parents=True)
-    with locked(folder / "runs" / jobs[0].cell.path):
+    jobs[0].folders[1].mkdir(parents=True)
+    with locked(jobs[0].folders[1]):
         assert sweeps.run(folder, jobs, environments) == jobs[:1]
     assert trained == ["joint"]
     assert sweeps.run(folder, jobs, environments) == []
     assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
+
+
+def test_a_sweep_that_is_stopped_and_packed_resumes_elsewhere(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Stopped before the third update; the files have no states of environments and a few rows of each table."""
+    sweep, folder, there = load(tmp_path), tmp_path / "study", tmp_path / "there"
+    sweep = override(sweep, {"algorithms": ("mappo",), "settings.checkpoint": {"every": 9, "environments": True}})
+    sweeps.prepare(sweep, folder)
+    asked = iter([False, False, False, True, True])
+    jobs = sweeps.plan(sweep, folder, config_of)
+    assert sweeps.run(folder, jobs, lambda config, seeds: (PROBE, PROBE), stop=lambda: next(asked)) == []
+    capfd.readouterr()
+    assert cli.main(["pack", str(folder), "-o", str(tmp_path / "out"), "--parts", "2", "--json"]) == 0
+    files = json.loads(capfd.readouterr().out)["files"]
+    assert len(files) == 2
+    for file in files:
+        tarfile.open(file).extractall(there, filter="data")
+    checkpoint = "runs/go1gate/mappo/seed0/checkpoints/step_000000000032.safetensors"
+    kept, whole = (set(load_file(root / checkpoint)) for root in (there / "study", folder))
+    assert kept == {name for name in whole if not name.startswith("rollout/")} < whole
+    left = sweeps.plan(sweep, there / "study", config_of)
+    assert [job.steps_left for job in left] == [32] and (there / "study" / "sweep.yaml").is_file()
+    assert sweeps.run(there / "study", left, lambda config, seeds: (PROBE, PROBE)) == []
+    for run in read_runs(there / "study"):
+        assert list(run.curve["env_steps"]) == [16, 32, 48] and len(run.evaluations) == 2
+    assert cli.main(["pack", str(folder), "-o", str(tmp_path / "out"), "--megabytes", "0.001"]) == 2
+    assert "MiB; allowed: 0.001" in capfd.readouterr().err
+
+
+def test_a_packed_table_keeps_its_last_row(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("x\n" + "\n".join(map(str, range(2345))) + "\n")
+    packing.thin(tmp_path / "a", tmp_path / "b")
+    header, *rows = (tmp_path / "b").read_text().split()
+    assert header == "x" and 500 <= len(rows) < 1000 and rows[-1] == "2344" and int(rows[0]) < 5
+
+
+def test_seeds_and_names_of_tasks(tmp_path: Path) -> None:
+    text = FILE.replace("settings:", 'settings:\n  opponents: ["{task}", idle]\n  start: "{task}.safetensors"')
+    jobs = sweeps.plan(load(tmp_path, text), tmp_path, config_of, ["*/jrpo"], [1])
+    assert [folder.name for job in jobs for folder in job.folders] == ["seed1"]
+    assert jobs[0].configs[0].opponents == ("go1gate", "idle") and jobs[0].configs[0].start == "go1gate.safetensors"
+    with pytest.raises(InputError, match="seeds: 7 is not allowed; it must be one of the sweep's: 0, 1"):
+        sweeps.plan(load(tmp_path), tmp_path, config_of, (), [1, 7])
+
+
+@pytest.mark.parametrize("part", yaml.safe_load((CONFIGS / "zoo.yaml").read_text()))
+def test_the_shipped_policies_are_remade_with_the_settings_of_train(part: str) -> None:
+    sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
+    jobs = sweeps.plan(sweep, CONFIGS, lambda task, _: setup.for_task(setup.base_config(task, None), task))
+    assert {job.cell.task for job in jobs} == set(sweep.tasks)
+    changed = {"checkpoint", "seed"} if "responses" not in part else {"checkpoint", "seed", "opponents", "total_steps"}
+    for job in jobs:
+        default = to_mapping(setup.for_task(setup.base_config(job.cell.task, None), job.cell.task))
+        own = to_mapping(job.configs[0])
+        different = {name for name in own if own[name] != default[name]}
+        assert different <= (changed | {"start", "ppo"} if job.cell.variant == "from-champion" else changed)
+        if own["start"]:
+            assert zoo.file_of(job.cell.task).name == Path(own["start"]).name
 
 
 def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ COMMANDS: dict[str, Any] = {
     "walk eval": walk.WalkEval,
     "walk convert": walk.WalkConvert,
     "sweep": study.Sweep,
+    "pack": study.Pack,
     "report": study.Report,
     "tournament": study.Tournament,
 }

@@ -18,7 +18,7 @@ from mqe_jax.errors import InputError, nearest
 from mqe_jax.league.league import MOVING, League
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_policy
-from mqe_jax.settings import fail, override
+from mqe_jax.settings import fail, load_yaml, override
 from mqe_jax.train import runner
 from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig, load_config
@@ -90,7 +90,8 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
         if demonstrator is None:
             return env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
         policy = load_policy(demonstrator, both)
-        return Demonstrated(both, num_envs, all_agents(both, policy, policy if len(both.teams) > 1 else None), seeds)
+        everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
+        return Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
 
     eval_env = None
     if config.evaluation.every is not None:
@@ -127,7 +128,8 @@ def find_config(name: str) -> Path:
     """Returns the settings file of a path or a shipped name; the InputError lists the shipped ones."""
     path = Path(name)
     files = [file.relative_to(CONFIG_FOLDER) for file in sorted(CONFIG_FOLDER.rglob("*.yaml"))]
-    shipped = {file.with_suffix("").as_posix(): CONFIG_FOLDER / file for file in files}
+    whole = [file for file in files if file.parts[0] not in ("league", "zoo.yaml")]
+    shipped = {file.with_suffix("").as_posix(): CONFIG_FOLDER / file for file in whole}
     allowed = f"a YAML file, or one of {', '.join(shipped)}"
     if name in shipped:
         return shipped[name]
@@ -142,7 +144,7 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
     """Returns the settings of a file or a shipped name, with the algorithm's preset.
 
     The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks. league trains with the rewards of `Match.shaping`.
+    paper/mappo for other tasks. league is changed by league/TASK where there is such a file.
 
     Raises:
         InputError: for a file or an algorithm that is not allowed.
@@ -151,13 +153,14 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
     if name is None and algorithm is not None:
         return load_config(find_config(f"paper/{algorithm}"))
     match = TASKS.get(task)
-    match = match if match is not None and issubclass(match, Match) else None
+    is_match = match is not None and issubclass(match, Match)
     if name is None:
         tuned = (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file()
-        name = f"tuned/{task}" if tuned else "league" if match else "paper/mappo"
+        name = f"tuned/{task}" if tuned else "league" if is_match else "paper/mappo"
     config = load_config(find_config(name), changes)
-    if name == "league" and match:
-        config = override(config, {"train_env": {f"rewards.{term}": weight for term, weight in match.shaping.items()}})
+    own = CONFIG_FOLDER / "league" / f"{task}.yaml"
+    if name == "league" and own.is_file():
+        config = override(config, load_yaml(own))
     return config
 
 

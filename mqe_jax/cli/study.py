@@ -1,10 +1,11 @@
-"""The commands `sweep`, `report` and `tournament`."""
+"""The commands `sweep`, `pack`, `report` and `tournament`."""
 
 from __future__ import annotations
 
 import functools
 import math
 import shlex
+import time
 from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,7 +16,7 @@ from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
 from mqe_jax.cli.output import echo
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import PositiveInt, fail, record
+from mqe_jax.settings import Positive, PositiveInt, fail, record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
@@ -35,6 +36,10 @@ class Sweep:
     cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
     """Train these cells only: TASK/ALGORITHM, followed by +VARIANT in a sweep with variants; may be a pattern such as
     '*/mat', and may be repeated."""
+    seeds: Annotated[list[int], Repeated, tyro.conf.arg(metavar="SEED")] = field(default_factory=list)
+    """Train these seeds only; may be repeated."""
+    time_limit: Annotated[Positive | None, tyro.conf.arg(metavar="MINUTES")] = None
+    """Save the run in training after this time, min, and end; the same command resumes it."""
     dry_run: bool = False
     """Print the remaining training runs and their estimated time, without training."""
     impl: Impl = "auto"
@@ -54,9 +59,14 @@ class Sweep:
 
         def config_of(task: str, algorithm: str) -> Any:
             name = settings.config and settings.config.replace("{task}", task)
-            return for_task(base_config(task, name, algorithm), task)
+            return for_task(base_config(task, name, None if algorithm == "default" else algorithm), task)
 
-        jobs = sweeps.plan(settings, folder, config_of, self.cells)
+        began = time.monotonic()
+
+        def stop() -> bool:
+            return self.time_limit is not None and time.monotonic() - began > 60.0 * self.time_limit
+
+        jobs = sweeps.plan(settings, folder, config_of, self.cells, self.seeds)
         result = _estimate(sweeps.estimate(folder, jobs), jobs)
         if self.dry_run:
             if not self.json:
@@ -64,17 +74,43 @@ class Sweep:
             return result
         sweeps.prepare(settings, folder)
         cells = "".join(f" --cells {shlex.quote(cell)}" for cell in self.cells)
+        cells += "".join(f" --seeds {seed}" for seed in self.seeds)
         part = "" if self.part is None else f" --part {shlex.quote(self.part)}"
         with interrupts.before_exit(lambda: f"resume with: mqe sweep {self.file}{part} --folder {folder}{cells}"):
-            others = sweeps.run(folder, jobs, functools.partial(environments, self.impl))
+            others = sweeps.run(folder, jobs, functools.partial(environments, self.impl), stop=stop)
         if others:
             skipped = ", ".join(job.cell.path.as_posix() for job in others)
             echo(f"mqe: skipped, in use by other processes: {skipped}")
-        files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
+        if stop():
+            echo(f"mqe: time limit of {self.time_limit:g} min; the same command resumes")
+        left = sweeps.plan(settings, folder, config_of, self.cells, self.seeds)
+        files = reports.report(folder) if not jobs or len(left) < len(jobs) else []
         if files:
             echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
-        left = sweeps.plan(settings, folder, config_of, self.cells)
         return {"left": _estimate(sweeps.estimate(folder, left), left), "report": [str(file) for file in files]}
+
+
+@record
+class Pack:
+    """Pack sweeps into a few files of limited size, from which another machine resumes them."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of sweeps; runs may be in training meanwhile."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
+    """Folder of the files part0.tar.gz, part1.tar.gz, ...; `tar xzf FILE -C FOLDER` unpacks one."""
+    parts: PositiveInt = 8
+    """Number of files, at most."""
+    megabytes: Positive = 16.0
+    """Size of a file, MiB, at most."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any]:
+        """Packs the runs; returns the files for `--json`."""
+        from mqe_jax.study.pack import pack
+
+        files = pack(self.folders, self.output, self.parts, self.megabytes)
+        echo(f"mqe: wrote {', '.join(f'{file} ({file.stat().st_size / 2**20:.1f} MiB)' for file in files)}")
+        return {"files": [str(file) for file in files]}
 
 
 @record

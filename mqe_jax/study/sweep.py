@@ -41,15 +41,15 @@ class Sweep:
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
-    """Names of the algorithms, as in `mqe train --algorithm`."""
+    """Names of the algorithms, as in `mqe train --algorithm`; `default` has the settings of `mqe train` without."""
     seeds: Annotated[tuple[Seed, ...], MinLen(1)] = (0, 1, 2, 3, 4)
     """Random seeds."""
     seeds_together: PositiveInt | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
-    """Settings file or shipped name, in which {task} stands for the task's id; none uses paper/ALGORITHM."""
+    """Settings file or shipped name, in which {task} stands for the task's id; none uses that of `mqe train`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings that override the file's in every run."""
+    """Settings that override the file's in every run; {task} in `start` and `opponents` stands for the task's id."""
     variants: Mapping[str, Any] = field(default_factory=lambda: {PLAIN: {}})
     """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
 
@@ -116,28 +116,49 @@ def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
 
 
 def plan(
-    sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig], cells: Sequence[str] = ()
+    sweep: Sweep,
+    folder: Path,
+    config_of: Callable[[str, str], TrainConfig],
+    cells: Sequence[str] = (),
+    seeds: Sequence[int] = (),
 ) -> list[Job]:
     """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
+
+    Of the sweep's seeds those in `seeds` are trained, or all if it is empty.
 
     `config_of(task, algorithm)` gives the settings that those of the sweep override. Finished runs are left out.
     The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 
     Raises:
-        InputError: for a task, an algorithm, a setting or a pattern that is not allowed.
+        InputError: for a task, an algorithm, a setting, a pattern or a seed that is not allowed.
     """
+    if unknown := set(seeds) - set(sweep.seeds):
+        fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
     jobs = []
     for cell in select(sweep, cells):
         config = _overridden(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
         config = _overridden(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
-        left = [seed for seed in sweep.seeds if not finished(_run(folder, cell, seed))]
+        named = {"start": config.start, "opponents": config.opponents}
+        if "{task}" in str(named):
+            config = override(config, _for_task(named, cell.task))
+        wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
+        left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
         started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
         fresh = [seed for seed in left if seed not in started]
         size = sweep.seeds_together or len(sweep.seeds)
         for group in (started, fresh):
             jobs += [_job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)]
     return jobs
+
+
+def _for_task(values: Any, task: str) -> Any:
+    """Returns values with the task's id in place of {task}, in strings at any depth."""
+    if isinstance(values, Mapping):
+        return {name: _for_task(value, task) for name, value in values.items()}
+    if isinstance(values, tuple):
+        return tuple(_for_task(value, task) for value in values)
+    return values.replace("{task}", task) if isinstance(values, str) else values
 
 
 def _overridden(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
@@ -197,26 +218,34 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
 
-def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> list[Job]:
-    """Trains the jobs sequentially; each resumes from its checkpoints.
+def run(
+    folder: Path,
+    jobs: Sequence[Job],
+    environments: Environments,
+    on_update: OnUpdate | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> list[Job]:
+    """Trains the jobs sequentially, until `stop()`; each resumes from its checkpoints.
 
-    Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
-    first. Returns the jobs skipped because other processes hold the locks of their cells.
+    Several processes may run the same sweep at the same time, each job being trained by the one that locks its run
+    folders first. Returns the jobs that were left to other processes.
 
     Raises:
         InputError: if a run cannot be resumed.
     """
     left = []
     for job in jobs:
-        cell_folder = folder / "runs" / job.cell.path
-        cell_folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.ExitStack() as lock:
-            try:
-                lock.enter_context(locked(cell_folder))
-            except InUseError:
-                left.append(job)
-                continue
-            if not all(map(finished, job.folders)):  # by another process since the jobs were planned
-                env, eval_env = environments(job.configs[0], len(job.configs))
-                train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
+        if stop():
+            break
+        if all(map(finished, job.folders)):  # by another process since the jobs were planned
+            continue
+        try:
+            with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
+                for run_dir in job.folders:
+                    run_dir.mkdir(parents=True, exist_ok=True)
+                    locks.enter_context(locked(run_dir))
+            env, eval_env = environments(job.configs[0], len(job.configs))
+            train_seeds(env, job.configs, job.folders, True, on_update, eval_env, stop=stop)
+        except InUseError:
+            left.append(job)
     return left

@@ -195,6 +195,18 @@ def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping
     return path
 
 
+def copy_without(path: Path, target: Path, name: str) -> None:
+    """Copies a checkpoint without a field of the learner state, `rollout`, as `checkpoint.environments: false` does.
+
+    Raises:
+        InputError: as `load_tree`.
+    """
+    arrays, metadata = _read(path, "checkpoint")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    kept = {key: array for key, array in arrays.items() if not key.startswith(f"{name}/")}
+    save_tree(target, kept, {**metadata, "environments": False}, kind="checkpoint")
+
+
 def load_checkpoint(path: str | Path, template: Any) -> Checkpoint:
     """Reads a checkpoint against a template; errors as in `load_tree`."""
     return load_tree(path, template, kind="checkpoint")

@@ -72,11 +72,13 @@ def train_seeds(
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
     recorder: Recorder | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
 
     `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all.
-    The recorder receives the environments of all seeds as one batch.
+    The recorder receives the environments of all seeds as one batch. Where `stop()` is true before an update, the runs
+    are saved and end there, to be resumed.
     """
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
@@ -93,7 +95,7 @@ def train_seeds(
         for folder in folders:
             check_run(folder, resume, run_files)
         checkpoints = _common_checkpoints(folders)
-        return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update)
+        return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update, stop)
 
 
 def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
@@ -142,8 +144,8 @@ class _Training:
         self._logs = contextlib.ExitStack()
         self._writing = threading.RLock()  # held while files are written and the state is exchanged
 
-    def run(self, on_update: OnUpdate | None) -> list[TrainState]:
-        """Runs the remaining updates and returns the last states."""
+    def run(self, on_update: OnUpdate | None, stop: Callable[[], bool]) -> list[TrainState]:
+        """Runs the remaining updates, until `stop()`, and returns the last states."""
         config = self._config
         if self._saved == self._env_steps:
             self._save_policies()  # a run that ended between checkpoint and policy has an older one
@@ -163,7 +165,7 @@ class _Training:
             logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
-                while self._env_steps < total_steps:
+                while self._env_steps < total_steps and not stop():
                     rows = self._step(files)
                     progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                     if on_update is not None:
@@ -172,7 +174,8 @@ class _Training:
                     if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
                         self._save()
                 self._save()
-                self._measure_best()
+                if self._env_steps >= total_steps:
+                    self._measure_best()
             except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
                 if isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" not in str(error):
                     raise

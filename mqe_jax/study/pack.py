@@ -1,0 +1,119 @@
+"""Sweeps packed for another machine: what their runs have learned, in a few files of limited size.
+
+A run keeps its settings, policies, evaluations, a thinned metrics.csv, and its newest checkpoint without the states of
+the environments, which are reset where it resumes. `tar xzf FILE -C FOLDER` unpacks a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from mqe_jax.errors import InputError
+from mqe_jax.files import check_folder, replacing
+from mqe_jax.settings import fail
+from mqe_jax.study.sweep import SWEEP_FILE
+from mqe_jax.train.checkpoint import copy_without, latest
+from mqe_jax.train.monitor import EVALUATIONS_FILE
+from mqe_jax.train.policy import POLICY_FILE
+from mqe_jax.train.runner import CONFIG_FILE, CSV_FILE
+
+ROWS = 500
+"""Rows of a packed metrics.csv, at most about: every n-th, and the last one."""
+
+_TRIES = 3  # to read the newest checkpoint, which a training may replace meanwhile
+
+
+def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) -> list[Path]:
+    """Packs sweeps into files `part0.tar.gz`, `part1.tar.gz`, ... of the folder `output`; returns the files.
+
+    Runs may be in training meanwhile. In the files a sweep has the name of its folder.
+
+    Args:
+        folders: of the sweeps; their names differ.
+        output: folder of the files.
+        parts: number of files, at most.
+        megabytes: size of a file, MiB, at most.
+
+    Raises:
+        InputError: for a folder without a run, or where the runs do not fit.
+    """
+    if len({folder.resolve().name for folder in folders}) < len(folders):
+        fail("folder", [str(folder) for folder in folders], "folders of different names")
+    check_folder(output, "output")
+    with tempfile.TemporaryDirectory(dir=output) as temporary:
+        root = Path(temporary)
+        sizes = {run: _size(run) for folder in folders for run in _staged(folder, root / folder.resolve().name)}
+        bins: list[list[Path]] = [[] for _ in range(parts)]
+        for run in sorted(sizes, key=lambda run: -sizes[run]):
+            min(bins, key=lambda runs: sum(sizes[each] for each in runs)).append(run)
+        files = []
+        for i, runs in enumerate(filter(None, bins)):
+            files.append(output / f"part{i}.tar.gz")
+            with replacing(files[-1]) as path, tarfile.open(path, "w:gz", compresslevel=1) as archive:
+                for run in runs:
+                    archive.add(run, run.relative_to(root))
+            if (size := files[-1].stat().st_size / 2**20) > megabytes:
+                raise InputError(f"output: {files[-1]} has {size:.1f} MiB; allowed: {megabytes:g}; pack fewer runs")
+    for old in set(output.glob("part*.tar.gz")) - set(files):
+        old.unlink()
+    return files
+
+
+def _staged(folder: Path, target: Path) -> list[Path]:
+    """Copies what is packed of a sweep into a folder; returns the copies of its runs, and of its settings."""
+    runs = sorted(path.parent for path in folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}"))
+    if not runs:
+        raise InputError(f"folder: {folder} has no run runs/TASK/ALGORITHM/seed*; it must be a sweep's folder")
+    copies = []
+    for run in runs:
+        copies.append(target / run.relative_to(folder))
+        (copies[-1] / "best").mkdir(parents=True)
+        for name in (CONFIG_FILE, EVALUATIONS_FILE, POLICY_FILE):
+            _copy(run / name, copies[-1] / name)
+        for best in run.glob("best/*.safetensors"):
+            _copy(best, copies[-1] / "best" / best.name)
+        thin(run / CSV_FILE, copies[-1] / CSV_FILE)
+        _checkpoint(run, copies[-1])
+    if (folder / SWEEP_FILE).is_file():
+        copies.append(target / SWEEP_FILE)
+        _copy(folder / SWEEP_FILE, copies[-1])
+    return copies
+
+
+def _copy(source: Path, target: Path) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        shutil.copyfile(source, target)
+
+
+def _checkpoint(run: Path, target: Path) -> None:
+    """Copies a run's newest checkpoint, without the states of the environments."""
+    for attempt in range(_TRIES):
+        newest = latest(run)
+        if newest is None:
+            return
+        try:
+            copy_without(newest, target / newest.relative_to(run), "rollout")
+            return
+        except InputError:
+            if attempt == _TRIES - 1:
+                raise
+
+
+def thin(source: Path, target: Path) -> None:
+    """Copies a table with about `ROWS` of its rows."""
+    if not source.is_file():
+        return
+    header, *rows = source.read_text(encoding="utf-8").splitlines()
+    stride = max(1, len(rows) // ROWS)
+    kept = rows[::-1][::stride][::-1]
+    target.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
+
+
+def _size(path: Path) -> int:
+    """Returns the size of a file, or of all files below a folder, bytes."""
+    return path.stat().st_size if path.is_file() else sum(_size(each) for each in path.iterdir())
