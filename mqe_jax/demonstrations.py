@@ -31,9 +31,9 @@ class DemonstratedState(State[Any]):
     """States of N environments, and M states in which episodes can start."""
 
     demonstrations: PyTree
-    """Fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`. With `backward`
-    also `phase`, by which they are in order: of a state before the success of its episode its share of the time until
-    then, infinite of others."""
+    """Fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`. With `backward` also
+    `phase`, by which they are in order: the share of the time until the success of its episode at which a state is;
+    infinite of states after it, and of episodes without."""
 
 
 class Demonstrated(VectorEnv):

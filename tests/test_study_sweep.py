@@ -16,7 +16,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax import cli, zoo
 from mqe_jax.cli import setup
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import locked
 from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.study import pack as packing
@@ -114,6 +114,19 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
     assert sweeps.run(folder, jobs, environments) == []
     assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
+
+
+def test_a_run_that_becomes_non_finite_does_not_keep_others_from_training(tmp_path: Path) -> None:
+    sweep, folder = load(tmp_path), tmp_path / "study"
+
+    def environments(config: TrainConfig, seeds: int) -> tuple[Probe, Probe]:
+        if config.ppo.ratio == "dimension":
+            raise NonFiniteError("the first job")
+        return PROBE, PROBE
+
+    with pytest.raises(NonFiniteError, match="the first job"):
+        sweeps.run(folder, sweeps.plan(sweep, folder, config_of), environments)
+    assert [job.cell.algorithm for job in sweeps.plan(sweep, folder, config_of)] == ["mappo"]
 
 
 def test_a_sweep_that_is_stopped_and_packed_resumes_elsewhere(

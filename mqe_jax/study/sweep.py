@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import yaml
 from annotated_types import MinLen
 
-from mqe_jax.errors import InputError, InUseError, nearest
+from mqe_jax.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.settings import PositiveInt, Seed, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
@@ -232,8 +232,9 @@ def run(
 
     Raises:
         InputError: if a run cannot be resumed.
+        NonFiniteError: after the last job, if one became non-finite.
     """
-    left = []
+    left, broken = [], []
     for job in jobs:
         if stop():
             break
@@ -248,4 +249,8 @@ def run(
             train_seeds(env, job.configs, job.folders, True, on_update, eval_env, stop=stop)
         except InUseError:
             left.append(job)
+        except NonFiniteError as error:
+            broken.append(error)
+    if broken:
+        raise broken[0]
     return left

@@ -158,7 +158,7 @@ def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | No
             obs_normalizer=obs_normalizer,
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
-            assistance=next_assistance(config, now.assistance, metrics.get("success", now.assistance)),
+            assistance=next_assistance(config, now.assistance, metrics.get("success", jnp.float32(jnp.nan))),
             rollout=rollout_state,
             key=key,
             updates=state.updates + 1,
