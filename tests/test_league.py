@@ -19,6 +19,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax import cli
 from mqe_jax.cli.setup import base_config
+from mqe_jax.envs import make
 from mqe_jax.errors import InputError
 from mqe_jax.league import pool, tournament
 from mqe_jax.league.league import League
@@ -27,7 +28,7 @@ from mqe_jax.settings import build
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
-from tests.test_opponents import KEY, SETTINGS, matches
+from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}
@@ -222,12 +223,13 @@ def test_a_league_killed_five_times_ends_as_if_never_killed(tmp_path: Path) -> N
     assert (whole / "policy.safetensors").read_bytes() == (killed / "policy.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("task", ["go1wrestling", "go1tug"])
+@pytest.mark.parametrize("task", MATCHES)
 def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> None:
     config = base_config(task, None)
-    assert {"newest", "older", "scripted"} <= set(config.opponents)
-    shaping = {"rewards.push": 3.0, "rewards.approach": 1.0} if "wrestling" in task else {}
-    assert dict(config.train_env) == {"frozen_time": 0.0, **shaping}
+    assert {"newest", "older", "scripted"} <= set(config.opponents) and config.num_envs % len(config.opponents) == 0
+    assert make(task, impl="c", num_envs=1, **config.training_env).params.frozen_time == 0
+    if task == "go1wrestling":
+        assert dict(config.train_env) == {"frozen_time": 0.0, "rewards.push": 3.0, "rewards.approach": 1.0}
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
 
 
