@@ -1,17 +1,21 @@
-"""Files and folders: atomic writes, errors that name the file, write checks, locks."""
+"""Files and folders: bounded readers (`mqe_jax.limits`), atomic writes, errors that name the file, locks."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import fcntl
+import json
 import os
+import stat
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mqe_jax import interrupts
-from mqe_jax.errors import InputError, InUseError
+from mqe_jax import interrupts, limits
+from mqe_jax.errors import InputError, InUseError, brief
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,15 +62,92 @@ def append(path: Path, content: bytes) -> None:
         file.write(content)
 
 
+# -- readers: every failure of a parser is an InputError that names the file; no file costs more than its limit --------
+
+
+def check_file(path: Path, limit: int) -> None:
+    """Raises an InputError unless a path is a regular file of at most `limit` bytes."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a null byte
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"{path}: cannot be read ({reason})") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: cannot be read (not a regular file)")
+    if status.st_size > limit:
+        raise InputError(f"{path}: has {status.st_size} bytes; it must have at most {limit}")
+
+
+@contextlib.contextmanager
+def parsing(path: Path | str, what: str) -> Iterator[None]:
+    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: is not <what> (...)`.
+
+    Parsers of other libraries raise errors of any type, among them RecursionError and MemoryError.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = brief(" ".join(str(error).split()) or type(error).__name__)
+        raise InputError(f"{path}: is not {what} ({reason})") from None
+
+
+def read_text(path: Path, limit: int, what: str) -> str:
+    """Reads a UTF-8 file of at most `limit` bytes."""
+    check_file(path, limit)
+    with parsing(path, what):
+        return path.read_text(encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """Reads a JSON file, nested at most `limits.DEPTH` deep."""
+    return parse_json(read_text(path, limits.JSON_BYTES, "JSON"), str(path))
+
+
+def parse_json(text: str, name: str) -> Any:
+    """Returns the value of a JSON text, nested at most `limits.DEPTH` deep; errors start with its name."""
+    with parsing(name, "JSON"):
+        value = json.loads(text)
+        level = [value]
+        for _ in range(limits.DEPTH):
+            inner = [list(x.values()) if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
+            level = [x for values in inner for x in values]
+        if level:
+            raise ValueError(f"nested more than {limits.DEPTH} deep")
+        return value
+
+
+def read_rows(path: Path) -> Iterator[list[str]]:
+    """Yields the rows of a CSV file, the columns' names first."""
+    check_file(path, limits.CSV_BYTES)
+    with parsing(path, "a CSV file"), path.open(encoding="utf-8", newline="") as file:
+        yield from csv.reader(file, strict=True)
+
+
 def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
-    """Reads a safetensors file; an InputError says `what` it should be."""
-    from safetensors import SafetensorError
+    """Reads a safetensors file of weights; an InputError says `what` it should be."""
     from safetensors.numpy import load_file
 
-    try:
+    check_file(file, limits.WEIGHTS_BYTES)
+    with parsing(f"{what} {file}", "a safetensors file of numpy's types"):
         return load_file(file)
-    except SafetensorError as error:
-        raise InputError(f"{what} {file}: not a safetensors file ({error})") from None
+
+
+@contextlib.contextmanager
+def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
+    """Opens a zip file whose members have at most `limit` bytes together, none of them encrypted.
+
+    Whatever is raised while it is open becomes an InputError that says `what` it should be.
+    """
+    check_file(path, limit)
+    with parsing(path, what), zipfile.ZipFile(path) as opened:
+        size = sum(member.file_size for member in opened.infolist())
+        if size > limit:
+            raise ValueError(f"its members have {size} bytes; at most {limit} are allowed")
+        if any(member.flag_bits & 1 for member in opened.infolist()):
+            raise ValueError("encrypted")
+        yield opened
 
 
 def check_folder(folder: Path, field: str = "run_dir") -> None:

@@ -15,7 +15,8 @@ from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
 from mqe_jax.cli.output import echo
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import PositiveInt, fail, record
+from mqe_jax.limits import Candidates
+from mqe_jax.settings import fail, record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
@@ -108,7 +109,7 @@ class Tournament(TaskOptions):
     """Policies; scripted, idle and random play too. Ratings are relative to scripted, or idle without it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("runs/tournament")
     """Folder of tournament.csv and tournament.png."""
-    episodes: PositiveInt = 64
+    episodes: Candidates = 64
     """Episodes of each pair on each side."""
     deterministic: bool = False
     """Use mean actions of trained policies; otherwise they are sampled, as in training."""

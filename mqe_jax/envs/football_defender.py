@@ -12,9 +12,10 @@ import numpy as np
 from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Fraction
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
-from mqe_jax.settings import Fraction, record
+from mqe_jax.settings import record
 
 if TYPE_CHECKING:
     from mujoco import mjx

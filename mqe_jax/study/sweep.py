@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from annotated_types import MinLen
+from annotated_types import MaxLen, MinLen
 
 from mqe_jax.errors import InputError, InUseError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
-from mqe_jax.settings import PositiveInt, Seed, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.limits import Seed, Seeds
+from mqe_jax.settings import build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -42,9 +43,9 @@ class Sweep:
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
     """Names of the algorithms, as in `mqe train --algorithm`."""
-    seeds: Annotated[tuple[Seed, ...], MinLen(1)] = (0, 1, 2, 3, 4)
+    seeds: Annotated[tuple[Seed, ...], MinLen(1), MaxLen(1000)] = (0, 1, 2, 3, 4)
     """Random seeds."""
-    seeds_together: PositiveInt | None = None
+    seeds_together: Seeds | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
     """Settings file or shipped name, in which {task} stands for the task's id; none uses paper/ALGORITHM."""

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import robots, walk_policy
-from mqe_jax.settings import NonNegative, PositiveInt, fail
+from mqe_jax.limits import Horizon, NonNegative
+from mqe_jax.settings import fail
 from mqe_jax.train import nn
 from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
@@ -33,7 +34,7 @@ class WalkNetwork(GaussianSettings):
 
     weights: str | None = None
     """File of walk weights to start from, of any robot; none samples them."""
-    chunk_length: PositiveInt = 24
+    chunk_length: Horizon = 24
     """Steps of a chunk, at whose first one the history is stored."""
     adaptation_coef: NonNegative = 1.0
     """Weight of the adaptation network's regression loss."""
