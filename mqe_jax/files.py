@@ -7,6 +7,7 @@ import csv
 import fcntl
 import json
 import os
+import re
 import stat
 import tempfile
 import zipfile
@@ -21,6 +22,13 @@ if TYPE_CHECKING:
     import numpy as np
 
 
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\.\w+)?")
+_locks: dict[Path, int] = {}  # folders that this process has locked, with the handle of each
+
+
+# -- writers: below a locked folder they write only while the folder's path still leads to it --------------------------
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary name in the same folder, with the same suffix, which is renamed to `path` at the end.
@@ -28,10 +36,12 @@ def replacing(path: Path) -> Iterator[Path]:
     The temporary file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    check_locks(path)
     interrupts.temporaries.add(temporary)
     try:
         with naming(path):
             yield temporary
+            check_locks(path)
             os.replace(temporary, path)
     finally:
         with contextlib.suppress(OSError):
@@ -58,8 +68,43 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def append(path: Path, content: bytes) -> None:
     """Appends to a file, which it creates where there is none; an OSError names it."""
+    check_locks(path)
     with naming(path), path.open("ab") as file:
         file.write(content)
+
+
+def make_folder(path: Path) -> None:
+    """Creates a folder, where there is none, in one that exists; an OSError names it."""
+    check_locks(path)
+    with naming(path):
+        path.mkdir(exist_ok=True)
+
+
+def check_locks(path: Path) -> None:
+    """Raises an InputError where a locked folder around `path` was removed, renamed or replaced."""
+    for folder in path.parents:
+        if folder in _locks:
+            with contextlib.suppress(OSError):
+                if os.path.samestat(folder.stat(), os.fstat(_locks[folder])):
+                    continue
+            raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Removes the temporary files that processes which have ended left in a folder."""
+    for path in folder.glob(".*.tmp*"):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match and path not in interrupts.temporaries and not _alive(int(match[1])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _alive(process: int) -> bool:
+    """Returns whether another process has this number."""
+    with contextlib.suppress(OSError, OverflowError):
+        os.kill(process, 0)
+        return process != os.getpid()
+    return False
 
 
 # -- readers: every failure of a parser is an InputError that names the file; no file costs more than its limit --------
@@ -80,7 +125,7 @@ def check_file(path: Path, limit: int) -> None:
 
 @contextlib.contextmanager
 def parsing(path: Path | str, what: str) -> Iterator[None]:
-    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: is not <what> (...)`.
+    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: damaged, or not <what> (...)`.
 
     Parsers of other libraries raise errors of any type, among them RecursionError and MemoryError.
     """
@@ -90,7 +135,7 @@ def parsing(path: Path | str, what: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = brief(" ".join(str(error).split()) or type(error).__name__)
-        raise InputError(f"{path}: is not {what} ({reason})") from None
+        raise InputError(f"{path}: damaged, or not {what} ({reason})") from None
 
 
 def read_text(path: Path, limit: int, what: str) -> str:
@@ -164,15 +209,22 @@ def check_folder(folder: Path, field: str = "run_dir") -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Holds a lock on a folder; it is released when the process exits, even abnormally.
 
+    Below it, nothing is written once its path leads to another folder or to none.
+
     Raises:
         InUseError: where another process (or this one) already holds it.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    handle, outer = os.open(folder, os.O_RDONLY), _locks.get(folder)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InUseError(f"run_dir: {folder} is in use by another process") from None
+        _locks[folder] = handle
         yield
     finally:
         os.close(handle)
+        if outer is None:
+            _locks.pop(folder, None)
+        else:
+            _locks[folder] = outer

@@ -148,7 +148,10 @@ def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) 
         (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown name .*did you mean 'gate_width'"),
         (lambda: make("go1gate", rewards={"colision": 1.0}), r"rewards.colision.*did you mean 'collision'"),
         (lambda: make("go1gate", gate_width="wide"), r"gate_width: 'wide' is not allowed; it must be a valid number"),
-        (lambda: make("go1gate", gate_width=-1), r"gate_width: -1 is not allowed; it must be greater than 0"),
+        (
+            lambda: make("go1gate", gate_width=-1),
+            r"gate_width: -1 is not allowed; it must be greater than or equal to 0.0",
+        ),
         (lambda: make("go1gate", gate_width=4.0), r"gate_width: 4.0 .* less than the width of the track, 3.0"),
         (lambda: make("go1gate", gate_width=True), r"gate_width: True"),
         (lambda: make("go1gate", episode_length=float("inf")), r"episode_length: inf"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
+from mqe_jax.files import parsing, read_rows
 from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.monitor import read_evaluations
@@ -104,16 +106,17 @@ def read_curve(path: Path) -> Curve:
     Raises:
         InputError: naming the file, if it is missing or malformed.
     """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
-            curve = {name: np.array([float(row[name]) for row in rows]) for name in reader.fieldnames or []}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; a run folder has one after its first update") from None
-    except (OSError, TypeError, ValueError):
-        raise InputError(f"{path}: is not a metrics.csv") from None
-    if not {"env_steps", REWARD} <= set(curve) or not rows:
+    if not path.exists():
+        raise InputError(f"{path}: no such file; a run folder has one after its first update")
+    rows = read_rows(path)
+    names = next(rows, [])
+    columns = [array("d") for _ in names]
+    with parsing(path, "a metrics.csv"):
+        for row in rows:
+            for column, text in zip(columns, row, strict=True):
+                column.append(float(text))
+    curve = {name: np.array(column) for name, column in zip(names, columns, strict=True)}
+    if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
         raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
     return curve
 

@@ -17,9 +17,17 @@ import yaml
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.files import check_folder, locked, write_atomically
+from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
 from mqe_jax.settings import fail, to_mapping
-from mqe_jax.train.checkpoint import check_run, checkpoint_step, latest, list_checkpoints, nonfinite, save_checkpoint
+from mqe_jax.train.checkpoint import (
+    check_alone,
+    check_run,
+    checkpoint_step,
+    latest,
+    list_checkpoints,
+    nonfinite,
+    save_checkpoint,
+)
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
@@ -88,8 +96,12 @@ def train_seeds(
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
     with contextlib.ExitStack() as locks:
         for folder in folders:
+            check_alone(folder)
+        for folder in folders:
             check_folder(folder)
             locks.enter_context(locked(folder))
+            for inner in (folder, *folder.glob("*/")):
+                remove_temporaries(inner)
         for folder in folders:
             check_run(folder, resume, run_files)
         checkpoints = _common_checkpoints(folders)
