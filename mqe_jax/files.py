@@ -125,7 +125,7 @@ def check_file(path: Path, limit: int) -> None:
 
 @contextlib.contextmanager
 def parsing(path: Path | str, what: str) -> Iterator[None]:
-    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: damaged, or not <what> (...)`.
+    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: damaged, or not <what> ...`.
 
     Parsers of other libraries raise errors of any type, among them RecursionError and MemoryError.
     """

@@ -162,7 +162,7 @@ def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) 
         (lambda: make("go1gate", randomization={"friction": (0, 1)}), r"randomization.friction: .*greater than 0"),
         (lambda: make("go1gate", randomization={"action_lag": 1.5}), r"randomization.action_lag: 1.5 .*valid integer"),
         (lambda: make("go1seesaw", plank_start=-0.3), r"plank_start: -0.3 .*within \+-plank.limit"),
-        (lambda: make("go1tug", cylinder={"radius": 0}), r"cylinder.radius: 0 .*greater than 0"),
+        (lambda: make("go1tug", cylinder={"radius": 0}), r"cylinder.radius: 0 .*greater than or equal to 0.001"),
         (lambda: make("go1revolvingdoor", gap=1.5), r"door.size: .*narrower than the gap, 1.5"),
         (lambda: make("go1bridge", platform_x=(3.0, 4.0)), r"platform_x: .*more than a platform's length"),
         (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate requires 2"),
