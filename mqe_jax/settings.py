@@ -24,9 +24,9 @@ import math
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar, dataclass_transform
+from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar, dataclass_transform
 
 import pydantic
 import pydantic_core
@@ -39,6 +39,8 @@ from mqe_jax.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Nu
 from mqe_jax.yaml_text import read_yaml
 
 T = TypeVar("T")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
@@ -74,6 +76,63 @@ def record(cls: type[T]) -> type[T]:
 
     made.__init__ = checked_init
     return typing.cast(type[T], made)
+
+
+def _path(value: Any) -> Any:
+    if not isinstance(value, str | Path) or not str(value) or not is_text(str(value)):
+        raise ValueError(f"a path, or a text that is not empty, {TEXT}")
+    return value
+
+
+PathText = Annotated[Any, pydantic.AfterValidator(_path)]
+"""A path, or a text that is one."""
+
+
+TEXT = f"at most {limits.TEXT} characters, none of which is a control character"
+"""What `is_text` allows."""
+
+
+def is_text(value: str) -> bool:
+    """Returns whether a text can be a name or a path, and be printed."""
+    return len(value) <= limits.TEXT and not any(ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value)
+
+
+def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Makes a function check some of its arguments, as a record checks its fields, each against a type.
+
+    Raises, when the function is called:
+        InputError: naming the argument, its value and what is allowed.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def call(*given: P.args, **named: P.kwargs) -> R:
+            bound = signature.bind(*given, **named)
+            for name in kinds.keys() & bound.arguments.keys():
+                bound.arguments[name] = check(name, bound.arguments[name], kinds[name])
+            return function(*bound.args, **bound.kwargs)
+
+        return call
+
+    return decorate
+
+
+def check(name: str, value: Any, kind: Any) -> Any:
+    """Returns a value as a type has it; raises the InputError of `fail` where it is none of the type."""
+    if is_record(kind):
+        return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
+    try:
+        return _adapter(kind).validate_python(value)
+    except pydantic.ValidationError as error:
+        text = str(_one_line(None, error))
+        raise InputError(f"{name}{text if text.startswith(':') else f'.{text}'}") from None
+
+
+@functools.cache
+def _adapter(kind: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(_lenient(kind), config=_CONFIG)
 
 
 def is_record(kind: object) -> bool:
@@ -130,7 +189,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: naming the file, if it cannot be read or is not a mapping.
     """
-    values = read_yaml(Path(path))
+    values = read_yaml(Path(check("path", path, PathText)))
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -189,10 +248,8 @@ def _number(kind: type, value: Any) -> Any:
 
 
 def _text(value: Any) -> Any:
-    if isinstance(value, str | Path):
-        text = str(value)
-        if len(text) > limits.TEXT or any(ord(letter) < 32 for letter in text):
-            raise ValueError(f"at most {limits.TEXT} characters, none of which is a control character")
+    if isinstance(value, str | Path) and not is_text(str(value)):
+        raise ValueError(TEXT)
     return value
 
 
@@ -207,6 +264,8 @@ def _boolean(value: Any) -> bool:
 
 def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Returns values with dotted names resolved into mappings, and records among them as mappings where merged."""
+    if not isinstance(values, Mapping):
+        fail(kind.__name__, values, "a mapping of names to values")
     nested: dict[str, Any] = {}
     for key, value in values.items():
         name, dot, rest = str(key).partition(".")
@@ -262,5 +321,5 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
     if first["type"].startswith("dataclass"):
         allowed = "it must be a mapping of names to values"
-    choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", ""))]
+    choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]
     return InputError(f"{'.'.join(places)}: {shown(value)} is not allowed; {allowed}{nearest(value, choices)}")

@@ -143,7 +143,7 @@ def test_files(tmp_path: Path) -> None:
     path.write_text("")
     assert load_yaml(path) == {}
     for text, message in (
-        ("a: [", "file.yaml: is not YAML"),
+        ("a: [", "file.yaml: damaged, or not YAML"),
         ("3", "file.yaml: holds int; it must be"),
         ("a: {b: 1, b: 2}", "file.yaml: .*'b' is given twice"),
     ):

@@ -104,9 +104,9 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
 
     (folder / "runs" / jobs[0].cell.path).mkdir(parents=True)
     with locked(folder / "runs" / jobs[0].cell.path):
-        assert sweeps.run(folder, jobs, environments) == jobs[:1]
+        assert sweeps.run(folder, jobs, environments) == (jobs[:1], [])
     assert trained == ["joint"]
-    assert sweeps.run(folder, jobs, environments) == []
+    assert sweeps.run(folder, jobs, environments) == ([], [])
     assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
 

@@ -14,7 +14,7 @@ import tyro
 from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
 from mqe_jax.cli.output import echo
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
 from mqe_jax.limits import Candidates
 from mqe_jax.settings import fail, record
 
@@ -42,7 +42,7 @@ class Sweep:
 
     def run(self) -> dict[str, Any]:
         """Trains the remaining runs and writes the report, or prints their estimated time."""
-        from mqe_jax.cli.setup import base_config, environments, for_task
+        from mqe_jax.cli.setup import base_config, check_start, environments, for_task
         from mqe_jax.envs import ALIASES, TASKS
         from mqe_jax.study import report as reports
         from mqe_jax.study import sweep as sweeps
@@ -57,7 +57,7 @@ class Sweep:
             name = settings.config and settings.config.replace("{task}", task)
             return for_task(base_config(task, name, algorithm), task)
 
-        jobs = sweeps.plan(settings, folder, config_of, self.cells)
+        jobs = sweeps.plan(settings, folder, config_of, self.cells, check_start)
         result = _estimate(sweeps.estimate(folder, jobs), jobs)
         if self.dry_run:
             if not self.json:
@@ -67,13 +67,19 @@ class Sweep:
         cells = "".join(f" --cells {shlex.quote(cell)}" for cell in self.cells)
         part = "" if self.part is None else f" --part {shlex.quote(self.part)}"
         with interrupts.before_exit(lambda: f"resume with: mqe sweep {self.file}{part} --folder {folder}{cells}"):
-            others = sweeps.run(folder, jobs, functools.partial(environments, self.impl))
+            others, failed = sweeps.run(
+                folder, jobs, functools.partial(environments, self.impl), on_failure=_tell_failure
+            )
         if others:
             skipped = ", ".join(job.cell.path.as_posix() for job in others)
             echo(f"mqe: skipped, in use by other processes: {skipped}")
-        files = [] if len(others) == len(jobs) > 0 else reports.report(folder)
+        files = [] if len(others) + len(failed) == len(jobs) > 0 else reports.report(folder)
         if files:
             echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
+        if failed:
+            kind = NonFiniteError if isinstance(failed[0][1], NonFiniteError) else InputError
+            names = ", ".join(job.cell.path.as_posix() for job, _ in failed)
+            raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {names}")
         left = sweeps.plan(settings, folder, config_of, self.cells)
         return {"left": _estimate(sweeps.estimate(folder, left), left), "report": [str(file) for file in files]}
 
@@ -143,6 +149,10 @@ class Tournament(TaskOptions):
                 print(f"{names[i]:<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
         rows = [{"policy": names[i], **{k: float(x[i]) for k, x in ratings._asdict().items()}} for i in order]
         return {"task": self.task, "ratings": rows, "policies": names, "results": results.tolist()}
+
+
+def _tell_failure(job: sweeps.Job, error: Exception) -> None:
+    echo(f"mqe: {job.cell.path.as_posix()} failed: {one_line(error)}")
 
 
 def _estimate(seconds: list[float], jobs: list[sweeps.Job]) -> dict[str, Any]:

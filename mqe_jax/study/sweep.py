@@ -14,12 +14,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
+import jax
 import yaml
 from annotated_types import MaxLen, MinLen
 
-from mqe_jax.errors import InputError, InUseError, nearest
+from mqe_jax.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
 from mqe_jax.limits import Seed, Seeds
 from mqe_jax.settings import build, fail, load_yaml, override, record, to_mapping
@@ -117,11 +118,16 @@ def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
 
 
 def plan(
-    sweep: Sweep, folder: Path, config_of: Callable[[str, str], TrainConfig], cells: Sequence[str] = ()
+    sweep: Sweep,
+    folder: Path,
+    config_of: Callable[[str, str], TrainConfig],
+    cells: Sequence[str] = (),
+    check: Callable[[TrainConfig], object] = lambda config: None,
 ) -> list[Job]:
     """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
 
-    `config_of(task, algorithm)` gives the settings that those of the sweep override. Finished runs are left out.
+    `config_of(task, algorithm)` gives the settings that those of the sweep override, and `check` raises an InputError
+    for settings with which a run could not start: here, before the first cell is trained. Finished runs are left out.
     The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 
@@ -132,6 +138,10 @@ def plan(
     for cell in select(sweep, cells):
         config = _overridden(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
         config = _overridden(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
+        try:
+            check(config)
+        except InputError as error:
+            raise InputError(f"{cell.path.as_posix()}: {error}") from None
         left = [seed for seed in sweep.seeds if not finished(_run(folder, cell, seed))]
         started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
         fresh = [seed for seed in left if seed not in started]
@@ -143,6 +153,9 @@ def plan(
 
 def _overridden(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
     """Returns settings with those of the mapping `name` in a sweep file; its errors have this prefix."""
+    for key in ("task", "seed"):
+        if key in changes:
+            fail(f"{name}.{key}", changes[key], f"left out: the sweep's {key}s are in its list `{key}s`")
     try:
         return override(config, changes)
     except InputError as error:
@@ -198,26 +211,45 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
 
-def run(folder: Path, jobs: Sequence[Job], environments: Environments, on_update: OnUpdate | None = None) -> list[Job]:
-    """Trains the jobs sequentially; each resumes from its checkpoints.
+class Outcome(NamedTuple):
+    """The jobs that `run` did not finish."""
+
+    others: list[Job]
+    """Those whose cells other processes have locked."""
+    failed: list[tuple[Job, Exception]]
+    """Those that failed, each with its error."""
+
+
+def run(
+    folder: Path,
+    jobs: Sequence[Job],
+    environments: Environments,
+    on_update: OnUpdate | None = None,
+    on_failure: Callable[[Job, Exception], object] = lambda job, error: None,
+) -> Outcome:
+    """Trains the jobs sequentially; each resumes from its checkpoints. One that fails does not stop the others.
 
     Several processes may run the same sweep at the same time, each job being trained by the one that locks its cell
-    first. Returns the jobs skipped because other processes hold the locks of their cells.
-
-    Raises:
-        InputError: if a run cannot be resumed.
+    first. `on_failure` is called at once for a job that fails with bad input, a file that cannot be read or written, a
+    training that became non-finite, or memory that does not suffice.
     """
-    left = []
+    outcome = Outcome([], [])
     for job in jobs:
-        cell_folder = folder / "runs" / job.cell.path
-        cell_folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.ExitStack() as lock:
-            try:
-                lock.enter_context(locked(cell_folder))
-            except InUseError:
-                left.append(job)
-                continue
-            if not all(map(finished, job.folders)):  # by another process since the jobs were planned
-                env, eval_env = environments(job.configs[0], len(job.configs))
-                train_seeds(env, job.configs, job.folders, True, on_update, eval_env)
-    return left
+        try:
+            _train(folder, job, environments, on_update)
+        except InUseError:
+            outcome.others.append(job)
+        except (InputError, OSError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
+            outcome.failed.append((job, error))
+            on_failure(job, error)
+    return outcome
+
+
+def _train(folder: Path, job: Job, environments: Environments, on_update: OnUpdate | None) -> None:
+    """Trains a job under the lock of its cell."""
+    cell_folder = folder / "runs" / job.cell.path
+    cell_folder.mkdir(parents=True, exist_ok=True)
+    with locked(cell_folder):
+        if not all(map(finished, job.folders)):  # by another process since the jobs were planned
+            env, eval_env = environments(job.configs[0], len(job.configs))
+            train_seeds(env, job.configs, job.folders, True, on_update, eval_env)

@@ -18,7 +18,7 @@ import yaml
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
-from mqe_jax.settings import fail, to_mapping
+from mqe_jax.settings import PathText, check, fail, to_mapping
 from mqe_jax.train.checkpoint import (
     check_alone,
     check_run,
@@ -35,7 +35,7 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationL
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
-from mqe_jax.train.types import Recorder, VectorEnv, join_traces
+from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
@@ -86,6 +86,10 @@ def train_seeds(
     `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all.
     The recorder receives the environments of all seeds as one batch.
     """
+    check("env", env, AnyBatch)
+    for config, run_dir in zip(configs, run_dirs, strict=True):
+        check("config", config, TrainConfig)
+        check("run_dir", run_dir, PathText)
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
