@@ -52,7 +52,7 @@ class Sweep:
     """Settings file or shipped name, in which {task} stands for the task's id; none uses paper/ALGORITHM."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings that override the file's in every run."""
-    variants: Mapping[str, Any] = field(default_factory=lambda: {PLAIN: {}})
+    variants: Annotated[Mapping[str, Any], MinLen(1)] = field(default_factory=lambda: {PLAIN: {}})
     """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
 
     def __post_init__(self) -> None:
