@@ -56,6 +56,7 @@ Port = Annotated[int, Gt(0), Lt(65536)]
 
 # -- texts, settings and files -----------------------------------------------------------------------------------------
 TEXT = 4096  # characters of a name or a path, none of which is a control character
+FILE_NAME = 255  # bytes of a part of a path
 SHOWN = 200  # characters of a value in a message
 DEPTH = 32  # nesting of YAML and JSON; YAML has no aliases
 VALUES = 20_000  # in one YAML file

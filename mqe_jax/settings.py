@@ -21,6 +21,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import os
 import re
 import types
 import typing
@@ -81,11 +82,15 @@ def record(cls: type[T]) -> type[T]:
 def _path(value: Any) -> Any:
     if not isinstance(value, str | Path) or not str(value) or not is_text(str(value)):
         raise ValueError(f"a path, or a text that is not empty, {TEXT}")
+    if any(len(os.fsencode(part)) > limits.FILE_NAME for part in Path(value).parts):
+        raise ValueError(f"a path whose parts have at most {limits.FILE_NAME} bytes")
     return value
 
 
 PathText = Annotated[Any, pydantic.AfterValidator(_path)]
 """A path, or a text that is one."""
+FileName = Annotated[str, pydantic.AfterValidator(_path)]
+"""A text that is a path."""
 
 
 TEXT = f"at most {limits.TEXT} characters, none of which is a control character"

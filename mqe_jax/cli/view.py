@@ -55,6 +55,6 @@ def _check_address(host: str, port: int) -> None:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as server:
             server.bind(address)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            fail("host", host, f"an address of this machine ({error.strerror or error})")
+    except (OSError, UnicodeError) as error:
+        if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
+            fail("host", host, f"an address of this machine ({getattr(error, 'strerror', None) or error})")

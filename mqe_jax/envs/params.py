@@ -20,7 +20,7 @@ from mqe_jax.limits import (
     Time,
     TimeLimit,
 )
-from mqe_jax.settings import Range, fail, record
+from mqe_jax.settings import FileName, Range, fail, record
 
 
 @record
@@ -57,7 +57,7 @@ class TaskParams:
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
     skill: str = "walk"
     """Skill of the agents with control `command`, and of NPC robots (`mqe_jax.skills`)."""
-    skill_weights: str | None = None
+    skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
     """Named default commands of the skill; of the walk policy trot, pronk, bound or pace, trot if None."""
@@ -67,7 +67,7 @@ class TaskParams:
     """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
     joint angles, hips within 0.125 rad.
     """
-    actuator_network: str | None = None
+    actuator_network: FileName | None = None
     """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: PositiveFriction = 1.0
     """Sliding friction of robots and ground."""

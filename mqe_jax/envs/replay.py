@@ -88,6 +88,10 @@ def load_recording(file: str | pathlib.Path) -> Recording:
         about = parse_json(str(arrays["about"]), "about")
         states = {name.removeprefix("states/"): arrays[name] for name in arrays if name.startswith("states/")}
         made = Recording(**about, states=states, actions=arrays["actions"])
+        if [type(about[name]) for name in ("task", "params", "impl", "control")] != [str, dict, str, str]:
+            raise ValueError("its task, parameters, engine or control are of another type")
+        if any(values.dtype.kind not in "fiub" for values in (made.actions, *states.values())):
+            raise ValueError("its arrays are not numbers")
         if made.actions.ndim != 3 or not all(len(made.actions) == len(values) > 0 for values in states.values()):
             raise ValueError("its arrays are not those of a sequence of states and actions")
         return made

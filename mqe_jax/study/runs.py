@@ -89,7 +89,7 @@ def read_runs(folder: Path) -> list[Run]:
     """
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
-        if finished(path.parent):
+        if path.parent.name.removeprefix("seed").isdecimal() and finished(path.parent):
             seed = int(path.parent.name.removeprefix("seed"))
             evaluations = read_evaluations(path.parent)
             curve = read_curve(path.parent / CSV_FILE)
@@ -144,11 +144,11 @@ class Reference:
 
     label: str = "reference"
     """What the values are, in the legend of figures."""
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(default_factory=dict)
     """Variant -> task -> algorithm -> average step reward."""
-    variants: Mapping[str, Any] = field(default_factory=dict)
+    variants: Mapping[str, str] = field(default_factory=dict)
     """Titles of variants, in their order; others follow."""
-    tasks: Mapping[str, Any] = field(default_factory=dict)
+    tasks: Mapping[str, str] = field(default_factory=dict)
     """Titles of tasks, in their order; others follow."""
     algorithms: tuple[str, ...] = ()
     """Algorithms in their order; others follow."""

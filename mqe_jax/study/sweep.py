@@ -182,8 +182,9 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
     for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
         with contextlib.suppress(InputError, KeyError):  # stopped before the first update, or without fps
             fps = read_curve(path)["fps"]
+            speed = float(fps[len(fps) // 2])
             for key in ((), path.parts[-4:-2]):
-                speeds.setdefault(key, []).append(float(fps[len(fps) // 2]))
+                speeds.setdefault(key, []).extend([speed] * (0 < speed < math.inf))
     seconds = []
     for job in jobs:
         known = speeds.get(job.cell.path.parts) or speeds.get(())

@@ -21,7 +21,7 @@ from annotated_types import Ge
 from typing_extensions import TypedDict
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import make_folder, read_json, write_atomically
+from mqe_jax.files import check_locks, make_folder, read_json, write_atomically
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import EvalResult, Evaluator
 from mqe_jax.train.learner import env_dims
@@ -148,6 +148,7 @@ class EvaluationLog:
 
     def prune(self) -> None:
         """Removes all policies but the best; called once the checkpoint that includes it is on disk."""
+        check_locks(self._path)
         best = self.best()
         for path in (self._run_dir / "best").glob("*.safetensors"):
             if best is None or path != _best_path(self._run_dir, best):
