@@ -115,71 +115,72 @@ def _render(x: Any, **options: Any) -> Any:
     )
 
 
-CALLS: list[tuple[str, Callable[[Any], Any]]] = [
-    *[("task: ", lambda x, v=v: make(v)) for v in (3, [], None)],
-    *[("impl: ", lambda x, v=v: make("go1gate", impl=v)) for v in (3, [])],
-    ("control: ", lambda x: make("go1gate", control=[])),
-    *[("num_envs: ", lambda x, v=v: make("go1gate", num_envs=v)) for v in (NAN, 1.5, 0, True, 10**9, None, [])],
-    ("robot: ", lambda x: make("go1gate", robot=[])),
-    *[("skill_weights: ", lambda x, v=v: make("go1gate", skill_weights=v)) for v in ("a\0b", "", "x" * 300)],
-    ("commands", lambda x: make("go1gate", commands=3)),
-    *[("num_envs: ", lambda x, v=v: VectorEnv(x["task"], v)) for v in (0, NAN, 1.5, 10**9, "x")],
-    *[("copies: ", lambda x, v=v: VectorEnv(x["task"], 2, v)) for v in (0, NAN, -1)],
-    ("num_envs: ", lambda x: VectorEnv(x["task"], 2**17, 2)),
-    ("env: ", lambda x: VectorEnv("go1gate", 2)),  # type: ignore[arg-type]
-    *[("key: ", lambda x, v=v: x["matches"].reset(v)) for v in (3, "x", None, np.zeros(2))],
-    *[("key: ", lambda x, v=v: x["task"].reset(v)) for v in (3, "x", None, np.zeros(3, np.uint32))],
-    *[("episodes: ", lambda x, v=v: _evaluate(x, v)) for v in (0, -1, 1.5, NAN, "many", True, 10**12)],
-    *[("block: ", lambda x, v=v: _evaluate(x, block=v)) for v in (0, NAN, 1.5)],
-    *[("max_steps: ", lambda x, v=v: _evaluate(x, max_steps=v)) for v in (0, NAN, -1)],
-    *[("key: ", lambda x, v=v: _evaluate(x, key=v)) for v in (3, None, "k")],
-    ("act: ", lambda x: _evaluate(x, act=None)),
-    *[("env: ", lambda x, v=v: _evaluate(x, env=v)) for v in (None, "go1gate", 3)],
-    ("env: ", lambda x: _evaluate(x, env=x["fake"])),
-    *[("source: ", lambda x, v=v: mqe_jax.load_policy(v)) for v in (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)],
-    ("env: ", lambda x: mqe_jax.load_policy("scripted", "go1gate")),
-    ("not a regular file", lambda x: mqe_jax.load_policy("/dev/zero")),
-    *[("opponents: ", lambda x, v=v: versus(x["matches"], v)) for v in ([], "idle", 3, [3], None)],
-    *[("draw_reward: ", lambda x, v=v: versus(x["matches"], ["idle"], draw_reward=v)) for v in (NAN, "x", 1e300)],
-    *[("env: ", lambda x, v=v: versus(v, ["idle"])) for v in (None, "go1tug")],
-    ("env: ", lambda x: Mirror(None)),  # type: ignore[arg-type]
-    *[("episodes: ", lambda x, v=v: _record(x, episodes=v)) for v in (0, NAN, 1.5, 10**8)],
-    *[("seconds: ", lambda x, v=v: _record(x, seconds=v)) for v in (0, NAN, math.inf, -1, 1e-9, "x")],
-    ("episodes: 1024", lambda x: _record(x, episodes=1024, seconds=600)),
-    ("key: ", lambda x: _record(x, key=7)),
-    ("act: ", lambda x: _record(x, act=3)),
-    ("episodes: ", lambda x: recording.best([])),
-    *[("size", lambda x, v=v: _render(x, size=v)) for v in ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))],
-    *[("fps: ", lambda x, v=v: _render(x, fps=v)) for v in (-1, 0, NAN, math.inf, "x")],
-    *[("speed: ", lambda x, v=v: _render(x, speed=v)) for v in (0, -1, NAN)],
-    *[("at: ", lambda x, v=v: _render(x, path=Path("a.png"), at=v)) for v in (NAN, -1)],
-    *[("path: ", lambda x, v=v: _render(x, path=v)) for v in (None, 3, "")],
-    ("backend: ", lambda x: _render(x, backend="x")),
-    ("view: ", lambda x: _render(x, view="x", backend=None)),
-    ("episode: ", lambda x: _render(x, episode=x["episode"].cut(slice(0, 0)))),
-    ("episode: ", lambda x: render.render_episode(x["match"], x["episode"], x["gif"])),
-    ("output: ", lambda x: _render(x, episode=x["long"], size=(4096, 4096), fps=50)),
-    ("size", lambda x: list(render.render_frames(x["fake"], x["episode"], size=(-1, 3)))),
-    ("frames: ", lambda x: clips.write_clip(x["gif"], iter([]), 25)),
-    ("frames: ", lambda x: clips.write_clip(x["gif"], iter([np.zeros((32, 32))]), 25)),
-    ("frames: ", lambda x: clips.write_clip(x["gif"], iter(["x"]), 25)),  # type: ignore[arg-type]
-    ("fps: ", lambda x: clips.write_clip(x["gif"], iter([np.zeros((32, 32, 3), np.uint8)]), 0)),
-    *[("run_dir: ", lambda x, v=v: train(x["batch"], x["config"], v)) for v in (None, "", 3)],
-    ("config: ", lambda x: train(x["batch"], {"seed": 1}, "run")),  # type: ignore[arg-type]
-    ("env: ", lambda x: train(None, x["config"], "run")),  # type: ignore[arg-type]
-    *[("path: ", lambda x, v=v: load_config(v)) for v in (None, 3)],
-    *[("TrainConfig: ", lambda x, v=v: build(TrainConfig, v)) for v in (None, [1], "x")],
-    *[("policy: ", lambda x, v=v: read_policy(v)) for v in (None, 3)],
+CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
+    ("task: ", lambda x, v: make(v), (3, [], None)),
+    ("impl: ", lambda x, v: make("go1gate", impl=v), (3, [])),
+    ("control: ", lambda x, v: make("go1gate", control=v), ([], 3)),
+    ("num_envs: ", lambda x, v: make("go1gate", num_envs=v), (NAN, 1.5, 0, True, 10**9, None, [])),
+    ("robot: ", lambda x, v: make("go1gate", robot=[]), (None,)),
+    ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300)),
+    ("commands", lambda x, v: make("go1gate", commands=3), (None,)),
+    ("num_envs: ", lambda x, v: VectorEnv(x["task"], v), (0, NAN, 1.5, 10**9, "x")),
+    ("copies: ", lambda x, v: VectorEnv(x["task"], 2, v), (0, NAN, -1)),
+    ("num_envs: ", lambda x, v: VectorEnv(x["task"], 2**17, 2), (None,)),
+    ("env: ", lambda x, v: VectorEnv(v, 2), ("go1gate", None)),
+    ("key: ", lambda x, v: x["matches"].reset(v), (3, "x", None, np.zeros(2))),
+    ("key: ", lambda x, v: x["task"].reset(v), (3, "x", None, np.zeros(3, np.uint32))),
+    ("episodes: ", lambda x, v: _evaluate(x, v), (0, -1, 1.5, NAN, "many", True, 10**12)),
+    ("block: ", lambda x, v: _evaluate(x, block=v), (0, NAN, 1.5)),
+    ("max_steps: ", lambda x, v: _evaluate(x, max_steps=v), (0, NAN, -1)),
+    ("key: ", lambda x, v: _evaluate(x, key=v), (3, None, "k")),
+    ("act: ", lambda x, v: _evaluate(x, act=None), (None,)),
+    ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
+    ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
+    ("source: ", lambda x, v: mqe_jax.load_policy(v), (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)),
+    ("env: ", lambda x, v: mqe_jax.load_policy("scripted", "go1gate"), (None,)),
+    ("not a regular file", lambda x, v: mqe_jax.load_policy("/dev/zero"), (None,)),
+    ("opponents: ", lambda x, v: versus(x["matches"], v), ([], "idle", 3, [3], None)),
+    ("draw_reward: ", lambda x, v: versus(x["matches"], ["idle"], draw_reward=v), (NAN, "x", 1e300)),
+    ("env: ", lambda x, v: versus(v, ["idle"]), (None, "go1tug")),
+    ("env: ", lambda x, v: Mirror(v), (None, 3)),
+    ("episodes: ", lambda x, v: _record(x, episodes=v), (0, NAN, 1.5, 10**8)),
+    ("seconds: ", lambda x, v: _record(x, seconds=v), (0, NAN, math.inf, -1, 1e-9, "x")),
+    ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
+    ("key: ", lambda x, v: _record(x, key=7), (None,)),
+    ("act: ", lambda x, v: _record(x, act=3), (None,)),
+    ("episodes: ", lambda x, v: recording.best([]), (None,)),
+    ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
+    ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),
+    ("speed: ", lambda x, v: _render(x, speed=v), (0, -1, NAN)),
+    ("at: ", lambda x, v: _render(x, path=Path("a.png"), at=v), (NAN, -1)),
+    ("path: ", lambda x, v: _render(x, path=v), (None, 3, "")),
+    ("backend: ", lambda x, v: _render(x, backend="x"), (None,)),
+    ("view: ", lambda x, v: _render(x, view="x", backend=None), (None,)),
+    ("episode: ", lambda x, v: _render(x, episode=x["episode"].cut(slice(0, 0))), (None,)),
+    ("episode: ", lambda x, v: render.render_episode(x["match"], x["episode"], x["gif"]), (None,)),
+    ("output: ", lambda x, v: _render(x, episode=x["long"], size=(4096, 4096), fps=50), (None,)),
+    ("size", lambda x, v: list(render.render_frames(x["fake"], x["episode"], size=(-1, 3))), (None,)),
+    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([]), 25), (None,)),
+    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32))]), 25), (None,)),
+    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([v]), 25), ("x",)),
+    ("fps: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32, 3), np.uint8)]), 0), (None,)),
+    ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), (None, "", 3)),
+    ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
+    ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
+    ("path: ", lambda x, v: load_config(v), (None, 3)),
+    ("TrainConfig: ", lambda x, v: build(TrainConfig, v), (None, [1], "x")),
+    ("policy: ", lambda x, v: read_policy(v), (None, 3)),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("index", range(len(CALLS)))
-def test_bad_calls(index: int, given: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("said", "call", "value"), [(*row[:2], value) for row in CALLS for value in row[2]])
+def test_bad_calls(
+    said: str, call: Any, value: Any, given: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An InputError that names the argument; nothing is written."""
     monkeypatch.chdir(tmp_path)
-    said, call = CALLS[index]
     with pytest.raises(InputError) as error:
-        call(given)
+        call(given, value)
     assert said in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 1000
     assert list(tmp_path.iterdir()) == []
 

@@ -144,7 +144,7 @@ class Reference:
 
     label: str = "reference"
     """What the values are, in the legend of figures."""
-    values: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(default_factory=dict)
+    values: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
     """Variant -> task -> algorithm -> average step reward."""
     variants: Mapping[str, str] = field(default_factory=dict)
     """Titles of variants, in their order; others follow."""
