@@ -182,6 +182,7 @@ def test_there_and_back() -> None:
         ({"network.hidden_sizes": []}, "network.hidden_sizes: .* should have at least 1 item"),
         ({"network.hidden_size": 3}, "network.hidden_size: unknown name .* 'hidden_sizes'"),
         ({"network.name": "actor_crtic"}, "network.name: 'actor_crtic' .* a registered network: .*actor_critic"),
+        ({"network.name": [1]}, r"network.name: \[1\] .* a registered network"),
         ({"network.log_std_min": 1.0}, r"network.log_std_init: 0.0 .* at least log_std_min \(1.0\)"),
         ({"network": 3}, "network: 3 is not allowed; it must be an instance of NetworkSettings"),
     ],

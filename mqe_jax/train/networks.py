@@ -112,7 +112,7 @@ def network_settings(value: Any) -> Any:
     if not isinstance(value, Mapping):
         return value
     name = value.get("name", "actor_critic")
-    if name not in NETWORKS:
+    if not isinstance(name, str) or name not in NETWORKS:
         hint = nearest(name, NETWORKS)
         fail("name", name, f"a registered network: {', '.join(NETWORKS)}{hint}")
     return build(NETWORKS[name], value)
