@@ -21,6 +21,7 @@ from mqe_jax.train.learner import Learner, make_learner
 from mqe_jax.train.runner import train
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
+SETTINGS = settings(network__recurrent=False, ppo__epochs=1, ppo__minibatches=1)
 
 
 def replace(folder: Path) -> None:
@@ -39,7 +40,7 @@ LOST: dict[str, Callable[[Path], object]] = {
 @pytest.fixture(scope="module")
 def learner() -> Learner:
     """The compiled learner of all trainings of this file."""
-    return make_learner(PROBE, settings())
+    return make_learner(PROBE, SETTINGS)
 
 
 @pytest.mark.parametrize("how", LOST)
@@ -55,7 +56,7 @@ def test_a_training_stops_when_its_folder_is_lost(
             LOST[how](folder)
 
     with pytest.raises(InputError, match=f"run_dir: {folder} was removed, renamed or replaced; nothing more is"):
-        train(PROBE, settings(), folder, on_update=lose)
+        train(PROBE, SETTINGS, folder, on_update=lose)
     assert not folder.exists() or list(folder.iterdir()) == []
     moved = next(tmp_path.rglob("moved"), tmp_path / "other" / "run")
     if how != "removed":
@@ -74,11 +75,11 @@ def test_a_second_training_keeps_its_checkpoints(
     def lose(state: object, row: dict[str, float]) -> None:
         if row["updates"] == 1:
             folder.rename(tmp_path / "moved")
-            train(PROBE, settings(), folder)
+            train(PROBE, SETTINGS, folder)
             seen.update({path: path.read_bytes() for path in folder.rglob("*") if path.is_file()})
 
     with pytest.raises(InputError, match="was removed, renamed or replaced"):
-        train(PROBE, settings(), folder, on_update=lose)
+        train(PROBE, SETTINGS, folder, on_update=lose)
     assert len(seen) >= 5 and {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == seen
 
 
@@ -119,7 +120,7 @@ def test_files_of_dead_processes_go_when_a_run_starts(
     kept = [f".clip.{os.getppid()}.tmp.mp4", ".hidden", "notes.tmp"]
     for name in (*gone, *kept):
         (tmp_path / name).write_text("half")
-    train(PROBE, settings(), tmp_path)
+    train(PROBE, SETTINGS, tmp_path)
     assert [name for name in (*gone, *kept) if (tmp_path / name).exists()] == kept
 
 
