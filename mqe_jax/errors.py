@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterable
+
+from mqe_jax.limits import SHOWN
+
+_REPR = reprlib.Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, SHOWN, SHOWN
+_REPR.maxtuple = _REPR.maxlist = _REPR.maxdict = 8
 
 
 class InputError(ValueError):
@@ -27,9 +34,24 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
+def shown(value: object) -> str:
+    """Returns a value as it is shown in a message: its `repr`, shortened."""
+    try:
+        text = _REPR.repr(value)
+    except Exception:  # a `repr` of whoever made the value, or an integer of thousands of digits
+        text = f"<{type(value).__name__}>"
+    return brief(text)
+
+
+def brief(text: str) -> str:
+    """Returns a text of at most `SHOWN` characters."""
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
 def nearest(word: object, known: Iterable[object]) -> str:
     """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
     import difflib  # 10 ms, which a program needs for a message only
 
-    match = difflib.get_close_matches(str(word), [str(name) for name in known], 1, 0.5)
+    text = word[:SHOWN] if isinstance(word, str) else shown(word)
+    match = difflib.get_close_matches(text, [str(name) for name in known], 1, 0.5)
     return f" (did you mean {match[0]!r}?)" if match else ""

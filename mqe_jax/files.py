@@ -1,20 +1,32 @@
-"""Files and folders: atomic writes, errors that name the file, write checks, locks."""
+"""Files and folders: bounded readers (`mqe_jax.limits`), atomic writes, errors that name the file, locks."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import fcntl
+import json
 import os
+import re
+import stat
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mqe_jax import interrupts
-from mqe_jax.errors import InputError, InUseError
+from mqe_jax import interrupts, limits
+from mqe_jax.errors import InputError, InUseError, brief
 
 if TYPE_CHECKING:
     import numpy as np
+
+
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\.\w+)?")
+_locks: dict[Path, int] = {}  # folders that this process has locked, with the handle of each
+
+
+# -- writers: below a locked folder they write only while the folder's path still leads to it --------------------------
 
 
 @contextlib.contextmanager
@@ -24,10 +36,12 @@ def replacing(path: Path) -> Iterator[Path]:
     The temporary file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    check_locks(path)
     interrupts.temporaries.add(temporary)
     try:
         with naming(path):
             yield temporary
+            check_locks(path)
             os.replace(temporary, path)
     finally:
         with contextlib.suppress(OSError):
@@ -54,19 +68,131 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def append(path: Path, content: bytes) -> None:
     """Appends to a file, which it creates where there is none; an OSError names it."""
+    check_locks(path)
     with naming(path), path.open("ab") as file:
         file.write(content)
 
 
+def make_folder(path: Path) -> None:
+    """Creates a folder, where there is none, in one that exists; an OSError names it."""
+    check_locks(path)
+    with naming(path):
+        path.mkdir(exist_ok=True)
+
+
+def check_locks(path: Path) -> None:
+    """Raises an InputError where a locked folder around `path` was removed, renamed or replaced."""
+    for folder in path.parents:
+        if folder in _locks:
+            with contextlib.suppress(OSError):
+                if os.path.samestat(folder.stat(), os.fstat(_locks[folder])):
+                    continue
+            raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Removes the temporary files that processes which have ended left in a folder."""
+    for path in folder.glob(".*.tmp*"):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match and path not in interrupts.temporaries and not _alive(int(match[1])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _alive(process: int) -> bool:
+    """Returns whether another process has this number."""
+    with contextlib.suppress(OSError, OverflowError):
+        os.kill(process, 0)
+        return process != os.getpid()
+    return False
+
+
+# -- readers: every failure of a parser is an InputError that names the file; no file costs more than its limit --------
+
+
+def check_file(path: Path, limit: int) -> None:
+    """Raises an InputError unless a path is a regular file of at most `limit` bytes."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a null byte
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"{path}: cannot be read ({reason})") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: cannot be read (not a regular file)")
+    if status.st_size > limit:
+        raise InputError(f"{path}: has {status.st_size} bytes; it must have at most {limit}")
+
+
+@contextlib.contextmanager
+def parsing(path: Path | str, what: str) -> Iterator[None]:
+    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: damaged, or not <what> ...`.
+
+    Parsers of other libraries raise errors of any type, among them RecursionError and MemoryError.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = brief(" ".join(str(error).split()) or type(error).__name__)
+        raise InputError(f"{path}: damaged, or not {what} ({reason})") from None
+
+
+def read_text(path: Path, limit: int, what: str) -> str:
+    """Reads a UTF-8 file of at most `limit` bytes."""
+    check_file(path, limit)
+    with parsing(path, what):
+        return path.read_text(encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    """Reads a JSON file, nested at most `limits.DEPTH` deep."""
+    return parse_json(read_text(path, limits.JSON_BYTES, "JSON"), str(path))
+
+
+def parse_json(text: str, name: str) -> Any:
+    """Returns the value of a JSON text, nested at most `limits.DEPTH` deep; errors start with its name."""
+    with parsing(name, "JSON"):
+        value = json.loads(text)
+        level = [value]
+        for _ in range(limits.DEPTH):
+            inner = [list(x.values()) if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
+            level = [x for values in inner for x in values]
+        if level:
+            raise ValueError(f"nested more than {limits.DEPTH} deep")
+        return value
+
+
+def read_rows(path: Path) -> Iterator[list[str]]:
+    """Yields the rows of a CSV file, the columns' names first."""
+    check_file(path, limits.CSV_BYTES)
+    with parsing(path, "a CSV file"), path.open(encoding="utf-8", newline="") as file:
+        yield from csv.reader(file, strict=True)
+
+
 def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
-    """Reads a safetensors file; an InputError says `what` it should be."""
-    from safetensors import SafetensorError
+    """Reads a safetensors file of weights; an InputError says `what` it should be."""
     from safetensors.numpy import load_file
 
-    try:
+    check_file(file, limits.WEIGHTS_BYTES)
+    with parsing(f"{what} {file}", "a safetensors file of numpy's types"):
         return load_file(file)
-    except SafetensorError as error:
-        raise InputError(f"{what} {file}: not a safetensors file ({error})") from None
+
+
+@contextlib.contextmanager
+def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
+    """Opens a zip file whose members have at most `limit` bytes together, none of them encrypted.
+
+    Whatever is raised while it is open becomes an InputError that says `what` it should be.
+    """
+    check_file(path, limit)
+    with parsing(path, what), zipfile.ZipFile(path) as opened:
+        size = sum(member.file_size for member in opened.infolist())
+        if size > limit:
+            raise ValueError(f"its members have {size} bytes; at most {limit} are allowed")
+        if any(member.flag_bits & 1 for member in opened.infolist()):
+            raise ValueError("encrypted")
+        yield opened
 
 
 def check_folder(folder: Path, field: str = "run_dir") -> None:
@@ -83,15 +209,22 @@ def check_folder(folder: Path, field: str = "run_dir") -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Holds a lock on a folder; it is released when the process exits, even abnormally.
 
+    Below it, nothing is written once its path leads to another folder or to none.
+
     Raises:
         InUseError: where another process (or this one) already holds it.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    handle, outer = os.open(folder, os.O_RDONLY), _locks.get(folder)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InUseError(f"run_dir: {folder} is in use by another process") from None
+        _locks[folder] = handle
         yield
     finally:
         os.close(handle)
+        if outer is None:
+            _locks.pop(folder, None)
+        else:
+            _locks[folder] = outer

@@ -15,12 +15,13 @@ import mujoco
 import numpy as np
 
 from mqe_jax.collision import GROUND_BIT, OBJECT_BIT, WALL_BIT
-from mqe_jax.settings import NonNegative, Positive, record
+from mqe_jax.limits import Coordinate, Damping, Distance, Friction, Length, Mass
+from mqe_jax.settings import record
 
 GRAVITY = 9.81  # m/s^2
 Color = tuple[float, float, float, float]
-Vector = tuple[float, float, float]
-Size = tuple[Positive, Positive, Positive]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Size = tuple[Length, Length, Length]
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 # Collides with ground, walls, other objects and robots.
@@ -74,9 +75,9 @@ class Box(Object):
 
     size: Size = (1.0, 1.0, 1.0)
     """Full extents, m."""
-    mass: Positive = 6.0
+    mass: Mass = 6.0
     """Mass, kg."""
-    friction: NonNegative = 1.0
+    friction: Friction = 1.0
     """Sliding friction; takes precedence over the ground's."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
@@ -92,13 +93,13 @@ class Box(Object):
 class Ball(Object):
     """A football with rolling resistance. Coordinates and velocity as in `Box`."""
 
-    radius: Positive = 0.1
+    radius: Length = 0.1
     """Radius, m."""
-    mass: Positive = 0.318
+    mass: Mass = 0.318
     """Mass, kg."""
-    damping: NonNegative = 0.1
+    damping: Damping = 0.1
     """Linear damping, N s/m."""
-    angular_damping: NonNegative = 0.0003
+    angular_damping: Damping = 0.0003
     """Angular damping, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
@@ -125,17 +126,17 @@ class Cylinder(Object):
     friction loss of the slide, which needs no contacts.
     """
 
-    x: float = 1.6
+    x: Coordinate = 1.6
     """X of the axis, m."""
-    radius: Positive = 1.2
+    radius: Length = 1.2
     """Radius, m."""
-    height: Positive = 0.5
+    height: Length = 0.5
     """Height, m."""
-    mass: Positive = 3.0
+    mass: Mass = 3.0
     """Mass, kg."""
-    friction: NonNegative = 1.0
+    friction: Friction = 1.0
     """Sliding friction between cylinder and ground."""
-    reach: Positive = 1.8
+    reach: Length = 1.8
     """Maximum |y|, m."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
@@ -169,15 +170,15 @@ class Cylinder(Object):
 class Door(Object):
     """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y."""
 
-    position: tuple[float, float] = (2.6, 0.0)
+    position: tuple[Coordinate, Coordinate] = (2.6, 0.0)
     """Position of the hinge (x, y), m."""
     size: Size = (0.08, 1.95, 0.8)
     """Thickness, width and height, m."""
-    mass: Positive = 4.0
+    mass: Mass = 4.0
     """Mass, kg."""
-    inertia: Positive = 1.232
+    inertia: Mass = 1.232
     """Inertia about the hinge, kg m^2."""
-    damping: NonNegative = 0.5
+    damping: Damping = 0.5
     """Damping of the hinge, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
@@ -195,15 +196,15 @@ class Seesaw(Object):
     """Position of the hinge (x, y, z), m."""
     size: Size = (4.123, 1.0, 0.03)
     """Length, width and thickness of the plank, m."""
-    behind: float = 0.103
+    behind: Coordinate = 0.103
     """Distance of the plank's centre from the hinge, towards the near end, m."""
-    mass: Positive = 100.0
+    mass: Mass = 100.0
     """Mass, kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every angle."""
-    inertia: Positive = 100.0
+    inertia: Mass = 100.0
     """Inertia about the hinge, kg m^2."""
-    limit: Positive = 0.254
+    limit: Length = 0.254
     """Maximum |angle|, rad; at the lower limit the near end is on the ground."""
-    damping: NonNegative = 1000.0
+    damping: Damping = 1000.0
     """Damping of the hinge, N m s/rad; limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge, turns it
     at 0.21 rad/s.
     """
@@ -245,7 +246,7 @@ class Platform(Object):
     """Centre of the top face (x, y, z), m."""
     size: Size = (1.0, 1.0, 1.0)
     """Full extents, m."""
-    column: NonNegative = 0.0
+    column: Distance = 0.0
     """Radius of the supporting column, m; none if 0."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
@@ -284,9 +285,9 @@ class Ring(Object):
 
     center: Vector = (0.0, 0.0, 0.0)
     """Centre (x, y, z), m."""
-    radius: Positive = 1.7
+    radius: Length = 1.7
     """Radius, m."""
-    width: Positive = 0.04
+    width: Length = 0.04
     """Width of the line, m."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
@@ -314,11 +315,11 @@ class Sheep(Object):
     Ground friction is part of `flock`, which needs no contacts.
     """
 
-    radius: Positive = 0.2
+    radius: Length = 0.2
     """Radius, m."""
-    height: Positive = 0.5
+    height: Length = 0.5
     """Height, m."""
-    mass: Positive = 5.0
+    mass: Mass = 5.0
     """Mass, kg."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:

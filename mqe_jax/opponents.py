@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.errors import InputError
+from mqe_jax.limits import Number
 from mqe_jax.policies import load_opponent, team_size
-from mqe_jax.settings import fail
+from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.policy import Policy, TrainedPolicy
-from mqe_jax.train.types import Memory, PyTree
+from mqe_jax.train.types import AnyBatch, Memory, PyTree
 
 OUTCOMES = ("win", "draw", "loss")
 """Outcomes of an episode for team 0, in the order of `Opponent.outcomes`."""
@@ -72,7 +73,7 @@ class OneTeam:
     """Environment steps until the time limit."""
 
     def __init__(self, matches: VectorEnv, num_envs: int) -> None:
-        if len(matches.teams) != 2:
+        if len(check("env", matches, AnyBatch).teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
         self.env, self.matches, self.num_envs = matches.env, matches, num_envs
         self.name = matches.name
@@ -221,6 +222,7 @@ class Versus(OneTeam):
         )
 
 
+@checked(env=AnyBatch, draw_reward=Number)
 def versus(
     env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0, time_limit_ends: bool = False
 ) -> Versus:
@@ -238,6 +240,11 @@ def versus(
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
     """
+    if isinstance(opponents, str) or not isinstance(opponents, Sequence):
+        fail("opponents", opponents, "a list of policies")
+    for policy in opponents:
+        if not isinstance(policy, str | Path) and not hasattr(policy, "initial_memory"):
+            fail("opponents", policy, "a policy, or what load_policy accepts")
     policies = [load_opponent(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
     return Versus(env, policies, draw_reward, time_limit_ends)
 
@@ -250,7 +257,7 @@ class Mirror(OneTeam):
     """
 
     def __init__(self, matches: VectorEnv) -> None:
-        super().__init__(matches, 2 * matches.num_envs)
+        super().__init__(matches, 2 * check("env", matches, AnyBatch).num_envs)
         self.privileged_observation_size += 1
 
     def reset(self, key: jax.Array) -> TeamState:

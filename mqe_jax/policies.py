@@ -16,8 +16,9 @@ from mqe_jax.envs import TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
+from mqe_jax.settings import PathText, checked
 from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
-from mqe_jax.train.types import Memory
+from mqe_jax.train.types import AnyEnvironment, Memory
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -81,6 +82,7 @@ class BothTeams:
 def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
 @overload
 def load_policy(source: str | Path, env: Any, *, deterministic: bool = False) -> Policy: ...
+@checked(source=PathText, env=AnyEnvironment | None)
 def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = False) -> Policy:
     """Returns the policy of a name, a run folder or a policy file.
 

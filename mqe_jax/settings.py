@@ -10,8 +10,9 @@ A record is a frozen dataclass whose fields carry their types and bounds once, a
 Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and raises a one-line
 `InputError`: `ppo.clip: -1 is not allowed; it must be greater than 0`.
 
-Numbers are finite unless a field is `AnyFloat`; booleans are rejected as numbers; numpy scalars and strings such as
-"7e-4" (which YAML does not read as a number) are accepted; "none" means None for an optional field.
+Every number has bounds: those of its kind (`mqe_jax.limits`), or of `Number` and `Integer` where a field is a plain
+`float` or `int`. Booleans are rejected as numbers; numpy scalars and strings such as "7e-4" (which YAML does not read
+as a number) are accepted; "none" means None for an optional field.
 """
 
 from __future__ import annotations
@@ -19,30 +20,30 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import math
+import os
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar, dataclass_transform
+from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar, dataclass_transform
 
 import pydantic
 import pydantic_core
-import yaml
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from mqe_jax.errors import InputError, nearest
+from mqe_jax import limits
+from mqe_jax.errors import InputError, nearest, shown
+from mqe_jax.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for those who declare records)
+from mqe_jax.yaml_text import read_yaml
 
 T = TypeVar("T")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
-
-
-def _not_nan(value: float) -> float:
-    if value != value:
-        raise ValueError("a number, infinity included")
-    return value
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
@@ -51,14 +52,8 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Positive = Annotated[float, Gt(0)]
-NonNegative = Annotated[float, Ge(0)]
-Fraction = Annotated[float, Ge(0), Le(1)]
-AnyFloat = Annotated[float, pydantic.Field(allow_inf_nan=True), pydantic.AfterValidator(_not_nan)]
-PositiveInt = Annotated[int, Gt(0)]
-NonNegativeInt = Annotated[int, Ge(0)]
-Seed = Annotated[int, Ge(0), Lt(2**32)]
-Range = Annotated[tuple[float, float], pydantic.AfterValidator(_ordered)]
+Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered)]
+Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered)]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
@@ -84,6 +79,67 @@ def record(cls: type[T]) -> type[T]:
     return typing.cast(type[T], made)
 
 
+def _path(value: Any) -> Any:
+    if not isinstance(value, str | Path) or not str(value) or not is_text(str(value)):
+        raise ValueError(f"a path, or a text that is not empty, {TEXT}")
+    if any(len(os.fsencode(part)) > limits.FILE_NAME for part in Path(value).parts):
+        raise ValueError(f"a path whose parts have at most {limits.FILE_NAME} bytes")
+    return value
+
+
+PathText = Annotated[Any, pydantic.AfterValidator(_path)]
+"""A path, or a text that is one."""
+FileName = Annotated[str, pydantic.AfterValidator(_path)]
+"""A text that is a path."""
+
+
+TEXT = f"at most {limits.TEXT} characters, none of which is a control character"
+"""What `is_text` allows."""
+
+
+def is_text(value: str) -> bool:
+    """Returns whether a text can be a name or a path, and be printed."""
+    return len(value) <= limits.TEXT and not any(ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value)
+
+
+def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Makes a function check some of its arguments, as a record checks its fields, each against a type.
+
+    Raises, when the function is called:
+        InputError: naming the argument, its value and what is allowed.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def call(*given: P.args, **named: P.kwargs) -> R:
+            bound = signature.bind(*given, **named)
+            for name in kinds.keys() & bound.arguments.keys():
+                bound.arguments[name] = check(name, bound.arguments[name], kinds[name])
+            return function(*bound.args, **bound.kwargs)
+
+        return call
+
+    return decorate
+
+
+def check(name: str, value: Any, kind: Any) -> Any:
+    """Returns a value as a type has it; raises the InputError of `fail` where it is none of the type."""
+    if is_record(kind):
+        return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
+    try:
+        return _adapter(kind).validate_python(value)
+    except pydantic.ValidationError as error:
+        text = str(_one_line(None, error))
+        raise InputError(f"{name}{text if text.startswith(':') else f'.{text}'}") from None
+
+
+@functools.cache
+def _adapter(kind: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(_lenient(kind), config=_CONFIG)
+
+
 def is_record(kind: object) -> bool:
     """Returns whether a type (or an instance's type) was made by `record`."""
     return dataclasses.is_dataclass(kind) and pydantic.dataclasses.is_pydantic_dataclass(
@@ -93,7 +149,7 @@ def is_record(kind: object) -> bool:
 
 def fail(name: str, value: object, allowed: str) -> NoReturn:
     """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must be ...`."""
-    raise InputError(f"{name}: {value!r} is not allowed; it must be {allowed}")
+    raise InputError(f"{name}: {shown(value)} is not allowed; it must be {allowed}")
 
 
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
@@ -132,28 +188,13 @@ def to_mapping(settings: Any) -> dict[str, Any]:
     return pydantic_core.to_jsonable_python(settings, fallback=plain)
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML reader that refuses a name given twice in one mapping, of which PyYAML keeps the last."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        pairs = node.value if isinstance(node, yaml.MappingNode) else []
-        names = [key.value for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
-        if twice := next((name for i, name in enumerate(names) if name in names[:i]), None):
-            raise yaml.YAMLError(f"{twice!r} is given twice")
-        return super().construct_mapping(node, deep)
-
-
 def load_yaml(path: str | Path) -> dict[str, Any]:
     """Reads names and values from a YAML file; an empty file gives an empty mapping.
 
     Raises:
         InputError: naming the file, if it cannot be read or is not a mapping.
     """
-    try:
-        values = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: cannot be read as YAML settings ({reason})") from None
+    values = read_yaml(Path(check("path", path, PathText)))
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -173,6 +214,8 @@ def hints_of(kind: Any) -> dict[str, Any]:
 def _lenient(hint: Any) -> Any:
     """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as numbers."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated and parts[0] in (int, float):
+        return _bounded(hint)
     if origin is Annotated:  # pydantic applies the last validators of an annotation first
         kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
@@ -182,8 +225,18 @@ def _lenient(hint: Any) -> Any:
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
     if hint in (int, float):
-        return Annotated[hint, pydantic.BeforeValidator(functools.partial(_number, hint))]
-    return Annotated[bool, pydantic.BeforeValidator(_boolean)] if hint is bool else hint
+        return _bounded(Annotated[hint, None])
+    before = {bool: _boolean, str: _text, Path: _text}.get(hint)
+    return hint if before is None else Annotated[hint, pydantic.BeforeValidator(before)]
+
+
+def _bounded(hint: Any) -> Any:
+    """Returns an annotated number with the default bound on a side where it has none."""
+    kind, *parts = typing.get_args(hint)
+    low, high = limits.bounds(hint)
+    default = limits.bounds(limits.Integer if kind is int else limits.Number)
+    parts += [Ge(default[0])] * (low == -math.inf) + [Le(default[1])] * (high == math.inf)
+    return Annotated[(kind, *parts, pydantic.BeforeValidator(functools.partial(_number, kind)))]  # type: ignore
 
 
 def _none(value: Any) -> Any:
@@ -199,6 +252,12 @@ def _number(kind: type, value: Any) -> Any:
         return value
 
 
+def _text(value: Any) -> Any:
+    if isinstance(value, str | Path) and not is_text(str(value)):
+        raise ValueError(TEXT)
+    return value
+
+
 def _boolean(value: Any) -> bool:
     if not type(value).__name__.startswith("bool"):  # of Python or numpy
         raise ValueError("true or false")
@@ -210,6 +269,8 @@ def _boolean(value: Any) -> bool:
 
 def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Returns values with dotted names resolved into mappings, and records among them as mappings where merged."""
+    if not isinstance(values, Mapping):
+        fail(kind.__name__, values, "a mapping of names to values")
     nested: dict[str, Any] = {}
     for key, value in values.items():
         name, dot, rest = str(key).partition(".")
@@ -259,11 +320,11 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
             kind = _record_in(hints_of(kind)[part])
         known = list(hints_of(kind))
         hint = f"{nearest(places[-1], known)}; allowed: {', '.join(known)}"
-        return InputError(f"{'.'.join(places)}: unknown name (value {value!r}){hint}")
+        return InputError(f"{'.'.join(places)}: unknown name (value {shown(value)}){hint}")
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")
     allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
     if first["type"].startswith("dataclass"):
         allowed = "it must be a mapping of names to values"
-    choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", ""))]
-    return InputError(f"{'.'.join(places)}: {value!r} is not allowed; {allowed}{nearest(value, choices)}")
+    choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]
+    return InputError(f"{'.'.join(places)}: {shown(value)} is not allowed; {allowed}{nearest(value, choices)}")

@@ -31,9 +31,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import read_tensors, write_atomically
+from mqe_jax.files import check_locks, read_tensors, write_atomically
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.settings import PathText, check
 from mqe_jax.skills import Command, Skill, register
 
 HISTORY = 30
@@ -221,7 +222,7 @@ def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Par
     Raises:
         InputError: if the file is missing, damaged, or holds other names or shapes.
     """
-    file = pathlib.Path(path) if path is not None else ASSETS / robot.walk.weights
+    file = pathlib.Path(check("weights", path, PathText)) if path is not None else ASSETS / robot.walk.weights
     train = f"train it with 'mqe walk train --robot {robot.name}'"
     if not file.is_file() and path is None:
         raise InputError(
@@ -246,6 +247,7 @@ def save_params(
         for kind, array in arrays.items()
     }
     file = pathlib.Path(path)
+    check_locks(file)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, save(flat, {"about": json.dumps(dict(metadata or {}))}))

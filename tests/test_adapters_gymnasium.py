@@ -149,9 +149,9 @@ def test_render_returns_images() -> None:
     [
         ({"autoreset_mode": "later"}, "autoreset_mode: 'later'; allowed: NextStep, SameStep, Disabled"),
         ({"render_mode": "human"}, "render_mode: 'human'; allowed: None, rgb_array"),
-        ({"num_envs": 0}, "num_envs: 0 must be at least 1"),
-        ({"num_envs": 1.5}, r"num_envs: 1\.5 must be an integer"),
-        ({"max_episode_steps": 0}, "max_episode_steps: 0 must be at least 1"),
+        ({"num_envs": 0}, "num_envs: 0 is not allowed; .* greater than 0"),
+        ({"num_envs": 1.5}, r"num_envs: 1\.5 is not allowed; .* a valid integer"),
+        ({"max_episode_steps": 0}, "max_episode_steps: 0 is not allowed; .* greater than 0"),
         ({"gate": 1}, "gate"),
     ],
 )

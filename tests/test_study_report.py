@@ -123,7 +123,7 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no finished run"):
         report(tmp_path)
     (tmp_path / "metrics.csv").write_text("env_steps\nhello\n")
-    with pytest.raises(InputError, match=r"metrics\.csv: is not a metrics"):
+    with pytest.raises(InputError, match=r"metrics\.csv: damaged, or not a metrics"):
         read_curve(tmp_path / "metrics.csv")
     (tmp_path / "values.yaml").write_text("value: 3")
     with pytest.raises(InputError, match=r"values\.yaml: value: unknown name"):

@@ -109,9 +109,9 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
 
     jobs[0].folders[1].mkdir(parents=True)
     with locked(jobs[0].folders[1]):
-        assert sweeps.run(folder, jobs, environments) == jobs[:1]
+        assert sweeps.run(folder, jobs, environments) == (jobs[:1], [])
     assert trained == ["joint"]
-    assert sweeps.run(folder, jobs, environments) == []
+    assert sweeps.run(folder, jobs, environments) == ([], [])
     assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
 
@@ -221,6 +221,7 @@ def test_variants_override_the_settings(tmp_path: Path) -> None:
         ({"seeds": [0, 0]}, "seeds: .*without repetitions"),
         ({"task": ["go1gate"]}, "task: unknown name .*'tasks'"),
         ({"variants": {"a b": {}}}, r"variants\.a b"),
+        ({"variants": {}}, "variants: {}"),
     ],
 )
 def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
@@ -231,7 +232,7 @@ def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
 def test_a_missing_file_is_named_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         sweeps.load_sweep(tmp_path / "none.yaml")
-    assert str(error.value).startswith(f"{tmp_path / 'none.yaml'}: cannot be read as YAML")
+    assert str(error.value).startswith(f"{tmp_path / 'none.yaml'}: cannot be read (")
 
 
 def test_a_folder_that_cannot_be_written_is_named() -> None:
@@ -246,6 +247,47 @@ def test_a_folder_that_cannot_be_written_is_named() -> None:
 def test_a_wrong_setting_is_named_with_its_place(text: str, name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"^{re.escape(name)}"):
         sweeps.plan(load(tmp_path, "tasks: [go1gate]\n" + text), tmp_path, config_of)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("variants: {a: {task: go1tug}}\n", r"^variants\.a\.task: 'go1tug' is not allowed; it must be left out"),
+        ("settings: {seed: 3}\n", r"^settings\.seed: 3 is not allowed; it must be left out"),
+        ("variants: {plain: {}, a: {env: {gate_wdth: 1}}}\n", r"^go1gate/mappo\+a: gate_wdth.*'gate_width'"),
+        ("settings: {train_env: {rewards: {colision: 1}}}\n", r"^go1gate/mappo: rewards\.colision"),
+        ("variants: {a: {env: {gate_width: 9}}}\n", r"^go1gate/mappo\+a: gate_width: 9"),
+        ("variants: {a: {env: {control: fly}}}\n", r"^go1gate/mappo\+a: control"),
+        ("settings: {opponents: [idle]}\n", r"^go1gate/mappo: opponents"),
+        ("tasks: [go1gate, go1tug]\nvariants: {a: {opponents: [nobody]}}\n", r"^go1gate/mappo\+a: opponents"),
+    ],
+)
+def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, tmp_path: Path) -> None:
+    sweep = load(tmp_path, text if text.startswith("tasks") else "tasks: [go1gate]\n" + text)
+    with pytest.raises(InputError, match=message):
+        sweeps.plan(sweep, tmp_path, config_of, check=setup.check_start)
+
+
+def test_a_cell_that_fails_is_named_and_the_others_are_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    load(tmp_path)
+    trained: list[str] = []
+
+    def train(env: Probe, configs: list[TrainConfig], *_: object) -> None:
+        if configs[0].ppo.ratio == "dimension":
+            raise InputError("opponents: this one cannot be read")
+        trained.append(configs[0].ppo.ratio)
+
+    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: (PROBE, PROBE))
+    monkeypatch.setattr(sweeps, "train_seeds", train)
+    monkeypatch.setattr("mqe_jax.study.report.report", lambda folder: [])
+    assert cli.main(["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]) == 2
+    assert trained == ["joint"]
+    assert capfd.readouterr().err.splitlines() == [
+        "mqe: go1gate/mappo failed: opponents: this one cannot be read",
+        "mqe: cells: 1 of 2 trainings failed: go1gate/mappo",
+    ]
 
 
 def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:

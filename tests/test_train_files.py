@@ -91,6 +91,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wandb = pytest.importorskip("wandb", reason="needs the extra log")
     monkeypatch.delenv("WANDB_MODE", raising=False)
     first = tmp_path / "run"
+    first.mkdir()
     write(logs.LOGGERS["wandb"](first, 0))
     run_id = (first / "wandb" / "run_id").read_text()
     (file,) = first.glob("wandb/offline-run-*/*.wandb")
@@ -154,11 +155,17 @@ def test_a_checkpoint_keeps_every_leaf(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["tree.safetensors"]
 
 
-def test_old_checkpoints_and_left_overs_go(tmp_path: Path) -> None:
-    for step in (1, 20, 300):
+def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
+    contents = set()
+    for _ in range(4):
+        save_tree(tmp_path / "x", TREE, {"b": 1, "a": [2]}, kind="policy")
+        contents.add((tmp_path / "x").read_bytes())
+    assert len(contents) == 1
+
+
+def test_old_checkpoints_go(tmp_path: Path) -> None:
+    for step in (1, 20, 300, 4000):
         newest = save_checkpoint(tmp_path, TREE, step, {}, keep=2)
-        (newest.parent / ".step_000000000001.safetensors.x.tmp").write_text("half")
-    save_checkpoint(tmp_path, TREE, 4000, {}, keep=2)
     assert [p.name for p in sorted(newest.parent.iterdir())] == [
         "step_000000000300.safetensors",
         "step_000000004000.safetensors",
@@ -177,10 +184,30 @@ def test_a_damaged_checkpoint_names_the_one_before(tmp_path: Path) -> None:
         load_tree(path, TREE, kind="checkpoint")
 
 
+def test_no_flipped_bit_of_the_header_passes(tmp_path: Path) -> None:
+    """Each is an InputError, or changes neither arrays nor metadata (such as the blanks after the header)."""
+    path, about = tmp_path / "x", {"note": "ü", "step": 20}
+    save_tree(path, TREE, about, kind="checkpoint")
+    whole, passed = path.read_bytes(), 0
+    for place in range(8 + int.from_bytes(whole[:8], "little")):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << (place % 7)
+        path.write_bytes(flipped)
+        try:
+            restored = load_tree(path, TREE, kind="checkpoint")
+        except InputError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+        else:
+            assert_same(restored.tree, TREE)
+            assert restored.metadata == about
+            passed += 1
+    assert passed < 16
+
+
 def damage_nothing_but_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoints, "VERSION", 99)
     save_tree(path, TREE, {}, kind="checkpoint")
-    monkeypatch.setattr(checkpoints, "VERSION", 2)
+    monkeypatch.setattr(checkpoints, "VERSION", 3)
 
 
 def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,7 +234,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     save_file({"a": np.zeros(3)}, path)
     assert "not a file of this package" in error_of()
     damage_nothing_but_version(path, monkeypatch)
-    assert "version 99; version 2 is needed" in error_of()
+    assert "version 99; version 3 is needed" in error_of()
     path.write_bytes(whole)
     assert "a has shape (2, 3); (2, 4) is needed" in error_of({**TREE, "a": jnp.zeros((2, 4))})
     assert "a has dtype float32; int32" in error_of({**TREE, "a": jnp.zeros((2, 3), jnp.int32)})

@@ -102,6 +102,8 @@ def test_a_killed_training_resumes_as_if_never_stopped(
     capsys.readouterr()
     state = train(PROBE, settings(), run_dir, resume=True)
     assert_same(state, expected)
+    policies = {(folder / "policy.safetensors").read_bytes() for folder in (run_dir, straight_dir)}
+    assert len(policies) == 1
     told = capsys.readouterr()
     assert told.out == "" and "80 of 80 steps, reward" in told.err
     timed = {"seconds", "fps"}

@@ -180,7 +180,7 @@ def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:
 def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     text = tmp_path / "text.jit"
     text.write_text("hello")
-    with pytest.raises(ValueError, match=r"text\.jit: not a TorchScript Sequential"):
+    with pytest.raises(ValueError, match=r"text\.jit: damaged, or not a TorchScript Sequential"):
         convert.read_torchscript(text)
     write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
     with pytest.raises(ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"):

@@ -16,6 +16,8 @@ import numpy as np
 from mqe_jax import envs
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
+from mqe_jax.limits import PositiveInt
+from mqe_jax.settings import check
 
 
 def missing(library: str, error: ImportError) -> InputError:
@@ -46,12 +48,11 @@ def task_env(
         return task
     if max_steps is None:
         return envs.make(task, **overrides)
-    if max_steps < 1:
-        raise InputError(f"{limit}: {max_steps} must be at least 1")
+    steps: int = check(limit, max_steps, PositiveInt)
     if "episode_length" in overrides:
         raise InputError(f"episode_length: give either this or {limit}, not both")
     dt = envs.make(task, **overrides).dt
-    return envs.make(task, **overrides, episode_length=max_steps * dt)
+    return envs.make(task, **overrides, episode_length=steps * dt)
 
 
 def agent_names(env: QuadrupedEnv) -> list[str]:

@@ -14,8 +14,9 @@ from gymnasium.vector import AutoresetMode
 
 from mqe_jax.adapters import select
 from mqe_jax.envs import QuadrupedEnv, State
-from mqe_jax.envs.base import check_num_envs
 from mqe_jax.errors import InputError
+from mqe_jax.limits import Environments, Pixels
+from mqe_jax.settings import check
 from mqe_jax.viz.cameras import Camera, default_camera
 from mqe_jax.viz.geometry import rendering_model
 from mqe_jax.viz.recording import Episode
@@ -68,13 +69,14 @@ class HostEnvs:
         render_mode: str | None = None,
         render_size: tuple[int, int] = RENDER_SIZE,
     ) -> None:
-        check_num_envs(num_envs)
+        num_envs = check("num_envs", num_envs, Environments)
+        width, height = check("render_size", render_size, tuple[Pixels, Pixels])
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise InputError(f"render_mode: {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
         self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.state: State | None = None
-        self._mode, self._size = render_mode, render_size
+        self._mode, self._size = render_mode, (width, height)
         self._camera: Camera | None = None
         key = (type(self.env), self.env.params, self.env.impl, self.env.control, self.env.physics.num_envs)
         try:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import tyro
 
+from mqe_jax import limits
 from mqe_jax.cli import commands, export, render, study, view, walk
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.settings import TEXT, fail, is_text
 
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 
@@ -51,6 +54,16 @@ def overview(group: str = "") -> str:
     return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 
 
+def _check_words(arguments: Sequence[str]) -> None:
+    """Raises an InputError for an empty value, which would stand for this folder, and for what is no text."""
+    for flag, word in itertools.pairwise(("mqe", *arguments)):
+        name, equals, value = word.partition("=")
+        if not word or (word.startswith("--") and equals and not value):
+            fail((name or flag).lstrip("-"), "", "not empty")
+        if not is_text(word):
+            fail(flag.lstrip("-")[: limits.SHOWN], word, TEXT)
+
+
 def parse(arguments: Sequence[str]) -> Any:
     """Returns the record of the command that the first word or two name; its `run` returns the object of `--json`.
 
@@ -58,6 +71,7 @@ def parse(arguments: Sequence[str]) -> Any:
         InputError: for an unknown command.
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
+    _check_words(arguments)
     words = 2 if " ".join(arguments[:2]) in COMMANDS else 1
     name, rest = " ".join(arguments[:words]), list(arguments[words:])
     if {"-h", "--help"}.intersection(arguments[:2]) and name not in COMMANDS:

@@ -14,8 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import InputError, one_line
-from mqe_jax.files import append, check_folder
+from mqe_jax.errors import InputError
+from mqe_jax.files import append, check_folder, read_rows
 
 COLUMNS: tuple[str, ...] = (
     "task",
@@ -111,10 +111,10 @@ def check_csv(path: Path) -> None:
     """Creates the folder of a table of measurements, and raises an InputError where the table has other columns."""
     check_folder(path.parent, "csv")
     try:
-        head = path.read_text(encoding="utf-8").partition("\n")[0] if path.exists() else ""
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"csv: {path} cannot be read ({one_line(error)})") from None
-    if head not in ("", ",".join(COLUMNS)):
+        head = next(read_rows(path), []) if path.exists() else []
+    except InputError as error:
+        raise InputError(f"csv: {error}") from None
+    if head not in ([], list(COLUMNS)):
         raise InputError(f"csv: {path} has other columns; it must have {', '.join(COLUMNS)}")
 
 

@@ -12,7 +12,8 @@ import tyro
 
 from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions
 from mqe_jax.cli.output import echo, print_table
-from mqe_jax.settings import PositiveInt, record
+from mqe_jax.limits import Environments, Episodes, Horizon
+from mqe_jax.settings import record
 
 
 @record
@@ -74,9 +75,9 @@ class Eval(PolicyOptions):
     """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from fresh resets."""
 
     json: Json = False
-    episodes: PositiveInt = 512
+    episodes: Episodes = 512
     """Number of evaluation episodes, split evenly over environments."""
-    num_envs: PositiveInt = 128
+    num_envs: Environments = 128
     """Number of parallel environments."""
     dump_diverged: DumpDiverged = None
 
@@ -163,11 +164,11 @@ class Bench(TaskOptions):
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""
     json: Json = False
-    num_envs: PositiveInt = 256
+    num_envs: Environments = 256
     """Number of parallel environments."""
-    steps: PositiveInt = 50
+    steps: Horizon = 50
     """Environment steps per timed call."""
-    repeats: PositiveInt = 5
+    repeats: Horizon = 5
     """Number of timed calls; the median is reported."""
     seed: Seed = 0
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -199,7 +200,7 @@ class Demo:
     """Run folder; an interrupted demo resumes from it."""
     config: str = "demo"
     """Settings, as in `mqe train --config`."""
-    episodes: PositiveInt = 256
+    episodes: Episodes = 256
     """Number of episodes per evaluation."""
     impl: Impl = "auto"
 

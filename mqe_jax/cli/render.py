@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from annotated_types import Gt, Le
 
 from mqe_jax.cli.options import Json, PolicyOptions
 from mqe_jax.cli.output import echo
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.limits import Candidates, ClipLength, FrameRate, Pixels, Speed, Time
+from mqe_jax.settings import record
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
@@ -23,21 +23,21 @@ class Render(PolicyOptions):
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write: .mp4, .webp, .gif or .png."""
     json: Json = False
-    best_of: PositiveInt = 1
+    best_of: Candidates = 1
     """Number of episodes, of which the best is rendered (by success, then reward)."""
-    seconds: Positive = 20.0
+    seconds: ClipLength = 20.0
     """Maximum length of the clip, s."""
-    width: Annotated[Annotated[int, Gt(0), Le(4096)] | None, tyro.conf.arg(metavar="INT")] = None
+    width: Annotated[Pixels | None, tyro.conf.arg(metavar="INT")] = None
     """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .webp
     and .gif, 1280 for .png."""
-    fps: Annotated[Annotated[float, Gt(0), Le(4096)] | None, tyro.conf.arg(metavar="FLOAT")] = None
+    fps: Annotated[FrameRate | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Frames per second. Default: 25 for .mp4, 12.5 for .webp and .gif."""
     view: Literal["follow", "near", "scene", "side"] | None = None
     """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
     side (tracks the first robot). Default: follow for a clip, scene for an image."""
-    speed: Positive = 1.0
+    speed: Speed = 1.0
     """Playback speed of a clip; 0.5 is slow motion."""
-    at: Annotated[NonNegative | None, tyro.conf.arg(metavar="SECONDS")] = None
+    at: Annotated[Time | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time of an image in the episode, s. Default: its middle."""
 
     def run(self) -> dict[str, Any]:

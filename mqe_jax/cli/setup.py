@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import yaml
 
 from mqe_jax.cli.output import echo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.match import Match
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.league.league import MOVING, League
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_policy
@@ -22,6 +21,7 @@ from mqe_jax.settings import fail, load_yaml, override
 from mqe_jax.train import runner
 from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.yaml_text import parse_yaml
 
 CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
 
@@ -32,11 +32,8 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals or not name.strip():
-            raise InputError(f"set: {pair!r} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
-        try:
-            values[name.strip().replace("-", "_")] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise InputError(f"set: the value of {pair!r} cannot be read as YAML") from None
+            raise InputError(f"set: {shown(pair)} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
+        values[name.strip().replace("-", "_")] = parse_yaml(text, f"set: the value of {shown(pair)}")
     return values
 
 
@@ -107,6 +104,22 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
         eval_env = versus(eval_env, fixed or anchors(eval_env.env)[:1])
     return learning, eval_env
+
+
+def check_start(config: TrainConfig) -> None:
+    """Raises an InputError where a training could not start: for parameters, rewards or policies of its task.
+
+    It makes the task with the parameters of training and of evaluation, for one environment on the C engine.
+    """
+    env, _ = make_env(config.task or "", "c", config.training_env, 1)
+    if config.train_env:
+        make_env(config.task or "", "c", config.env, 1)
+    if len(env.teams) < 2 and config.opponents:
+        fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+    for name in {*config.opponents, config.curriculum.demonstrator} - {*MOVING, None}:
+        load_policy(str(name), env)
+    if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
+        fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 
 
 def anchors(env: Any) -> list[str]:

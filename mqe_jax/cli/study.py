@@ -15,8 +15,9 @@ import tyro
 from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
 from mqe_jax.cli.output import echo
-from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import Positive, PositiveInt, fail, record
+from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
+from mqe_jax.limits import Candidates, Positive, PositiveInt
+from mqe_jax.settings import fail, record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
@@ -46,7 +47,7 @@ class Sweep:
 
     def run(self) -> dict[str, Any]:
         """Trains the remaining runs and writes the report, or prints their estimated time."""
-        from mqe_jax.cli.setup import base_config, environments, for_task
+        from mqe_jax.cli.setup import base_config, check_start, environments, for_task
         from mqe_jax.envs import ALIASES, TASKS
         from mqe_jax.study import report as reports
         from mqe_jax.study import sweep as sweeps
@@ -66,7 +67,7 @@ class Sweep:
         def stop() -> bool:
             return self.time_limit is not None and time.monotonic() - began > 60.0 * self.time_limit
 
-        jobs = sweeps.plan(settings, folder, config_of, self.cells, self.seeds)
+        jobs = sweeps.plan(settings, folder, config_of, self.cells, self.seeds, check_start)
         result = _estimate(sweeps.estimate(folder, jobs), jobs)
         if self.dry_run:
             if not self.json:
@@ -77,7 +78,8 @@ class Sweep:
         cells += "".join(f" --seeds {seed}" for seed in self.seeds)
         part = "" if self.part is None else f" --part {shlex.quote(self.part)}"
         with interrupts.before_exit(lambda: f"resume with: mqe sweep {self.file}{part} --folder {folder}{cells}"):
-            others = sweeps.run(folder, jobs, functools.partial(environments, self.impl), stop=stop)
+            make = functools.partial(environments, self.impl)
+            others, failed = sweeps.run(folder, jobs, make, on_failure=_tell_failure, stop=stop)
         if others:
             skipped = ", ".join(job.cell.path.as_posix() for job in others)
             echo(f"mqe: skipped, in use by other processes: {skipped}")
@@ -87,6 +89,10 @@ class Sweep:
         files = reports.report(folder) if not jobs or len(left) < len(jobs) else []
         if files:
             echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
+        if failed:
+            kind = NonFiniteError if isinstance(failed[0][1], NonFiniteError) else InputError
+            names = ", ".join(job.cell.path.as_posix() for job, _ in failed)
+            raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {names}")
         return {"left": _estimate(sweeps.estimate(folder, left), left), "report": [str(file) for file in files]}
 
 
@@ -144,7 +150,7 @@ class Tournament(TaskOptions):
     """Policies; scripted, idle and random play too. Ratings are relative to scripted, or idle without it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("runs/tournament")
     """Folder of tournament.csv and tournament.png."""
-    episodes: PositiveInt = 64
+    episodes: Candidates = 64
     """Episodes of each pair on each side."""
     deterministic: bool = False
     """Use mean actions of trained policies; otherwise they are sampled, as in training."""
@@ -178,6 +184,10 @@ class Tournament(TaskOptions):
                 print(f"{names[i]:<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
         rows = [{"policy": names[i], **{k: float(x[i]) for k, x in ratings._asdict().items()}} for i in order]
         return {"task": self.task, "ratings": rows, "policies": names, "results": results.tolist()}
+
+
+def _tell_failure(job: sweeps.Job, error: Exception) -> None:
+    echo(f"mqe: {job.cell.path.as_posix()} failed: {one_line(error)}")
 
 
 def _estimate(seconds: list[float], jobs: list[sweeps.Job]) -> dict[str, Any]:

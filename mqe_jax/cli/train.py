@@ -15,7 +15,8 @@ from mqe_jax.cli.output import echo
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import tasks
-from mqe_jax.settings import PositiveInt, override, record
+from mqe_jax.limits import Seeds
+from mqe_jax.settings import override, record
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
@@ -64,7 +65,7 @@ class Train(TaskOptions):
     """Run folder. Default: runs/TASK."""
     resume: bool = False
     """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
-    num_seeds: PositiveInt = 1
+    num_seeds: Seeds = 1
     """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
     --run-dir."""
     dump_diverged: DumpDiverged = None

@@ -7,11 +7,12 @@ import importlib.util
 import socket
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le
 
 from mqe_jax.cli.options import PolicyOptions
 from mqe_jax.cli.output import echo
 from mqe_jax.errors import InputError
+from mqe_jax.limits import Port
 from mqe_jax.settings import fail, record
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
@@ -25,7 +26,7 @@ class View(PolicyOptions):
     """Number of environments, side by side: 1 to 16."""
     host: str = "127.0.0.1"
     """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
-    port: Annotated[int, Gt(0), Lt(65536)] = 8080
+    port: Port = 8080
     """Port to listen on, or the next free one if it is in use."""
 
     def run(self) -> None:
@@ -54,6 +55,6 @@ def _check_address(host: str, port: int) -> None:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as server:
             server.bind(address)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            fail("host", host, f"an address of this machine ({error.strerror or error})")
+    except (OSError, UnicodeError) as error:
+        if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
+            fail("host", host, f"an address of this machine ({getattr(error, 'strerror', None) or error})")

@@ -12,7 +12,8 @@ import tyro
 from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed
 from mqe_jax.cli.output import echo, print_table
 from mqe_jax.errors import InputError
-from mqe_jax.settings import PositiveInt, record
+from mqe_jax.limits import Environments
+from mqe_jax.settings import record
 
 
 @record
@@ -22,7 +23,7 @@ class WalkEval:
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Weights to evaluate. Default: the shipped ones."""
     json: Json = False
-    episodes: PositiveInt = 1000
+    episodes: Environments = 1000
     """Number of episodes per scenario, run in parallel."""
     scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
     """Scenario, such as flat, pushes or slope_up; may be repeated. Default: all."""

@@ -11,7 +11,8 @@ from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task
 from mqe_jax.envs.state import EnvironmentState, Moment, State
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import override
+from mqe_jax.limits import Environments
+from mqe_jax.settings import checked, override
 
 
 def tasks() -> tuple[str, ...]:
@@ -19,6 +20,7 @@ def tasks() -> tuple[str, ...]:
     return tuple(TASKS)
 
 
+@checked(task=str, impl=str, control=str, num_envs=Environments)
 def make(
     task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
 ) -> QuadrupedEnv:

@@ -8,12 +8,19 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs.base import QuadrupedEnv, check_num_envs
+from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
+from mqe_jax.limits import Environments, PositiveInt
+from mqe_jax.memory import bytes_of, check_memory
+from mqe_jax.settings import check, checked, fail
+from mqe_jax.train.types import RandomKey
 
 KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
 """Fields that an auto-reset keeps; all but the first describe the last step."""
+
+_SMALL = 4096
+"""Number of environments whose memory is not checked, which saves a trace."""
 
 Start = Callable[[jax.Array, jax.Array], State]
 """Returns an initial state from a random key and the assistance, as `QuadrupedEnv.reset`."""
@@ -54,9 +61,14 @@ class VectorEnv:
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
         """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
-        check_num_envs(num_envs)
-        self.env = env.with_num_envs(num_envs * copies)
+        if not isinstance(env, QuadrupedEnv):
+            fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
+        num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
+        self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
         self.num_envs = num_envs
+        if num_envs * copies > _SMALL:
+            state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
+            check_memory("num_envs", num_envs * copies, copies * bytes_of(state))
         self.name = env.name
         self.max_episode_steps = env.max_steps
         self.num_agents = env.num_agents
@@ -65,6 +77,7 @@ class VectorEnv:
         self.privileged_observation_size = env.privileged_observation_size
         self.action_size = env.action_size
 
+    @checked(key=RandomKey)
     def reset(self, key: jax.Array) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
         return jax.vmap(self.env.reset)(jax.random.split(key, self.num_envs))

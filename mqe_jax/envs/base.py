@@ -29,20 +29,15 @@ from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
+from mqe_jax.limits import Environments
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
+from mqe_jax.settings import check, checked, fail
+from mqe_jax.train.types import RandomKey
 
 if TYPE_CHECKING:
     from mujoco import mjx
-
-
-def check_num_envs(num_envs: int) -> None:
-    """Raises an InputError unless the number of environments is an integer of at least 1."""
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer):
-        raise InputError(f"num_envs: {num_envs!r} must be an integer")
-    if num_envs < 1:
-        raise InputError(f"num_envs: {num_envs} must be at least 1")
 
 
 class QuadrupedEnv(Task[S, P]):
@@ -57,7 +52,7 @@ class QuadrupedEnv(Task[S, P]):
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
         self.control = check_mode(control)
-        check_num_envs(num_envs)
+        num_envs = check("num_envs", num_envs, Environments)
         self.num_agents = self.params.num_agents
         self.robot = robots.get(self.params.robot)
         scene = self.scene()
@@ -87,6 +82,8 @@ class QuadrupedEnv(Task[S, P]):
         )
         self.impl = self.physics.impl
         self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
+        if self.max_steps < 1:
+            fail("episode_length", self.params.episode_length, f"at least one environment step, {self.dt} s")
         self.actuators = Actuators(self.physics, self.index)
         if network:
             weights = load_actuator_network(network)
@@ -170,6 +167,7 @@ class QuadrupedEnv(Task[S, P]):
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
+    @checked(key=RandomKey)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns a randomised initial state; runs no forward pass of the physics.
 

@@ -11,10 +11,11 @@ import numpy as np
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Coordinate, Length, TimeLimit
 from mqe_jax.objects import Platform
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import Positive, Range, fail, record
+from mqe_jax.settings import Coordinates, fail, record
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -32,25 +33,25 @@ class BridgeRewards:
 class BridgeParams(TaskParams):
     """Parameters of Traverse Bridge."""
 
-    episode_length: Positive = 20.0
-    spawn_height: Positive = 1.4
-    platform: tuple[Positive, Positive] = (1.3, 2.5)
+    episode_length: TimeLimit = 20.0
+    spawn_height: Length = 1.4
+    platform: tuple[Length, Length] = (1.3, 2.5)
     """Extents of both platforms along x and y, m; their long sides are perpendicular to the bridge, as in the paper's
     figure.
     """
-    platform_x: Range = (2.35, 7.65)
+    platform_x: Coordinates = (2.35, 7.65)
     """X of the platforms' centres, m."""
-    top: Positive = 1.02
+    top: Length = 1.02
     """Height of platforms and bridge, m."""
-    bridge_width: Positive = 0.7
+    bridge_width: Length = 0.7
     """Width of the bridge, m."""
-    bridge_thickness: Positive = 0.3
+    bridge_thickness: Length = 0.3
     """Thickness of the bridge, m."""
-    spawn_x: Range = (2.5, 7.5)
+    spawn_x: Coordinates = (2.5, 7.5)
     """X of the robots' spawn poses, m. The released system spawns the first robot at 2.0, with its hind feet on the
     platform's edge; here the two poses are symmetric.
     """
-    off_height: float = 0.5
+    off_height: Coordinate = 0.5
     """Height of a trunk below which a robot counts as off the bridge, m."""
     rewards: BridgeRewards = BridgeRewards()
     """Weights of the reward terms."""

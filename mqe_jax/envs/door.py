@@ -10,10 +10,11 @@ import jax.numpy as jnp
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Coordinate, Distance, Length, TimeLimit
 from mqe_jax.objects import Door
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, fail, record
+from mqe_jax.settings import fail, record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 _WALL_LENGTH = 1.0  # m along x, of the block with the door at its centre
@@ -33,18 +34,18 @@ class DoorRewards:
 class DoorParams(TaskParams):
     """Parameters of Revolving Door."""
 
-    episode_length: Positive = 5.0
-    track_width: Positive = 3.5
+    episode_length: TimeLimit = 5.0
+    track_width: Length = 3.5
     """Width of the track, m."""
-    gap: Positive = 2.0
+    gap: Length = 2.0
     """Width of the gap that holds the door, m."""
     door: Door = Door()
     """The door in the gap."""
-    spawn_x: float = 0.5
+    spawn_x: Coordinate = 0.5
     """X of the robots' spawn poses, m."""
-    spawn_y: NonNegative = 1.0
+    spawn_y: Distance = 1.0
     """Distance of the robots from the centre line, m."""
-    line_x: float = 3.85
+    line_x: Coordinate = 3.85
     """X of the finish line, m."""
     rewards: DoorRewards = DoorRewards()
     """Weights of the reward terms."""

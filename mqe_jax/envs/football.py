@@ -18,10 +18,11 @@ from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, S, State
+from mqe_jax.limits import Distance, Few, Fraction, Length, TimeLimit
 from mqe_jax.objects import Ball
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import Fraction, NonNegative, Positive, PositiveInt, record
+from mqe_jax.settings import record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -40,16 +41,16 @@ BALL_BLOCKS = (Block("ball", 3, "centre, m"), Block("ball_velocity", 3, "m/s"))
 class FootballParams(TaskParams):
     """Parameters of all football tasks."""
 
-    episode_length: Positive = 20.0
-    field_width: Positive = 9.0
+    episode_length: TimeLimit = 20.0
+    field_width: Length = 9.0
     """Width of the field, m."""
-    goal_width: Positive = 2.0
+    goal_width: Length = 2.0
     """Width of the goal mouths, m."""
-    wall_height: Positive = 1.0
+    wall_height: Length = 1.0
     """Height of all walls, m."""
     ball: Ball = Ball()
     """The ball."""
-    ball_noise: NonNegative = 0.0
+    ball_noise: Distance = 0.0
     """Half-width of the uniform noise on the ball's position at reset, m."""
     head_start: Fraction = 0.0
     """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match that of a team
@@ -182,7 +183,7 @@ class Football1vs1Params(FootballParams):
 class Football2vs2Params(FootballParams):
     """Parameters of Football (2 vs 2)."""
 
-    num_agents: PositiveInt = 4
+    num_agents: Few = 4
     rewards: FootballMatchRewards = FootballMatchRewards()
     """Weights of the reward terms."""
 

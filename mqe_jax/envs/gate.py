@@ -11,9 +11,10 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Coordinate, Distance, Length, TimeLimit
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, record
+from mqe_jax.settings import record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 
@@ -35,24 +36,24 @@ class GateRewards:
 class GateParams(TaskParams):
     """Parameters of Narrow Gate."""
 
-    episode_length: Positive = 10.0
-    spawn_noise: NonNegative = 0.0
-    min_height: float = 0.08
-    max_height: float = 1.5
+    episode_length: TimeLimit = 10.0
+    spawn_noise: Distance = 0.0
+    min_height: Coordinate = 0.08
+    max_height: Coordinate = 1.5
     end_on_collision: bool = True
-    track_width: Positive = 3.0
+    track_width: Length = 3.0
     """Width of the track, m."""
-    gate_width: Positive = 0.6
+    gate_width: Length = 0.6
     """Width of the gap, m."""
-    gate_depth: Positive = 0.1
+    gate_depth: Length = 0.1
     """Thickness of the wall along x, m."""
-    gate_random: tuple[NonNegative, NonNegative] = (0.5, 0.5)
+    gate_random: tuple[Distance, Distance] = (0.5, 0.5)
     """Half-widths of the range of the gap's centre in x and y, m."""
-    past_gate: float = 0.25
+    past_gate: Coordinate = 0.25
     """Distance behind the gate's centre at which a robot counts as through, m."""
-    target_x: float = 5.5
+    target_x: Coordinate = 5.5
     """X of the robots' targets, m."""
-    target_y: float = 0.75
+    target_y: Coordinate = 0.75
     """|y| of the targets, m; the robots' paths cross: the first robot's target is on the left."""
     rewards: GateRewards = GateRewards()
     """Weights of the reward terms."""

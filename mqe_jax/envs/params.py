@@ -7,22 +7,36 @@ from typing import Literal, TypeVar
 from mqe_jax import robots, skills, walk_policy  # noqa: F401  (a skill registers itself)
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
-from mqe_jax.settings import Fraction, NonNegative, Positive, PositiveInt, Range, fail, record
+from mqe_jax.limits import (
+    Buffer,
+    Coordinate,
+    Distance,
+    Few,
+    Fraction,
+    Iterations,
+    Length,
+    NonNegative,
+    Positive,
+    PositiveFriction,
+    Time,
+    TimeLimit,
+)
+from mqe_jax.settings import FileName, Range, fail, record
 
 
 @record
 class TaskParams:
     """Parameters common to all tasks; a task adds its own."""
 
-    num_agents: PositiveInt = 2
+    num_agents: Few = 2
     """Number of controlled robots."""
     robot: str = "go1"
     """Name of the robot, such as go1 or go2 (`mqe_jax.robots`)."""
-    episode_length: Positive = 10.0
+    episode_length: TimeLimit = 10.0
     """Time limit, s."""
-    spawn_height: Positive = 0.42
+    spawn_height: Length = 0.42
     """Spawn height of the trunks, m."""
-    spawn_noise: NonNegative = 0.1
+    spawn_noise: Distance = 0.1
     """Half-width of the uniform noise on the spawn position in x and y, m."""
     spawn_joint_scale: Range = (0.7, 1.3)
     """Range of the factor on the default joint angles at reset."""
@@ -34,9 +48,9 @@ class TaskParams:
     """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so a limit above pi / 2, as in the
     released system, is never reached: a robot that pitches over has a roll of pi.
     """
-    min_height: float = -1.0
+    min_height: Coordinate = -1.0
     """Minimum trunk height, m; below it the episode terminates."""
-    max_height: float = 100.0
+    max_height: Coordinate = 100.0
     """Maximum trunk height, m; above it the episode terminates."""
     end_on_collision: bool = False
     """Whether a contact force on an agent's trunk above `collision_force` ends the episode."""
@@ -44,7 +58,7 @@ class TaskParams:
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
     skill: str = "walk"
     """Skill of the agents with control `command`, and of NPC robots (`mqe_jax.skills`)."""
-    skill_weights: str | None = None
+    skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
     """Named default commands of the skill; of the walk policy trot, pronk, bound or pace, trot if None."""
@@ -54,23 +68,23 @@ class TaskParams:
     """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
     joint angles, hips within 0.125 rad.
     """
-    actuator_network: str | None = None
+    actuator_network: FileName | None = None
     """Weights file of an actuator network that replaces PD control; PD control if None."""
-    friction: Positive = 1.0
+    friction: PositiveFriction = 1.0
     """Sliding friction of robots and ground."""
     joint_mechanics: bool = False
     """Whether the joints have the robot's rotor inertia, damping and dry friction."""
-    solver_iterations: PositiveInt = 4
+    solver_iterations: Iterations = 4
     """Maximum solver iterations per physics step."""
     contacts: Literal["full", "minimal"] = "full"
     """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
     and disables limb collisions.
     """
-    contacts_per_robot: PositiveInt = 12
+    contacts_per_robot: Buffer = 12
     """Contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest contacts, and on average over
     all environments on Warp.
     """
-    constraints_per_robot: PositiveInt = 64
+    constraints_per_robot: Buffer = 64
     """Constraint buffer size per robot on Warp, per environment."""
     privileged_contact_forces: bool = False
     """Whether the privileged observation includes the contact forces on trunks and feet; their sensors cost about 8% of
@@ -78,7 +92,7 @@ class TaskParams:
     """
     randomization: Randomization = Randomization()
     """Domain randomisation."""
-    frozen_time: NonNegative = 4.0
+    frozen_time: Time = 4.0
     """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
     first learn sequential subtasks one at a time. Inactive at assistance 0.
     """

@@ -9,9 +9,10 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Length
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import Positive, record
+from mqe_jax.settings import record
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -27,7 +28,7 @@ class PlaneRewards:
 class PlaneParams(TaskParams):
     """Parameters of Plane."""
 
-    width: Positive = 3.0
+    width: Length = 3.0
     """Width of the strip across which the robots are spawned side by side, m."""
     rewards: PlaneRewards = PlaneRewards()
     """Weights of the reward terms."""

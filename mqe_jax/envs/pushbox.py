@@ -16,10 +16,11 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Buffer, Coordinate, Distance, Iterations, Length, NonNegative, TimeLimit
 from mqe_jax.objects import Box
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, fail, record
+from mqe_jax.settings import fail, record
 from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -48,27 +49,27 @@ class PushBoxRewards:
 class PushBoxParams(TaskParams):
     """Parameters of Push Box."""
 
-    episode_length: Positive = 15.0
-    track_width: Positive = 5.0
+    episode_length: TimeLimit = 15.0
+    track_width: Length = 5.0
     """Width of the track, m."""
-    gate_width: Positive = 1.5
+    gate_width: Length = 1.5
     """Width of the gap, m."""
-    gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
+    gate_random: tuple[Distance, Distance] = (0.0, 0.5)
     """Half-widths of the range of the gap's centre in x and y, m."""
-    past_gate: float = 0.0
+    past_gate: Coordinate = 0.0
     """Distance of the box's centre behind the gate's at which it counts as through, m."""
     box: Box = Box()
     """The box."""
-    box_x: float = 2.5
+    box_x: Coordinate = 2.5
     """X of the box's centre at reset, m."""
-    box_noise: NonNegative = 0.5
+    box_noise: Distance = 0.5
     """Half-width of the uniform noise on the box's position, m."""
     head_start: NonNegative = 0.0
     """Curriculum: box and robots start up to head_start x `State.assistance` further along x, m, so that agents first
     learn the end of the push. Inactive at assistance 0.
     """
-    solver_iterations: PositiveInt = 8  # with 4 the pushed box does not converge on Warp
-    contacts_per_robot: PositiveInt = 16
+    solver_iterations: Iterations = 8  # with 4 the pushed box does not converge on Warp
+    contacts_per_robot: Buffer = 16
     rewards: PushBoxRewards = PushBoxRewards()
     """Weights of the reward terms."""
 

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from mqe_jax.limits import Lag, NonNegative, TimeLimit
 from mqe_jax.robots.index import RobotIndex
-from mqe_jax.settings import NonNegative, NonNegativeInt, Positive, Range, fail, record
+from mqe_jax.settings import Range, fail, record
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -30,11 +31,11 @@ class Randomization:
     """Factor on all torques."""
     joint_mechanics: Range | None = None
     """Factor on rotor inertia, damping and dry friction of the joints; needs the task parameter `joint_mechanics`."""
-    action_lag: NonNegativeInt = 0
+    action_lag: Lag = 0
     """Maximum delay of the actuator targets, environment steps; one sample per environment."""
     push: NonNegative = 0.0
     """Maximum sudden change of a trunk's horizontal velocity, m/s."""
-    push_period: Positive = 5.0
+    push_period: TimeLimit = 5.0
     """Mean time between pushes, s."""
     observation_noise: NonNegative = 0.0
     """Standard deviation of the noise on observations, except on one-hot blocks."""

@@ -6,19 +6,19 @@ import dataclasses
 import io
 import json
 import pathlib
-import zipfile
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax import limits
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.files import archive, parse_json, write_atomically
 from mqe_jax.settings import to_mapping
 
 # Fields on which a step depends; the others are recomputed by it.
@@ -83,13 +83,18 @@ def load_recording(file: str | pathlib.Path) -> Recording:
     Raises:
         InputError: if the file is missing, damaged or not a recording.
     """
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            about = json.loads(str(arrays["about"]))
-            states = {name.removeprefix("states/"): arrays[name] for name in arrays if name.startswith("states/")}
-            return Recording(**about, states=states, actions=arrays["actions"])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: cannot be read as a recording ({error})") from None
+    path = pathlib.Path(file)
+    with archive(path, limits.RECORDING_BYTES, "a recording"), np.load(path, allow_pickle=False) as arrays:
+        about = parse_json(str(arrays["about"]), "about")
+        states = {name.removeprefix("states/"): arrays[name] for name in arrays if name.startswith("states/")}
+        made = Recording(**about, states=states, actions=arrays["actions"])
+        if [type(about[name]) for name in ("task", "params", "impl", "control")] != [str, dict, str, str]:
+            raise ValueError("its task, parameters, engine or control are of another type")
+        if any(values.dtype.kind not in "fiub" for values in (made.actions, *states.values())):
+            raise ValueError("its arrays are not numbers")
+        if made.actions.ndim != 3 or not all(len(made.actions) == len(values) > 0 for values in states.values()):
+            raise ValueError("its arrays are not those of a sequence of states and actions")
+        return made
 
 
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:

@@ -10,10 +10,11 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Coordinate, Length, TimeLimit
 from mqe_jax.objects import Platform, Seesaw
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import Positive, fail, record
+from mqe_jax.settings import fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 
@@ -41,23 +42,23 @@ class SeesawRewards:
 class SeesawParams(TaskParams):
     """Parameters of Climb on Seesaw."""
 
-    episode_length: Positive = 10.0
-    min_height: float = 0.08
+    episode_length: TimeLimit = 10.0
+    min_height: Coordinate = 0.08
     end_on_collision: bool = True
     gait: str = "pace"
-    track_width: Positive = 3.0
+    track_width: Length = 3.0
     """Track width, m."""
     plank: Seesaw = Seesaw()
     """The seesaw."""
-    plank_start: float = -0.25
+    plank_start: Coordinate = -0.25
     """Angle at reset, rad; negative with the near end down."""
     platform: Platform = Platform(center=(8.0, 0.0, 1.0), size=(1.0, 1.0, 0.03), column=0.2)
     """The platform at the seesaw's far end."""
-    on_platform: tuple[float, float] = (7.7, 1.2)
+    on_platform: tuple[Coordinate, Coordinate] = (7.7, 1.2)
     """X and z beyond which a robot counts as on the platform, m."""
-    height_base: float = 0.56
+    height_base: Coordinate = 0.56
     """Summed height of the robots at which the height term is zero, m."""
-    lateral_offset_base: float = 0.5
+    lateral_offset_base: Coordinate = 0.5
     """Summed squared distance from the centre line at which the `lateral_offset` term is zero, m^2."""
     rewards: SeesawRewards = SeesawRewards()
     """Weights of the reward terms."""

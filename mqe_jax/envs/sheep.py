@@ -12,11 +12,12 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Buffer, Coordinate, Distance, Few, Friction, Length, NonNegative, TimeLimit
 from mqe_jax.npc import flock
 from mqe_jax.objects import Sheep
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.settings import record
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -39,35 +40,35 @@ class SheepRewards:
 class SheepEasyParams(TaskParams):
     """Parameters of both tasks, with the defaults of the easy one."""
 
-    episode_length: Positive = 15.0
+    episode_length: TimeLimit = 15.0
     end_on_collision: bool = True
-    track_width: Positive = 4.0
+    track_width: Length = 4.0
     """Track width, m."""
-    lengths: tuple[Positive, Positive, Positive] = (1.5, 3.0, 3.0)
+    lengths: tuple[Length, Length, Length] = (1.5, 3.0, 3.0)
     """Lengths of the spawn area and of the free ground in front of and behind the gate, m."""
-    spawn_x: float = 1.25
+    spawn_x: Coordinate = 1.25
     """Spawn x of the robots, m."""
-    spawn_spacing: NonNegative = 1.95
+    spawn_spacing: Distance = 1.95
     """Distance between the robots, m."""
-    gate_width: Positive = 0.8
+    gate_width: Length = 0.8
     """Width of the gate's gap, m."""
-    gate_random: tuple[NonNegative, NonNegative] = (0.0, 0.5)
+    gate_random: tuple[Distance, Distance] = (0.0, 0.5)
     """Half-widths of the range of the gap's centre in x and y, m."""
-    past_gate: float = 0.0
+    past_gate: Coordinate = 0.0
     """Distance behind the gate's centre at which a sheep counts as through, m."""
-    flock: tuple[PositiveInt, PositiveInt] = (1, 1)
+    flock: tuple[Few, Few] = (1, 1)
     """Number of sheep along x and along y."""
-    flock_center: tuple[float, float] = (3.0, 0.0)
+    flock_center: tuple[Coordinate, Coordinate] = (3.0, 0.0)
     """Centre of the flock at reset, m."""
-    flock_spacing: NonNegative = 1.5
+    flock_spacing: Distance = 1.5
     """Distance between neighbouring sheep at reset, m."""
-    flock_noise: NonNegative = 0.3
+    flock_noise: Distance = 0.3
     """Half-width of the uniform noise on each sheep's position, m."""
     restlessness: NonNegative = 0.08
     """Scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep of the released
     system; in the paper sheep always move.
     """
-    sheep_friction: NonNegative = 1.0
+    sheep_friction: Friction = 1.0
     """Sliding friction between sheep and ground."""
     rewards: SheepRewards = SheepRewards()
     """Weights of the reward terms."""
@@ -81,17 +82,17 @@ class SheepEasyParams(TaskParams):
 class SheepHardParams(SheepEasyParams):
     """Parameters of `SheepEasyParams` with the defaults of the hard task."""
 
-    track_width: Positive = 6.0
-    lengths: tuple[Positive, Positive, Positive] = (2.0, 6.0, 6.0)
-    spawn_x: float = 1.5
-    spawn_spacing: NonNegative = 3.0
-    gate_width: Positive = 1.5
-    gate_random: tuple[NonNegative, NonNegative] = (0.0, 1.0)
-    flock: tuple[PositiveInt, PositiveInt] = (3, 3)
-    flock_center: tuple[float, float] = (5.0, 0.0)
+    track_width: Length = 6.0
+    lengths: tuple[Length, Length, Length] = (2.0, 6.0, 6.0)
+    spawn_x: Coordinate = 1.5
+    spawn_spacing: Distance = 3.0
+    gate_width: Length = 1.5
+    gate_random: tuple[Distance, Distance] = (0.0, 1.0)
+    flock: tuple[Few, Few] = (3, 3)
+    flock_center: tuple[Coordinate, Coordinate] = (5.0, 0.0)
     restlessness: NonNegative = 0.1
-    contacts_per_robot: PositiveInt = 20  # sheep touch each other
-    constraints_per_robot: PositiveInt = 96
+    contacts_per_robot: Buffer = 20  # sheep touch each other
+    constraints_per_robot: Buffer = 96
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
 
 

@@ -14,10 +14,11 @@ from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Distance, Length, TimeLimit
 from mqe_jax.objects import Cylinder
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, fail, record
+from mqe_jax.settings import fail, record
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
@@ -41,16 +42,16 @@ class TugRewards:
 class TugParams(TaskParams):
     """Parameters of Push Cylinder."""
 
-    episode_length: Positive = 15.0
-    spawn_height: Positive = 0.34
-    spawn_noise: NonNegative = 0.0
+    episode_length: TimeLimit = 15.0
+    spawn_height: Length = 0.34
+    spawn_noise: Distance = 0.0
     cylinder: Cylinder = Cylinder()
     """The cylinder. The arena is centred on it; its side walls are where the cylinder's reach ends."""
-    spawn_x: NonNegative = 1.0
+    spawn_x: Distance = 1.0
     """Half-width of the range of the robots' initial x about the arena's centre, m."""
-    spawn_y: NonNegative = 2.5
+    spawn_y: Distance = 2.5
     """Distance of the robots from the centre line, m; the first robot is on the side of negative y."""
-    win_distance: NonNegative = 0.1
+    win_distance: Distance = 0.1
     """Minimum distance of the cylinder on the opponent's half at the end of the episode for a win, m."""
     rewards: TugRewards = TugRewards()
     """Weights of the reward terms."""

@@ -11,10 +11,11 @@ import numpy as np
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.envs.state import Moment, State
+from mqe_jax.limits import Distance, Length, Positive, TimeLimit
 from mqe_jax.objects import Platform, Ring
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, fail, record
+from mqe_jax.settings import fail, record
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -37,20 +38,20 @@ class WrestlingParams(TaskParams):
     A robot is eliminated when its |roll| or |pitch| exceeds the limit, or its trunk is outside the ring or too low.
     """
 
-    episode_length: Positive = 15.0
-    spawn_height: Positive = 0.74
+    episode_length: TimeLimit = 15.0
+    spawn_height: Length = 0.74
     max_roll: Positive = 0.4 * np.pi
     platform: Platform = Platform(center=(3.1, 0.0, 0.4), size=(4.37, 4.37, 0.5))
     """The platform, with the ring in its centre; its lower part is below the ground. Robots dropped from the spawn
     height land on their feet.
     """
-    ring_radius: Positive = 1.7
+    ring_radius: Length = 1.7
     """Radius of the ring, m."""
-    ring_depth: NonNegative = 0.2
+    ring_depth: Distance = 0.2
     """Distance of a trunk below the platform's top at which the robot counts as out, m."""
-    spawn_y: NonNegative = 1.0
+    spawn_y: Distance = 1.0
     """Distance of the robots from the ring's centre, m; the first robot is on the side of negative y."""
-    head_start: NonNegative = 0.0
+    head_start: Distance = 0.0
     """Curriculum: both robots start up to head_start x `State.assistance` further along y, m, to a side drawn at
     random, so that one is near the edge of the ring. Inactive at assistance 0.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
+from mqe_jax.files import parsing, read_rows
 from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.monitor import read_evaluations
@@ -87,7 +89,7 @@ def read_runs(folder: Path) -> list[Run]:
     """
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
-        if finished(path.parent):
+        if path.parent.name.removeprefix("seed").isdecimal() and finished(path.parent):
             seed = int(path.parent.name.removeprefix("seed"))
             evaluations = read_evaluations(path.parent)
             curve = read_curve(path.parent / CSV_FILE)
@@ -104,16 +106,17 @@ def read_curve(path: Path) -> Curve:
     Raises:
         InputError: naming the file, if it is missing or malformed.
     """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
-            curve = {name: np.array([float(row[name]) for row in rows]) for name in reader.fieldnames or []}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; a run folder has one after its first update") from None
-    except (OSError, TypeError, ValueError):
-        raise InputError(f"{path}: is not a metrics.csv") from None
-    if not {"env_steps", REWARD} <= set(curve) or not rows:
+    if not path.exists():
+        raise InputError(f"{path}: no such file; a run folder has one after its first update")
+    rows = read_rows(path)
+    names = next(rows, [])
+    columns = [array("d") for _ in names]
+    with parsing(path, "a metrics.csv"):
+        for row in rows:
+            for column, text in zip(columns, row, strict=True):
+                column.append(float(text))
+    curve = {name: np.array(column) for name, column in zip(names, columns, strict=True)}
+    if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
         raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
     return curve
 
@@ -141,11 +144,11 @@ class Reference:
 
     label: str = "reference"
     """What the values are, in the legend of figures."""
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
     """Variant -> task -> algorithm -> average step reward."""
-    variants: Mapping[str, Any] = field(default_factory=dict)
+    variants: Mapping[str, str] = field(default_factory=dict)
     """Titles of variants, in their order; others follow."""
-    tasks: Mapping[str, Any] = field(default_factory=dict)
+    tasks: Mapping[str, str] = field(default_factory=dict)
     """Titles of tasks, in their order; others follow."""
     algorithms: tuple[str, ...] = ()
     """Algorithms in their order; others follow."""

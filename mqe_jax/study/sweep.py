@@ -14,14 +14,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
+import jax
 import yaml
-from annotated_types import MinLen
+from annotated_types import MaxLen, MinLen
 
 from mqe_jax.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.files import check_folder, locked, write_atomically
-from mqe_jax.settings import PositiveInt, Seed, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.limits import Seed, Seeds
+from mqe_jax.settings import build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -42,15 +44,15 @@ class Sweep:
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
     """Names of the algorithms, as in `mqe train --algorithm`; `default` has the settings of `mqe train` without."""
-    seeds: Annotated[tuple[Seed, ...], MinLen(1)] = (0, 1, 2, 3, 4)
+    seeds: Annotated[tuple[Seed, ...], MinLen(1), MaxLen(1000)] = (0, 1, 2, 3, 4)
     """Random seeds."""
-    seeds_together: PositiveInt | None = None
+    seeds_together: Seeds | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
     """Settings file or shipped name, in which {task} stands for the task's id; none uses that of `mqe train`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings that override the file's in every run; {task} in `start` and `opponents` stands for the task's id."""
-    variants: Mapping[str, Any] = field(default_factory=lambda: {PLAIN: {}})
+    variants: Annotated[Mapping[str, Any], MinLen(1)] = field(default_factory=lambda: {PLAIN: {}})
     """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
 
     def __post_init__(self) -> None:
@@ -121,12 +123,13 @@ def plan(
     config_of: Callable[[str, str], TrainConfig],
     cells: Sequence[str] = (),
     seeds: Sequence[int] = (),
+    check: Callable[[TrainConfig], object] = lambda config: None,
 ) -> list[Job]:
     """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
 
-    Of the sweep's seeds those in `seeds` are trained, or all if it is empty.
-
-    `config_of(task, algorithm)` gives the settings that those of the sweep override. Finished runs are left out.
+    Of the sweep's seeds those in `seeds` are trained, or all if it is empty. `config_of(task, algorithm)` gives the
+    settings that those of the sweep override, and `check` raises an InputError for settings with which a run could not
+    start: here, before the first cell is trained. Finished runs are left out.
     The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
     the same step.
 
@@ -142,6 +145,10 @@ def plan(
         named = {"start": config.start, "opponents": config.opponents}
         if "{task}" in str(named):
             config = override(config, _for_task(named, cell.task))
+        try:
+            check(config)
+        except InputError as error:
+            raise InputError(f"{cell.path.as_posix()}: {error}") from None
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
         started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
@@ -163,6 +170,9 @@ def _for_task(values: Any, task: str) -> Any:
 
 def _overridden(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
     """Returns settings with those of the mapping `name` in a sweep file; its errors have this prefix."""
+    for key in ("task", "seed"):
+        if key in changes:
+            fail(f"{name}.{key}", changes[key], f"left out: the sweep's {key}s are in its list `{key}s`")
     try:
         return override(config, changes)
     except InputError as error:
@@ -189,8 +199,9 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
     for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
         with contextlib.suppress(InputError, KeyError):  # stopped before the first update, or without fps
             fps = read_curve(path)["fps"]
+            speed = float(fps[len(fps) // 2])
             for key in ((), path.parts[-4:-2]):
-                speeds.setdefault(key, []).append(float(fps[len(fps) // 2]))
+                speeds.setdefault(key, []).extend([speed] * (0 < speed < math.inf))
     seconds = []
     for job in jobs:
         known = speeds.get(job.cell.path.parts) or speeds.get(())
@@ -218,39 +229,52 @@ def prepare(sweep: Sweep, folder: Path) -> None:
     write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
 
+class Outcome(NamedTuple):
+    """The jobs that `run` did not finish."""
+
+    others: list[Job]
+    """Those whose cells other processes have locked."""
+    failed: list[tuple[Job, Exception]]
+    """Those that failed, each with its error."""
+
+
 def run(
     folder: Path,
     jobs: Sequence[Job],
     environments: Environments,
     on_update: OnUpdate | None = None,
+    on_failure: Callable[[Job, Exception], object] = lambda job, error: None,
     stop: Callable[[], bool] = lambda: False,
-) -> list[Job]:
+) -> Outcome:
     """Trains the jobs sequentially, until `stop()`; each resumes from its checkpoints.
 
-    Several processes may run the same sweep at the same time, each job being trained by the one that locks its run
-    folders first. Returns the jobs that were left to other processes.
+    One that fails does not stop the others.
 
-    Raises:
-        InputError: if a run cannot be resumed.
-        NonFiniteError: after the last job, if one became non-finite.
+    Several processes may run the same sweep at the same time, each job being trained by the one that locks its run
+    folders first. `on_failure` is called at once for a job that fails with bad input, a file that cannot be read or
+    written, a training that became non-finite, or memory that does not suffice.
     """
-    left, broken = [], []
+    outcome = Outcome([], [])
     for job in jobs:
         if stop():
             break
-        if all(map(finished, job.folders)):  # by another process since the jobs were planned
-            continue
         try:
-            with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
-                for run_dir in job.folders:
-                    run_dir.mkdir(parents=True, exist_ok=True)
-                    locks.enter_context(locked(run_dir))
-            env, eval_env = environments(job.configs[0], len(job.configs))
-            train_seeds(env, job.configs, job.folders, True, on_update, eval_env, stop=stop)
+            _train(job, environments, on_update, stop)
         except InUseError:
-            left.append(job)
-        except NonFiniteError as error:
-            broken.append(error)
-    if broken:
-        raise broken[0]
-    return left
+            outcome.others.append(job)
+        except (InputError, OSError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
+            outcome.failed.append((job, error))
+            on_failure(job, error)
+    return outcome
+
+
+def _train(job: Job, environments: Environments, on_update: OnUpdate | None, stop: Callable[[], bool]) -> None:
+    """Trains a job, if no other process has finished it since the jobs were planned."""
+    if all(map(finished, job.folders)):
+        return
+    with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
+        for run_dir in job.folders:
+            run_dir.mkdir(parents=True, exist_ok=True)
+            locks.enter_context(locked(run_dir))
+    env, eval_env = environments(job.configs[0], len(job.configs))
+    train_seeds(env, job.configs, job.folders, True, on_update, eval_env, stop=stop)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from annotated_types import MinLen
 
-from mqe_jax.settings import Positive, PositiveInt, fail
+from mqe_jax.limits import Horizon, Positive, Width, Widths
+from mqe_jax.settings import fail
 from mqe_jax.train import nn
 from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
@@ -28,7 +28,7 @@ class ActorCritic(GaussianSettings):
     """Critic input: the privileged observation, all agents' observations, or each agent's own."""
     share_policy: bool = True
     """Share one actor between all agents, distinguished only by an id in their observations; else one per agent."""
-    hidden_sizes: Annotated[tuple[PositiveInt, ...], MinLen(1)] = (64,)
+    hidden_sizes: Widths = (64,)
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"
     """Activation after each hidden layer."""
@@ -37,9 +37,9 @@ class ActorCritic(GaussianSettings):
     linear layer with one of its own after the hidden layers."""
     recurrent: bool = True
     """Use a gated recurrent unit after the hidden layers of actor and critic."""
-    gru_size: PositiveInt = 64
+    gru_size: Width = 64
     """Width of the recurrent unit."""
-    chunk_length: PositiveInt = 2
+    chunk_length: Horizon = 2
     """Steps of truncated backpropagation through time; used with `recurrent`."""
     action_gain: Positive = 0.01
     """Gain of the orthogonal initialisation of the action layer."""

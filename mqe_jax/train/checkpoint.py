@@ -12,15 +12,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.numpy import save
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax import limits
+from mqe_jax.errors import InputError, brief
+from mqe_jax.files import check_file, make_folder, parse_json, parsing, write_atomically
 
 FORMAT = "mqe_jax.train"
-VERSION = 2
+VERSION = 3
 
+_LARGEST = {"policy": limits.POLICY_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
 
 
@@ -37,50 +39,61 @@ def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}, structure
 
 
-def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
-    total = 0
+def _checksum(arrays: Mapping[str, np.ndarray], metadata: str | None) -> str:
+    """Returns the checksum of arrays, their names and metadata; without metadata that of version 2, of arrays alone."""
+    total = 0 if metadata is None else zlib.crc32(metadata.encode())
     for name in sorted(arrays):
-        total = zlib.crc32(arrays[name].tobytes(), total)
-    return total
+        array = arrays[name]
+        about = "" if metadata is None else f"{name} {array.dtype} {array.shape}"
+        total = zlib.crc32(array.tobytes(), zlib.crc32(about.encode(), total))
+    return str(total)
 
 
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
-    """Writes a pytree of arrays with JSON metadata; `kind` is the kind of file that `load_tree` checks."""
+    """Writes a pytree of arrays with JSON metadata; `kind` is the kind of file that `load_tree` checks.
+
+    The same content gives the same bytes: safetensors writes several entries of metadata in random order, so that
+    there is one.
+    """
     named, _ = _flatten(jax.device_get(tree))
     # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
     arrays = {name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()}
-    header = {
-        "format": FORMAT,
-        "kind": kind,
-        "version": str(VERSION),
-        "checksum": str(_checksum(arrays)),
-        "metadata": json.dumps(dict(metadata), sort_keys=True),
-    }
-    write_atomically(Path(path), save(arrays, header))
+    text = json.dumps(dict(metadata), sort_keys=True)
+    header = {"kind": kind, "version": str(VERSION), "checksum": _checksum(arrays, text), "metadata": text}
+    write_atomically(Path(path), save(arrays, {FORMAT: json.dumps(header)}))
 
 
 def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Returns arrays by name and metadata; raises an InputError that names the file and what is wrong."""
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{path}: no such file; a {kind} written by this package is needed")
+    check_file(path, _LARGEST[kind])
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = file.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise InputError(f"{path}: not a file of this package; a {kind} is needed")
-            if header.get("kind") != kind:
-                raise InputError(f"{path}: holds a {header.get('kind')}; a {kind} is needed")
-            if header.get("version") != str(VERSION):
-                version = header.get("version")
-                raise InputError(f"{path}: has format version {version}; version {VERSION} is needed")
+        with parsing(path, f"a {kind}, or truncated"), safe_open(path, framework="numpy") as file:
+            found = file.metadata() or {}
+            header = parse_json(found[FORMAT], "header") if FORMAT in found else found  # version 2
+            _check_header(header, kind, FORMAT in found or found.get("format") == FORMAT)
             arrays = {name: file.get_tensor(name) for name in file.keys()}
-        metadata = json.loads(header.get("metadata", ""))
-    except (SafetensorError, OSError, json.JSONDecodeError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: damaged, truncated or not a {kind} ({reason}){_older(path)}") from None
-    if header.get("checksum") != str(_checksum(arrays)):
-        raise InputError(f"{path}: damaged (its content does not match its checksum){_older(path)}")
+            metadata = parse_json(header["metadata"], "metadata")
+            if not isinstance(metadata, dict):
+                raise ValueError("its metadata is not a mapping")
+            checked = header["metadata"] if header["version"] == str(VERSION) else None
+            if header["checksum"] != _checksum(arrays, checked):
+                raise ValueError("its content does not match its checksum")
+    except InputError as error:
+        text = str(error)
+        raise InputError(f"{text if str(path) in text else f'{path}: {text}'}{_older(path)}") from None
     return arrays, metadata
+
+
+def _check_header(header: Any, kind: str, ours: bool) -> None:
+    """Raises an InputError for a file of another package, kind or version."""
+    if not ours:
+        raise InputError(f"not a file of this package; a {kind} is needed")
+    if header["kind"] != kind:
+        raise InputError(f"holds a {brief(str(header['kind']))}; a {kind} is needed")
+    if header["version"] not in ("2", str(VERSION)):
+        raise InputError(f"has format version {brief(str(header['version']))}; version {VERSION} is needed")
 
 
 def _older(path: Path) -> str:
@@ -151,6 +164,17 @@ def latest(run_dir: str | Path) -> Path | None:
     return next(reversed(list_checkpoints(run_dir)), None)
 
 
+def check_alone(run_dir: Path) -> None:
+    """Raises an InputError for a folder in that of another run, or around runs of several seeds."""
+    seeds = [folder for folder in sorted(run_dir.glob("seed*")) if latest(folder)]
+    others = [run_dir.parent] * (latest(run_dir.parent) is not None) + seeds
+    if others:
+        raise InputError(
+            f"run_dir: {run_dir} cannot hold a run, because {others[0]} holds another run; "
+            "resume that one with its own --num-seeds, or name another folder"
+        )
+
+
 def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
     """Checks that a folder holds no run, or with `resume` one that can be resumed.
 
@@ -180,18 +204,13 @@ def nonfinite(tree: Any) -> list[str]:
 
 
 def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:
-    """Writes a checkpoint of environment step `step`, then removes all but the newest `keep`.
-
-    Partial files of interrupted writes are removed too.
-    """
+    """Writes a checkpoint of environment step `step`, then removes all but the newest `keep`."""
     folder = checkpoint_folder(run_dir)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / f"step_{step:012d}.safetensors"
     save_tree(path, tree, {**metadata, "step": step}, kind="checkpoint")
     for old in list_checkpoints(run_dir)[:-keep]:
         old.unlink(missing_ok=True)
-    for partial in folder.glob(".step_*.tmp*"):
-        partial.unlink(missing_ok=True)
     return path
 
 

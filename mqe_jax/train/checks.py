@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 
 from mqe_jax.errors import InputError
+from mqe_jax.memory import check_memory
 from mqe_jax.settings import fail
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import Network
@@ -34,6 +35,8 @@ def check_environment(env: VectorEnv, config: TrainConfig) -> None:
         found = getattr(state, name).shape
         if found != shape:
             raise InputError(f"env: {name} of {env.name} has shape {found}; expected {shape}")
+    numbers = env.num_agents * (env.observation_size + env.action_size + 4) + privileged
+    check_memory("rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update)
     assistance = config.curriculum.assistance
     if assistance and not hasattr(state, "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")

@@ -12,7 +12,20 @@ import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
 from mqe_jax.errors import InputError
-from mqe_jax.settings import Fraction, NonNegative, Positive, PositiveInt, Seed, fail, load_yaml, override, record
+from mqe_jax.limits import (
+    Environments,
+    Episodes,
+    Epochs,
+    Fraction,
+    Horizon,
+    Members,
+    NonNegative,
+    Positive,
+    PositiveInt,
+    Seed,
+    Steps,
+)
+from mqe_jax.settings import fail, load_yaml, override, record
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
@@ -24,7 +37,7 @@ _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
 class PPO:
     """The PPO update."""
 
-    epochs: PositiveInt = 10
+    epochs: Epochs = 10
     """Epochs over each rollout."""
     minibatches: PositiveInt = 1
     """Minibatches per epoch."""
@@ -120,13 +133,13 @@ class Normalization:
 class LeagueSettings:
     """The pool of earlier policies that `opponents` draw from."""
 
-    members: PositiveInt = 16
+    members: Members = 16
     """Policies in the pool; when it is full, the one beaten most leaves."""
-    snapshot_steps: PositiveInt = 3_000_000
+    snapshot_steps: Steps = 3_000_000
     """Environment steps after which the policy becomes a member."""
     snapshot_win_rate: Fraction = 0.7
     """Mean win rate against the members from which it becomes one already after a quarter of these steps."""
-    episodes: PositiveInt = 200
+    episodes: Episodes = 200
     """Episodes of a block of environments against a member until it plays another one."""
 
 
@@ -153,7 +166,7 @@ class EvaluationSettings:
 
     every: PositiveInt | None = None
     """Updates between two evaluations; none disables evaluation."""
-    episodes: PositiveInt = 32
+    episodes: Environments = 32
     """Episodes per evaluation under sampled actions, and as many under mean actions; one per environment."""
 
 
@@ -183,11 +196,11 @@ class TrainConfig:
     starts from nothing."""
     seed: Seed = 0
     """Random seed."""
-    num_envs: PositiveInt = 500
+    num_envs: Environments = 500
     """Number of parallel environments."""
-    total_steps: PositiveInt = 40_000_000
+    total_steps: Steps = 40_000_000
     """Total environment steps of the run, summed over environments."""
-    rollout_steps: PositiveInt = 200
+    rollout_steps: Horizon = 200
     """Steps of each environment between two updates."""
     stagger_episodes: bool = False
     """Start the first episodes at random times, so that environments do not all reset at the same step."""

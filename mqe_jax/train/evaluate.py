@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError
-from mqe_jax.settings import fail
-from mqe_jax.train.types import Memory, Recorder, TraceStep, VectorEnv, join_traces, teams_of
+from mqe_jax.limits import Episodes, Horizon, PositiveInt
+from mqe_jax.settings import check, checked
+from mqe_jax.train.types import AnyBatch, Memory, RandomKey, Recorder, TraceStep, VectorEnv, join_traces, teams_of
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
@@ -67,6 +68,7 @@ class _Progress(NamedTuple):
     """Sums over the last steps of counted episodes (N,) each."""
 
 
+@checked(env=AnyBatch, act=Callable, episodes=Episodes, key=RandomKey)
 def evaluate(
     env: VectorEnv,
     act: Act,
@@ -121,6 +123,7 @@ class Evaluator:
         max_steps: int = 1_000_000,
         recorder: Recorder | None = None,
     ) -> None:
+        block, max_steps = check("block", block, Horizon), check("max_steps", max_steps, PositiveInt)
         self._env, self._block, self._max_steps, self._recorder = env, block, max_steps, recorder
         trace_step = None if recorder is None else recorder.trace
 
@@ -139,8 +142,7 @@ class Evaluator:
 
     def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[EvalResult]:
         """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate`."""
-        if episodes < 1:
-            fail("episodes", episodes, "at least 1")
+        episodes = check("episodes", episodes, Episodes)
         count = self._env.num_envs
         quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
         split = jax.vmap(jax.random.split)(keys)

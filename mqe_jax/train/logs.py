@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib
 import importlib.util
@@ -22,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import append, naming, write_atomically
+from mqe_jax.files import append, make_folder, read_rows, write_atomically
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
@@ -79,17 +80,13 @@ def _read_rows(path: Path, key: str, last: int | None) -> tuple[list[str], list[
     """Returns columns and complete rows up to `last` in the column `key`; a partial last row is dropped."""
     if not path.is_file():
         return [], []
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
-        columns = list(reader.fieldnames or [])
-        rows = []
-        for row in reader:
-            try:
-                step = int(row[key])
-            except (KeyError, TypeError, ValueError):
-                continue
-            whole = None not in row and None not in row.values()
-            if whole and (last is None or step <= last):
+    lines = read_rows(path)
+    columns = next(lines, [])
+    rows = []
+    for line in lines:
+        row = dict(zip(columns, line, strict=False))
+        with contextlib.suppress(KeyError, ValueError):
+            if len(line) == len(columns) and (int(row[key]) <= last if last is not None else True):
                 rows.append(row)
     return columns, rows
 
@@ -109,8 +106,7 @@ class TensorBoardLog:
             self._proto = None
             return
         folder = run_dir / "tensorboard"
-        with naming(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self._path = folder / f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}"
         self._append(file_version="brain.Event:2")
         if env_steps:  # readers drop later events of earlier files
@@ -152,7 +148,7 @@ class WandbLog:
         check_loggers(("wandb",))
         wandb: Any = importlib.import_module("wandb")
         id_file = run_dir / "wandb" / "run_id"
-        id_file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(id_file.parent)
         if not (env_steps and id_file.is_file()):
             write_atomically(id_file, uuid.uuid4().hex[:8].encode())
         self._run = wandb.init(

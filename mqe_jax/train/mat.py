@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.settings import Positive, PositiveInt, fail
+from mqe_jax.limits import Depth, Positive, Width
+from mqe_jax.settings import fail
 from mqe_jax.train import nn
 from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
@@ -28,11 +29,11 @@ from mqe_jax.train.types import Memory, NetworkMemory, Params
 class Mat(GaussianSettings):
     """Settings of the multi-agent transformer."""
 
-    blocks: PositiveInt = 1
+    blocks: Depth = 1
     """Blocks of the encoder and of the decoder."""
-    heads: PositiveInt = 1
+    heads: Width = 1
     """Attention heads; a divisor of `width`."""
-    width: PositiveInt = 64
+    width: Width = 64
     """Width of every layer."""
     gain: Positive = 0.01
     """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of output layers."""

@@ -12,13 +12,16 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import jax
 import jax.numpy as jnp
+import pydantic
+from annotated_types import Ge
+from typing_extensions import TypedDict
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.files import check_locks, make_folder, read_json, write_atomically
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import EvalResult, Evaluator
 from mqe_jax.train.learner import env_dims
@@ -30,6 +33,19 @@ ABSOLUTE_FACTOR = 10
 """Number of episodes of the absolute metric, relative to an evaluation."""
 
 _SAMPLED, _DETERMINISTIC = 0, 1
+
+
+class _Evaluation(TypedDict):
+    __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True)  # type: ignore[misc]
+    env_steps: Annotated[int, Ge(0)]
+    sampled: dict[str, float | None]
+    deterministic: dict[str, float | None]
+
+
+class _Evaluations(TypedDict):
+    evaluations: list[_Evaluation]
+    absolute: _Evaluation | None
+    ended_at: NotRequired[int]
 
 
 class Monitor:
@@ -104,7 +120,7 @@ class EvaluationLog:
         best = self.best()
         if best is None or score(evaluation) > score(best):
             path = _best_path(self._run_dir, evaluation)
-            path.parent.mkdir(exist_ok=True)
+            make_folder(path.parent)
             save_policy(path.parent, policy, path.name)
         self.evaluations.append(evaluation)
         self.absolute = None
@@ -132,6 +148,7 @@ class EvaluationLog:
 
     def prune(self) -> None:
         """Removes all policies but the best; called once the checkpoint that includes it is on disk."""
+        check_locks(self._path)
         best = self.best()
         for path in (self._run_dir / "best").glob("*.safetensors"):
             if best is None or path != _best_path(self._run_dir, best):
@@ -152,9 +169,10 @@ def read_evaluations(run_dir: Path) -> dict[str, Any]:
     if not path.is_file():
         return {"evaluations": [], "absolute": None}
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
+        return dict(pydantic.TypeAdapter(_Evaluations).validate_python(read_json(path)))
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def _best_path(run_dir: Path, evaluation: dict[str, Any]) -> Path:

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import nearest
+from mqe_jax.limits import NonNegativeInt, PositiveInt
 from mqe_jax.settings import build, fail, record
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
@@ -29,11 +30,11 @@ from mqe_jax.train.types import Memory, NetworkMemory, Params
 class EnvDims(NamedTuple):
     """Sizes of the environment of one team and of its values (`ppo.value`)."""
 
-    agents: int
-    observation: int
-    privileged: int
-    action: int
-    values: int
+    agents: PositiveInt
+    observation: PositiveInt
+    privileged: NonNegativeInt
+    action: PositiveInt
+    values: PositiveInt
     """Number of values V: one per agent, or one of the team."""
 
 
@@ -111,7 +112,7 @@ def network_settings(value: Any) -> Any:
     if not isinstance(value, Mapping):
         return value
     name = value.get("name", "actor_critic")
-    if name not in NETWORKS:
+    if not isinstance(name, str) or name not in NETWORKS:
         hint = nearest(name, NETWORKS)
         fail("name", name, f"a registered network: {', '.join(NETWORKS)}{hint}")
     return build(NETWORKS[name], value)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.settings import build, to_mapping
+from mqe_jax.settings import PathText, build, check, to_mapping
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
@@ -165,12 +165,12 @@ def read_policy(run: str | Path) -> TrainedPolicy:
     Raises:
         InputError: in one line naming the file, if it is missing, damaged, of another format or non-finite.
     """
-    path = Path(run)
+    path = Path(check("policy", run, PathText))
     if path.is_dir():
         path = path / POLICY_FILE
     metadata = read_metadata(path, kind="policy")
     try:
-        dims = EnvDims(**metadata.pop("dims"))
+        dims = check("dims", EnvDims(**metadata.pop("dims")), EnvDims)
         config = build(TrainConfig, metadata.pop("config"))
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None

@@ -17,9 +17,17 @@ import yaml
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.files import check_folder, locked, write_atomically
-from mqe_jax.settings import fail, to_mapping
-from mqe_jax.train.checkpoint import check_run, checkpoint_step, latest, list_checkpoints, nonfinite, save_checkpoint
+from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
+from mqe_jax.settings import PathText, check, fail, to_mapping
+from mqe_jax.train.checkpoint import (
+    check_alone,
+    check_run,
+    checkpoint_step,
+    latest,
+    list_checkpoints,
+    nonfinite,
+    save_checkpoint,
+)
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
@@ -27,7 +35,7 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationL
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
-from mqe_jax.train.types import Recorder, VectorEnv, join_traces
+from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
@@ -80,6 +88,10 @@ def train_seeds(
     The recorder receives the environments of all seeds as one batch. Where `stop()` is true before an update, the runs
     are saved and end there, to be resumed.
     """
+    check("env", env, AnyBatch)
+    for config, run_dir in zip(configs, run_dirs, strict=True):
+        check("config", config, TrainConfig)
+        check("run_dir", run_dir, PathText)
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
@@ -90,8 +102,12 @@ def train_seeds(
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
     with contextlib.ExitStack() as locks:
         for folder in folders:
+            check_alone(folder)
+        for folder in folders:
             check_folder(folder)
             locks.enter_context(locked(folder))
+            for inner in (folder, *folder.glob("*/")):
+                remove_temporaries(inner)
         for folder in folders:
             check_run(folder, resume, run_files)
         checkpoints = _common_checkpoints(folders)

@@ -37,7 +37,10 @@ def first_state(
     metadata = read_metadata(checkpoint, kind="checkpoint")
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
-    _check_same(checkpoint.parent.parent, metadata.get("config", {}), config)
+    before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
+    if not isinstance(before, dict) or not isinstance(seconds, int | float):
+        raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
+    _check_same(checkpoint.parent.parent, before, config)
     whole = metadata.get("environments", True)
     template = jax.eval_shape(learner.init, initial_key(config))
     saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
@@ -49,7 +52,7 @@ def first_state(
         tree = dataclasses.replace(fresh, **tree)
     elif any(jax.tree.leaves(shared)):
         tree = with_shared(tree, shared, jax.jit(learner.init)(initial_key(config)))
-    return jax.tree.map(jnp.asarray, tree), float(metadata.get("seconds", 0.0))
+    return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
 def _from_policy(env: VectorEnv, state: TrainState, config: TrainConfig) -> TrainState:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import pydantic
 
 from mqe_jax.errors import InputError
 
@@ -16,6 +17,33 @@ Params = dict[str, Any]
 """Nested dict of parameter arrays."""
 Memory = Any
 """Recurrent state: a pytree of arrays with leading axis N, empty for feed-forward networks."""
+
+
+def _key(value: Any) -> Any:
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", float)
+    if (shape, dtype) != ((2,), jnp.uint32) and not (shape == () and jnp.issubdtype(dtype, jax.dtypes.prng_key)):
+        raise ValueError("a random key, such as jax.random.PRNGKey(0)")
+    return value
+
+
+def _environment(value: Any) -> Any:
+    if not all(hasattr(value, name) for name in ("name", "num_agents", "action_size", "reset", "step")):
+        raise ValueError("an environment, such as that of mqe_jax.make")
+    return value
+
+
+def _batch(value: Any) -> Any:
+    if not hasattr(_environment(value), "num_envs"):
+        raise ValueError("a batch of environments, such as VectorEnv(mqe_jax.make(task), 64)")
+    return value
+
+
+RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
+"""Kind of an argument that is a random key (see `mqe_jax.settings.checked`)."""
+AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]
+"""Kind of an argument that is one environment or a batch."""
+AnyBatch = Annotated[Any, pydantic.AfterValidator(_batch)]
+"""Kind of an argument that is a batch of environments."""
 
 Teams = tuple[tuple[int, ...], ...]
 """Agents of each team; every agent belongs to exactly one."""

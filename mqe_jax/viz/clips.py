@@ -7,14 +7,16 @@ import subprocess
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt
 from PIL import Image
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, replacing
 from mqe_jax.interrupts import child
+from mqe_jax.settings import PathText, checked
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
@@ -37,15 +39,28 @@ def check_output(path: Path) -> Path:
     return path
 
 
+@checked(path=PathText, fps=Annotated[float, Gt(0)])
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
-    path = check_output(path)
-    suffix = path.suffix.lower()
+    path = check_output(Path(path))
+    suffix, frames = path.suffix.lower(), _checked_frames(frames)
     with replacing(path) as temporary:
         if suffix == ".mp4":
             _write_mp4(temporary, frames, fps)
         else:
             _write_images(temporary, [Image.fromarray(frame) for frame in frames], suffix, fps)
+
+
+def _checked_frames(frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields at least one frame, each (H, W, 3) uint8."""
+    index = -1
+    for index, frame in enumerate(frames):
+        frame = np.asarray(frame)
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise InputError(f"frames: frame {index} is {frame.dtype} {frame.shape}; it must be uint8 (H, W, 3)")
+        yield frame
+    if index < 0:
+        raise InputError("frames: there are none")
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:

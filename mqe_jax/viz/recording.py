@@ -1,5 +1,6 @@
 """Recording of episodes as numpy arrays."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,7 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
+from mqe_jax.settings import checked, fail
 from mqe_jax.train.evaluate import Act
+from mqe_jax.train.types import RandomKey
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class Episode:
         return Episode(*poses, dt=self.dt * (frames.step or 1), success=self.success, reward=self.reward)
 
 
+@checked(act=Callable, key=RandomKey, episodes=Candidates, seconds=ClipLength)
 def record(
     env: Any, act: Act, memory: Any, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
 ) -> list[Episode]:
@@ -49,6 +54,9 @@ def record(
         episodes: number of environments.
         seconds: time limit of an episode; otherwise its last frame is that of the termination or truncation.
     """
+    numbers = episodes * round(seconds / env.dt) * (env.mj_model.nq + 7 * env.mj_model.nmocap)
+    if 4 * numbers > CLIP_BYTES:
+        fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     reset_key, act_key = jax.random.split(key)
 
     def now(state: Any) -> tuple[jax.Array, ...]:
@@ -88,4 +96,6 @@ def record(
 
 def best(episodes: list[Episode]) -> Episode:
     """Returns the best episode: by success, then by average step reward."""
+    if not episodes:
+        fail("episodes", episodes, "at least one episode")
     return max(episodes, key=lambda episode: (episode.success, episode.reward))

@@ -8,12 +8,15 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
+from mqe_jax.errors import InputError
 from mqe_jax.interrupts import child
+from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
+from mqe_jax.settings import PathText, checked
 from mqe_jax.viz.cameras import Camera, cameras
 from mqe_jax.viz.clips import check_output, write_clip
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
@@ -95,6 +98,11 @@ def _draw_gl(
             yield renderer.render()
 
 
+_SIZE = tuple[Pixels, Pixels]
+_BACKEND = Literal["auto", "egl", "osmesa"] | None
+
+
+@checked(size=_SIZE, backend=_BACKEND)
 def render_frames(
     env: Any,
     episode: Episode,
@@ -115,6 +123,7 @@ def render_frames(
     return _draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
 
 
+@checked(path=PathText, size=_SIZE | None, fps=FrameRate | None, speed=Speed, at=Time | None, backend=_BACKEND)
 def render_episode(
     env: Any,
     episode: Episode,
@@ -134,7 +143,9 @@ def render_episode(
     middle).
     Without GL, the packages required for 3-D rendering are printed to standard error.
     """
-    check_output(path)
+    path = check_output(Path(path))
+    if not len(episode) or episode.qpos.shape[1:] != (env.mj_model.nq,):
+        raise InputError(f"episode: {episode.qpos.shape} coordinates; {env.name} needs (frames, {env.mj_model.nq})")
     suffix = path.suffix.lower()
     size = size or {".mp4": (960, 540), ".png": (1280, 720)}.get(suffix, (480, 270))
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)
@@ -152,6 +163,9 @@ def render_episode(
     else:
         episode = episode.cut(slice(None, None, max(1, round(speed / (fps * episode.dt)))))
         fps = speed / episode.dt
+        if suffix != ".mp4" and 3 * len(episode) * size[0] * size[1] > CLIP_BYTES:
+            text = f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
+            raise InputError(f"output: {text}; give a smaller width, fewer frames per second, or .mp4")
         views = cameras(rendering_model(env.mj_model, episode), episode, view or "follow", aspect)
     write_clip(path, render_frames(env, episode, views, size, backend), fps)
     return backend or "matplotlib"

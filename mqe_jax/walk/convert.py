@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import zipfile
 
 import numpy as np
 
-from mqe_jax.errors import InputError
 from mqe_jax.walk_policy import Params, nested_params
 
 
@@ -25,10 +23,7 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """
     from mqe_jax.walk.torchscript import read_state
 
-    try:
-        return read_state(path)
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise InputError(f"walk policy {path}: not a TorchScript Sequential of float32 layers ({error})") from None
+    return read_state(path)
 
 
 def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import robots, walk_policy
-from mqe_jax.settings import NonNegative, PositiveInt, fail
+from mqe_jax.limits import Horizon, NonNegative
+from mqe_jax.settings import FileName, fail
 from mqe_jax.train import nn
 from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
@@ -31,9 +32,9 @@ _PRECISION = "tensorfloat32"  # full float32 products over 2100 numbers would ta
 class WalkNetwork(GaussianSettings):
     """Settings of the walk policy and its critic, which sees the privileged observation."""
 
-    weights: str | None = None
+    weights: FileName | None = None
     """File of walk weights to start from, of any robot; none samples them."""
-    chunk_length: PositiveInt = 24
+    chunk_length: Horizon = 24
     """Steps of a chunk, at whose first one the history is stored."""
     adaptation_coef: NonNegative = 1.0
     """Weight of the adaptation network's regression loss."""

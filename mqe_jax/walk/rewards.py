@@ -16,9 +16,10 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
+from mqe_jax.settings import record
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class WalkRewards:
     """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from annotated_types import Ge, Le
 
 from mqe_jax import walk_policy
 from mqe_jax.envs.randomization import Randomization, RandomizedParams
 from mqe_jax.envs.state import EnvironmentState
+from mqe_jax.limits import Fraction, Iterations, NonNegative, Time, TimeLimit
 from mqe_jax.robots.robot import Robot
+from mqe_jax.settings import record
 from mqe_jax.walk.rewards import WalkRewards
 from mqe_jax.walk_policy import WalkMemory
 
@@ -25,35 +28,35 @@ RANDOMIZATION = Randomization(
 )
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class WalkTask:
     """Parameters of the walking task."""
 
     rewards: WalkRewards = WalkRewards()
     """Weights of the reward terms."""
-    episode_length: float = 20.0
+    episode_length: TimeLimit = 20.0
     """Time limit, s."""
-    command_period: float = 8.0
+    command_period: Time = 8.0
     """Interval at which commands, slope and force are resampled, s; 0 never resamples."""
-    max_vx: float = 1.2
+    max_vx: NonNegative = 1.2
     """Maximum commanded forward velocity, m/s."""
-    max_vy: float = 0.7
+    max_vy: NonNegative = 0.7
     """Maximum commanded lateral velocity, m/s."""
-    max_yaw: float = 1.2
+    max_yaw: NonNegative = 1.2
     """Maximum commanded yaw rate, rad/s."""
-    slope: float = 0.32
+    slope: Annotated[float, Ge(0), Le(1.5)] = 0.32
     """Maximum slope, rad."""
-    slope_share: float = 0.5
+    slope_share: Fraction = 0.5
     """Fraction of the episodes' specs that have a slope."""
-    force: float = 40.0
+    force: NonNegative = 40.0
     """Maximum sustained horizontal force on the trunk, N."""
-    push: float = 0.9
+    push: NonNegative = 0.9
     """Maximum instantaneous change of the trunk's velocity, m/s."""
-    push_period: float = 4.0
+    push_period: TimeLimit = 4.0
     """Mean time between pushes, s."""
     randomize: bool = True
     """Whether friction, payload, centre of mass, motors and observations are randomised."""
-    solver_iterations: int = 4
+    solver_iterations: Iterations = 4
     """Solver iterations per physics step."""
 
 

@@ -8,12 +8,17 @@ object that keeps its attributes.
 from __future__ import annotations
 
 import io
+import math
 import os
 import pickle
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mqe_jax import limits
+from mqe_jax.files import archive
 
 _DTYPES = {
     "FloatStorage": "<f4",
@@ -31,27 +36,21 @@ class _Module:
         self.__dict__.update(state)
 
 
-def _rebuild_tensor(
-    storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any
-) -> np.ndarray:
-    last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) if all(size) else offset
-    if offset < 0 or any(s < 0 for s in stride) or last >= len(storage):
-        raise ValueError("a tensor reaches beyond its storage")
-    bytes_per = storage.itemsize
-    view = np.lib.stride_tricks.as_strided(storage[offset:], size, [s * bytes_per for s in stride])
-    return np.array(view, np.float32)
+_PurePython: Any = vars(pickle)["_Unpickler"]  # the one in C allocates whatever a memo's index says
 
 
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, data: bytes, archive: zipfile.ZipFile, root: str) -> None:
+class _Unpickler(_PurePython):
+    def __init__(self, data: bytes, opened: zipfile.ZipFile, root: str) -> None:
         super().__init__(io.BytesIO(data))
-        self._archive, self._root = archive, root
+        self._archive, self._root = opened, root
+        self._storages: dict[str, np.ndarray] = {}
+        self._left = limits.WEIGHTS_BYTES  # of all tensors, which may share storages
 
     def find_class(self, module: str, name: str) -> Any:
         if module.startswith("__torch__"):
             return _Module
         if module == "torch._utils" and name in ("_rebuild_tensor_v2", "_rebuild_tensor"):
-            return _rebuild_tensor
+            return self._rebuild_tensor
         if module == "torch._utils" and name == "_rebuild_parameter":
             return lambda tensor, *_: tensor
         if module == "torch" and name in _DTYPES:
@@ -66,33 +65,45 @@ class _Unpickler(pickle.Unpickler):
         kind, dtype, key = pid[:3]
         if kind != "storage":
             raise ValueError(f"holds a {kind}")
-        return np.frombuffer(self._archive.read(f"{self._root}/data/{key}"), dtype)
+        if key not in self._storages:
+            self._storages[key] = np.frombuffer(self._archive.read(f"{self._root}/data/{key}"), dtype)
+        return self._storages[key]
+
+    def _rebuild_tensor(
+        self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any
+    ) -> np.ndarray:
+        last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) if all(size) else offset
+        if offset < 0 or any(s < 0 for s in stride) or any(n < 0 for n in size) or last >= len(storage):
+            raise ValueError("a tensor reaches beyond its storage")
+        self._left -= 4 * math.prod(size)
+        if self._left < 0:
+            raise ValueError(f"its tensors have more than {limits.WEIGHTS_BYTES} bytes")
+        strides = [s * storage.itemsize for s in stride]
+        return np.array(np.lib.stride_tricks.as_strided(storage[offset:], size, strides), np.float32)
 
 
 def read_state(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Returns the tensors of a TorchScript file by dotted name, float32.
 
     Raises:
-        OSError, zipfile.BadZipFile, KeyError, ValueError: if the file is not such an archive.
+        InputError: if the file is not such an archive, or exceeds the limits.
     """
-    with zipfile.ZipFile(path) as archive:
-        names = [name for name in archive.namelist() if name.endswith("/data.pkl") and name.count("/") == 1]
+    with archive(Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of float32 layers") as opened:
+        names = [name for name in opened.namelist() if name.endswith("/data.pkl") and name.count("/") == 1]
         if len(names) != 1:
             raise ValueError("no data.pkl in it")
-        try:
-            root = _Unpickler(archive.read(names[0]), archive, names[0].split("/")[0]).load()
-        except (pickle.UnpicklingError, EOFError, AttributeError, TypeError, IndexError) as error:
-            raise ValueError(str(error)) from None
-    state: dict[str, np.ndarray] = {}
+        state: dict[str, np.ndarray] = {}
+        _collect(_Unpickler(opened.read(names[0]), opened, names[0].split("/")[0]).load(), "", state, set())
+        return state
 
-    def walk(node: Any, prefix: str) -> None:
-        for name, value in vars(node).items():
-            if isinstance(value, np.ndarray):
-                state[prefix + name] = value
-            elif isinstance(value, _Module):
-                walk(value, f"{prefix}{name}.")
 
-    if not isinstance(root, _Module):
-        raise ValueError("its root is not a module")
-    walk(root, "")
-    return state
+def _collect(module: Any, prefix: str, state: dict[str, np.ndarray], seen: set[int]) -> None:
+    """Adds the tensors of a tree of modules, in which none occurs twice, to `state`."""
+    if not isinstance(module, _Module) or id(module) in seen:
+        raise ValueError("its modules are not a tree")
+    seen.add(id(module))
+    for name, value in vars(module).items():
+        if isinstance(value, np.ndarray):
+            state[f"{prefix}{name}"] = value
+        elif isinstance(value, _Module):
+            _collect(value, f"{prefix}{name}.", state, seen)

@@ -10,7 +10,8 @@ from annotated_types import Ge
 
 from mqe_jax.envs import TASKS
 from mqe_jax.errors import InputError
-from mqe_jax.settings import NonNegative, PositiveInt, build, record, to_mapping
+from mqe_jax.limits import NonNegative, PositiveInt
+from mqe_jax.settings import build, record, to_mapping
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 

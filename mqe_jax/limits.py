@@ -1,0 +1,91 @@
+"""What input may hold and cost: the one list of bounds. Whatever is outside of them is refused with an `InputError`.
+
+Kinds of numbers are types: fields of records have them (`settings.record`), and arguments of functions
+(`settings.checked`); a field that is a plain `int` or `float` has the bounds of `Integer` or `Number`. The constants in
+capitals bound files, texts and memory; `files.py` has the readers. The fuzz tests take from here what must be refused
+(`bounds`) and what may be accepted.
+"""
+
+from __future__ import annotations
+
+import typing
+from typing import Annotated, Any
+
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+
+# -- numbers: finite, within both bounds -------------------------------------------------------------------------------
+Number = Annotated[float, Ge(-1e9), Le(1e9)]
+Positive = Annotated[float, Ge(1e-9), Le(1e9)]
+NonNegative = Annotated[float, Ge(0), Le(1e9)]
+Fraction = Annotated[float, Ge(0), Le(1)]
+Length = Annotated[float, Ge(1e-3), Le(1e3)]  # of a body or a scene, m
+Distance = Annotated[float, Ge(0), Le(1e3)]  # m
+Coordinate = Annotated[float, Ge(-1e3), Le(1e3)]  # in the environment's frame, m
+Mass = Annotated[float, Ge(1e-3), Le(1e4)]  # kg, or a moment of inertia, kg m^2
+Damping = Annotated[float, Ge(0), Le(1e5)]  # N s/m, or N m s/rad
+Friction = Annotated[float, Ge(0), Le(100)]
+PositiveFriction = Annotated[float, Ge(1e-3), Le(100)]
+TimeLimit = Annotated[float, Ge(0.02), Le(1e6)]  # of an episode, s; not below one environment step
+Time = Annotated[float, Ge(0), Le(1e4)]  # s
+ClipLength = Annotated[float, Ge(0.02), Le(600)]  # s
+FrameRate = Annotated[float, Ge(0.1), Le(240)]  # Hz
+Speed = Annotated[float, Ge(0.01), Le(100)]  # of a clip, relative to real time
+
+# -- counts: integers; a number with a fraction, NaN, a boolean are none -----------------------------------------------
+Integer = Annotated[int, Ge(-(10**12)), Le(10**12)]
+PositiveInt = Annotated[int, Gt(0), Le(10**6)]
+NonNegativeInt = Annotated[int, Ge(0), Le(10**6)]
+Seed = Annotated[int, Ge(0), Lt(2**32)]
+Steps = Annotated[int, Gt(0), Lt(10**12)]  # environment steps of a training
+Environments = Annotated[int, Gt(0), Le(2**17)]  # in parallel; their memory is checked too
+Episodes = Annotated[int, Gt(0), Le(2 * 10**6)]
+Candidates = Annotated[int, Gt(0), Le(1024)]  # episodes recorded, or played by each pair, at once
+Horizon = Annotated[int, Gt(0), Le(10**4)]  # environment steps in one program
+Few = Annotated[int, Gt(0), Le(16)]  # robots, rows of sheep
+Seeds = Annotated[int, Gt(0), Le(64)]  # trained in one program
+Lag = Annotated[int, Ge(0), Le(50)]  # environment steps
+Members = Annotated[int, Gt(0), Le(256)]  # of a league's pool
+Epochs = Annotated[int, Gt(0), Le(1000)]
+Iterations = Annotated[int, Gt(0), Le(100)]  # of the solver
+Buffer = Annotated[int, Gt(0), Le(1000)]  # contacts or constraints per robot
+Width = Annotated[int, Gt(0), Le(2048)]  # of a layer
+Depth = Annotated[int, Gt(0), Le(16)]  # layers or blocks of a network
+Widths = Annotated[tuple[Width, ...], MinLen(1), MaxLen(16)]  # of all layers
+Pixels = Annotated[int, Ge(16), Le(4096)]  # of one side of an image
+Port = Annotated[int, Gt(0), Lt(65536)]
+
+# -- texts, settings and files -----------------------------------------------------------------------------------------
+TEXT = 4096  # characters of a name or a path, none of which is a control character
+FILE_NAME = 255  # bytes of a part of a path
+SHOWN = 200  # characters of a value in a message
+DEPTH = 32  # nesting of YAML and JSON; YAML has no aliases
+VALUES = 20_000  # in one YAML file
+YAML_BYTES = 2**17
+JSON_BYTES = 2**26
+CSV_BYTES = 2**27
+WEIGHTS_BYTES = 2**27  # walk weights and actuator networks; in a TorchScript archive, all members and all tensors
+POLICY_BYTES = 2**28
+CHECKPOINT_BYTES = 2**34
+RECORDING_BYTES = 2**28  # all members
+
+# -- memory, refused before it is allocated ----------------------------------------------------------------------------
+CLIP_BYTES = 2**30  # recorded episodes; images of a clip that is not streamed
+MEMORY_SHARE = 0.5  # of the free memory, for the states of all environments or for a rollout
+
+
+def bounds(kind: Any) -> tuple[float, float]:
+    """Returns the lowest and the highest allowed number of a kind; an exclusive bound is the first number inside."""
+    low, high, step = -float("inf"), float("inf"), int(typing.get_args(kind)[0] is int)
+    for limit in kind.__metadata__:
+        match limit:
+            case Ge(ge=value):
+                low = max(low, value)  # type: ignore[type-var]
+            case Gt(gt=value):
+                low = max(low, value + step)  # type: ignore[operator]
+            case Le(le=value):
+                high = min(high, value)  # type: ignore[type-var]
+            case Lt(lt=value):
+                high = min(high, value - step)  # type: ignore[operator]
+            case _:
+                pass
+    return low, high

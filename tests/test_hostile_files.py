@@ -1,0 +1,236 @@
+"""Hostile files: YAML, JSON, CSV, safetensors, policies, archives. Each is refused in one line, within the limits."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import resource
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from mqe_jax import limits
+from mqe_jax.cli.setup import parse_overrides
+from mqe_jax.envs.replay import load_recording
+from mqe_jax.errors import InputError
+from mqe_jax.files import parse_json, read_rows, read_tensors
+from mqe_jax.settings import build
+from mqe_jax.study.runs import read_curve
+from mqe_jax.train import checkpoint
+from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.monitor import read_evaluations
+from mqe_jax.train.policy import read_policy
+from mqe_jax.walk.convert import read_torchscript
+from mqe_jax.yaml_text import parse_yaml
+
+
+def peak() -> int:
+    """Returns the largest resident memory of this process so far, bytes."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+ALIASES = "".join(
+    f"{'abcdefgh'[i]}: &{'abcdefgh'[i]} [{', '.join(['*' + 'abcdefgh'[i - 1]] * 9)}]\n" for i in range(1, 8)
+)
+YAMLS = {
+    "aliases": "a: &a [x, x]\n" + ALIASES,
+    "depth": "a: " + "[" * 5000,
+    "depth of mappings": "env: " + "{a: " * 3000 + "1" + "}" * 3000,
+    "number of values": "a: [" + "1," * limits.VALUES + "]",
+    "size": "# " + "x" * limits.YAML_BYTES,
+    "tag": "env: !!set {a}",
+    "object": "env: !!python/object/apply:os.system [true]",
+    "long number": "seed: " + "9" * 5000,
+    "key": "? [a]\n: 1",
+    "null byte": "a: \0",
+    "bytes": "a: \udcff",
+}
+
+
+@pytest.mark.parametrize("case", YAMLS)
+def test_bad_yaml(case: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(YAMLS[case], errors="surrogateescape")
+    with pytest.raises(InputError) as error:
+        load_config(path)
+    assert str(error.value).startswith(str(path)) and len(str(error.value)) < 500
+
+
+def test_yaml_has_no_dates_and_values_are_shown_shortened() -> None:
+    assert parse_yaml("a: 2020-01-01", "x") == {"a": "2020-01-01"}
+    with pytest.raises(InputError) as error:
+        build(TrainConfig, {"seed": [["x" * 1000] * 1000] * 1000})
+    assert len(str(error.value)) < 500
+    with pytest.raises(InputError, match=r"set: 'x{50,}"):
+        parse_overrides(["x" * 100_000])
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[" * 33 + "]" * 33, "9" * 5000, "{", '{"a": 1} x', ""])
+def test_bad_json(text: str) -> None:
+    with pytest.raises(InputError, match=r"^x: damaged, or not JSON"):
+        parse_json(text, "x")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"evaluations": 3},
+        [],
+        {"evaluations": [{}], "absolute": None},
+        {"evaluations": [], "absolute": {"env_steps": "x"}},
+    ],
+    ids=str,
+)
+def test_evaluations_of_another_form(content: Any, tmp_path: Path) -> None:
+    (tmp_path / "evaluations.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"evaluations\.json"):
+        read_evaluations(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [os.urandom(2000), b"\0" * 100, b"env_steps,average_step_reward\n1", b"a,b\n" + b"x" * 200_000, b'"', b""],
+    ids=["random", "zeros", "short row", "long field", "quote", "empty"],
+)
+def test_bad_metrics(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"metrics\.csv"):
+        read_curve(path)
+
+
+def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
+    """The files have holes, and take no space."""
+    before = peak()
+    for read, limit in (
+        (read_curve, limits.CSV_BYTES),
+        (load_config, limits.YAML_BYTES),
+        (read_policy, limits.POLICY_BYTES),
+    ):
+        path = tmp_path / "huge"
+        with path.open("wb") as file:
+            file.truncate(limit + 1)
+        with pytest.raises(InputError, match=f"has {limit + 1} bytes; it must have at most {limit}"):
+            read(path)
+    for path in (Path("/dev/zero"), tmp_path):
+        with pytest.raises(InputError, match="not a regular file"):
+            list(read_rows(path))
+    assert peak() < before + 2**27
+
+
+def tensors(dtype: str, size: int, metadata: dict[str, str] | None = None) -> bytes:
+    """Returns a safetensors file of one tensor `a`."""
+    about: dict[str, Any] = {"a": {"dtype": dtype, "shape": [1], "data_offsets": [0, size]}}
+    header = json.dumps(about | ({} if metadata is None else {"__metadata__": metadata})).encode()
+    return struct.pack("<Q", len(header)) + header + bytes(size)
+
+
+@pytest.mark.parametrize(("dtype", "size"), [("F8_E4M3", 1), ("F4", 1), ("X", 4), ("F32", 3), ("C64", 8)])
+def test_weights_of_types_that_numpy_lacks(dtype: str, size: int, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(tensors(dtype, size))
+    try:
+        read_tensors(path, "weights")
+    except InputError as error:
+        assert str(error).startswith(f"weights {path}: damaged, or not a safetensors file")
+    with pytest.raises(InputError, match=r"w\.safetensors"):
+        read_policy(path)
+
+
+SIZES = {"agents": 1, "observation": 1, "privileged": 1, "action": 1, "values": 1}
+METADATA = [
+    *("[]", "3", "null", '{"dims": 3}', '{"dims": [1]}', '{"dims": {"agents": "x"}}', "[" * 5000, '{"config": []}'),
+    *(json.dumps({"dims": {**SIZES, "agents": value}, "config": {}}) for value in (-1, 1e300, True, None, [])),
+]
+
+
+@pytest.mark.parametrize("metadata", METADATA)
+def test_policies_with_metadata_of_another_type(metadata: str, tmp_path: Path) -> None:
+    """Also where the checksum is right."""
+    path = tmp_path / "policy.safetensors"
+    arrays = {"a": np.zeros(1, np.float32)}
+    header = {"kind": "policy", "version": str(checkpoint.VERSION), "metadata": metadata}
+    header["checksum"] = checkpoint._checksum(arrays, metadata)  # pyright: ignore[reportPrivateUsage]
+    path.write_bytes(save(arrays, {checkpoint.FORMAT: json.dumps(header)}))
+    with pytest.raises(InputError, match=r"policy\.safetensors: "):
+        read_policy(path)
+
+
+# A pickle by its opcodes: a module with the attributes that follow on the stack as a dict.
+def module(*attributes: bytes) -> bytes:
+    return b"c__torch__.x\nM\n)\x81}(" + b"".join(attributes) + b"ub"
+
+
+def named(name: str, value: bytes) -> bytes:
+    return b"X" + struct.pack("<I", len(name)) + name.encode() + value
+
+
+def tensor(size: tuple[int, ...], stride: tuple[int, ...]) -> bytes:
+    storage = b"(" + named("storage", b"ctorch\nFloatStorage\n") + named("0", named("cpu", b"K\x01t")) + b"Q"
+    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\x00" + _tuple(size) + _tuple(stride) + b"tR"
+
+
+def _tuple(values: tuple[int, ...]) -> bytes:
+    return b"(" + b"".join(b"J" + struct.pack("<i", value) for value in values) + b"t"
+
+
+def archived(data: bytes, storage: bytes = bytes(4)) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("net/data.pkl", b"\x80\x02" + data + b".")
+        archive.writestr("net/data/0", storage)
+    return file.getvalue()
+
+
+def encrypted(content: bytes) -> bytes:
+    """Sets the flag of encryption in all headers of a zip file."""
+    changed = bytearray(content)
+    for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        start = content.find(mark)
+        while start >= 0:
+            changed[start + offset] |= 1
+            start = content.find(mark, start + 1)
+    return bytes(changed)
+
+
+LINEAR = named("weight", tensor((1,), (1,)))
+ARCHIVES: dict[str, Callable[[], bytes]] = {
+    "large member": lambda: archived(module(LINEAR), bytes(limits.WEIGHTS_BYTES)),
+    "one number as a large tensor": lambda: archived(module(named("w", tensor((2**14, 2**14), (0, 0))))),
+    "many large tensors": lambda: archived(module(*(named(str(i), tensor((2**12, 2**12), (0, 0))) for i in range(9)))),
+    "negative size": lambda: archived(module(named("w", tensor((-1,), (1,))))),
+    "beyond its storage": lambda: archived(module(named("w", tensor((2,), (1,))))),
+    "module in itself": lambda: archived(b"c__torch__.x\nM\n)\x81q\x00}(" + named("a", b"h\x00") + b"ub"),
+    "module twice": lambda: archived(module(named("a", module() + b"q\x00"), named("b", b"h\x00"))),
+    "depth": lambda: archived((b"c__torch__.x\nM\n)\x81}(" + named("a", b"")) * 3000 + b"N" + b"ub" * 3000),
+    "memo": lambda: archived(b"Nr\xff\xff\xff\x7f"),
+    "class": lambda: archived(b"cos\nsystem\n(X\x04\x00\x00\x00truetR"),
+    "root": lambda: archived(b"K\x01"),
+    "truncated": lambda: archived(module(LINEAR))[:-30],
+    "encrypted": lambda: encrypted(archived(module(LINEAR))),
+    "no archive": lambda: b"hello",
+}
+
+
+def test_a_small_archive_is_read(tmp_path: Path) -> None:
+    """The opcodes of the cases below are right."""
+    (tmp_path / "good.jit").write_bytes(archived(module(LINEAR), struct.pack("<f", 3.0)))
+    assert read_torchscript(tmp_path / "good.jit") == {"weight": np.array([3.0], np.float32)}
+
+
+@pytest.mark.parametrize("case", ARCHIVES)
+def test_bad_archives(case: str, tmp_path: Path) -> None:
+    path, before = tmp_path / "bad.jit", peak()
+    path.write_bytes(ARCHIVES[case]())
+    with pytest.raises(InputError, match=r"bad\.jit: damaged, or not a TorchScript Sequential"):
+        read_torchscript(path)
+    assert peak() < before + 2**29
+    with pytest.raises(InputError, match=r"bad\.jit"):
+        load_recording(path)
