@@ -14,12 +14,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mqe_jax.appearance import HIDDEN_GROUP, STONE, WOOD, Color, bodies
+from mqe_jax.appearance.shapes import circle
 from mqe_jax.collision import GROUND_BIT, OBJECT_BIT, WALL_BIT
 from mqe_jax.limits import Coordinate, Damping, Distance, Friction, Length, Mass
 from mqe_jax.settings import record
 
 GRAVITY = 9.81  # m/s^2
-Color = tuple[float, float, float, float]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Size = tuple[Length, Length, Length]
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
@@ -65,10 +66,6 @@ def _add_joint(body: Any, suffix: str, kind: Any, damping: float = 0.0, **option
     body.add_joint(name=f"{body.name}/{suffix}", type=kind, damping=(damping, 0, 0), **options)
 
 
-def _visual_geom(body: Any, kind: Any, color: Color, **options: Any) -> None:
-    body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=2, mass=0.0, **options)
-
-
 @record
 class Box(Object):
     """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body)."""
@@ -86,7 +83,9 @@ class Box(Object):
         body = add_body(spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
         _add_joint(body, "free", _JOINT.mjJNT_FREE)
         half = np.array(self.size) / 2
-        add_solid(body, _GEOM.mjGEOM_BOX, (0.93, 0.93, 0.93, 1.0), self.friction, size=half, **_FREE)
+        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, self.friction, size=half, **_FREE)
+        if visual:
+            bodies.crate(body, half)
 
 
 @record
@@ -111,11 +110,8 @@ class Ball(Object):
         add_slides(body, "xyz", self.damping)
         _add_joint(body, "turn", _JOINT.mjJNT_BALL, self.angular_damping)
         add_solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
-        if visual:  # dark patches make the rotation visible
-            for axis in _AXES.values():
-                for side in (-1, 1):
-                    size, place = (0.5 * self.radius, 0, 0), np.array(axis) * side * 0.56 * self.radius
-                    _visual_geom(body, _GEOM.mjGEOM_SPHERE, (0.1, 0.1, 0.12, 1.0), size=size, pos=place)
+        if visual:
+            bodies.football(body, self.radius)
 
 
 @record
@@ -151,19 +147,17 @@ class Cylinder(Object):
             range=(-self.reach, self.reach),
             frictionloss=self.friction * self.mass * GRAVITY,
         )
-        white = (0.95, 0.95, 0.95, 1.0)
         add_solid(
             body,
             _GEOM.mjGEOM_CAPSULE,
-            white,
-            group=3,
+            WOOD,
+            group=HIDDEN_GROUP,
             size=(self.radius, 0, 0),
             fromto=(0, 0, 0, 0, 0, self.height),
             **_HELD,
         )
         if visual:
-            half = self.height / 2
-            _visual_geom(body, _GEOM.mjGEOM_CYLINDER, white, size=(self.radius, half, 0), pos=(0, 0, half))
+            bodies.drum(body, self.radius, self.height)
 
 
 @record
@@ -185,7 +179,10 @@ class Door(Object):
         """Adds the door."""
         body = add_body(spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
         _add_joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
-        add_solid(body, _GEOM.mjGEOM_BOX, (0.93, 0.93, 0.93, 1.0), size=np.array(self.size) / 2, **_HELD)
+        half, group = np.array(self.size) / 2, HIDDEN_GROUP if visual else 1
+        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, group=group, size=half, **_HELD)
+        if visual:
+            bodies.door(body, half)
 
 
 @record
@@ -221,21 +218,11 @@ class Seesaw(Object):
             limited=True,
             range=(-self.limit, self.limit),
         )
-        half, white = np.array(self.size) / 2, (0.95, 0.95, 0.95, 1.0)
-        add_solid(body, _GEOM.mjGEOM_BOX, white, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
+        half = np.array(self.size) / 2
+        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
         if visual:
-            x, y, z = self.hinge
-            grey = (0.55, 0.55, 0.58, 1.0)
-            for side in (-1, 1):
-                edge, post = y + side * half[1], y + side * (half[1] + 0.06)
-                _visual_geom(
-                    spec.worldbody,
-                    _GEOM.mjGEOM_CYLINDER,
-                    grey,
-                    size=(0.05, 0, 0),
-                    fromto=(x, edge, z, x, edge + side * 0.08, z),
-                )
-                _visual_geom(spec.worldbody, _GEOM.mjGEOM_BOX, grey, size=(0.05, 0.02, z / 2), pos=(x, post, z / 2))
+            bodies.plank(body, half, -self.behind)
+            bodies.trestle(spec.worldbody, self.hinge, half[1])
 
 
 @record
@@ -253,14 +240,14 @@ class Platform(Object):
         """Adds the block."""
         x, y, top = self.center
         body = spec.worldbody.add_body(name=name, pos=(x, y, top - self.size[2] / 2))
-        add_solid(body, _GEOM.mjGEOM_BOX, (0.95, 0.95, 0.95, 1.0), size=np.array(self.size) / 2, **_FLOOR)
+        add_solid(body, _GEOM.mjGEOM_BOX, STONE, size=np.array(self.size) / 2, **_FLOOR)
         if not self.column:
             return
         foot = top - self.size[2]
         body.add_geom(
             name=f"{name}/column",
             type=_GEOM.mjGEOM_CAPSULE,
-            group=3,
+            group=HIDDEN_GROUP,
             mass=0.0,
             condim=3,
             priority=1,
@@ -270,13 +257,7 @@ class Platform(Object):
             fromto=(0, 0, -top + self.size[2] / 2, 0, 0, -self.size[2] / 2 - self.column),
         )
         if visual:
-            _visual_geom(
-                spec.worldbody,
-                _GEOM.mjGEOM_CYLINDER,
-                (0.75, 0.75, 0.78, 1.0),
-                size=(self.column, foot / 2, 0),
-                pos=(x, y, foot / 2),
-            )
+            bodies.column(spec.worldbody, self.column, (x, y, foot))
 
 
 @record
@@ -291,21 +272,12 @@ class Ring(Object):
     """Width of the line, m."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the line as short visual segments."""
+        """Adds the line."""
         body = spec.worldbody.add_body(name=name, pos=self.center)
         if not visual:
             return
-        pieces = 72
-        half = np.pi * self.radius / pieces * 1.05
-        for angle in np.arange(pieces) * 2 * np.pi / pieces:
-            _visual_geom(
-                body,
-                _GEOM.mjGEOM_BOX,
-                (0.2, 0.2, 0.22, 1.0),
-                size=(self.width / 2, half, 0.004),
-                pos=(self.radius * np.cos(angle), self.radius * np.sin(angle), 0.0),
-                quat=(np.cos(angle / 2), 0, 0, np.sin(angle / 2)),
-            )
+        for part in circle((0.0, 0.0), self.radius, width=self.width):
+            part.add(body)
 
 
 @record
@@ -326,23 +298,14 @@ class Sheep(Object):
         """Adds the sheep: a capsule whose lower end is below the ground, so that it is cylindrical at ground level."""
         body = add_body(spec, name, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
         add_slides(body, "xy")
-        fleece = (0.96, 0.95, 0.90, 1.0)
         add_solid(
             body,
             _GEOM.mjGEOM_CAPSULE,
-            fleece,
-            group=3 if visual else 1,
+            STONE,
+            group=HIDDEN_GROUP if visual else 1,
             size=(self.radius, 0, 0),
             fromto=(0, 0, 0, 0, 0, self.height - self.radius),
             **_HELD,
         )
         if visual:
-            dark, top, wide = (0.16, 0.14, 0.13, 1.0), self.height, self.radius
-            body_size, head_size = (wide, 0.75 * wide, 0.32 * top), (0.45 * wide, 0.3 * wide, 0.3 * wide)
-            _visual_geom(body, _GEOM.mjGEOM_ELLIPSOID, fleece, size=body_size, pos=(0, 0, 0.62 * top))
-            _visual_geom(body, _GEOM.mjGEOM_SPHERE, fleece, size=(0.35 * wide, 0, 0), pos=(0.85 * wide, 0, 0.92 * top))
-            _visual_geom(body, _GEOM.mjGEOM_ELLIPSOID, dark, size=head_size, pos=(1.15 * wide, 0, 0.82 * top))
-            for x in (-0.5 * wide, 0.5 * wide):
-                for y in (-0.35 * wide, 0.35 * wide):
-                    leg = (x, y, 0.02, x, y, 0.4 * top)
-                    _visual_geom(body, _GEOM.mjGEOM_CAPSULE, dark, size=(0.12 * wide, 0, 0), fromto=leg)
+            bodies.sheep(body, self.radius, self.height)

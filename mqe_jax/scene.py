@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax import robots
+from mqe_jax.appearance.light import add_light
 from mqe_jax.collision import MAX_ROBOTS
 from mqe_jax.errors import InputError
 from mqe_jax.objects import Object
@@ -35,7 +36,7 @@ class Scene:
     objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
     """Movable and fixed objects by name, added after the robots as bodies `object/<name>`."""
     colors: tuple[int, ...] = ()
-    """Colours of the robots, as indices of `mqe_jax.robots.build.COLORS`; in order if empty."""
+    """Colours of the robots, as indices of `mqe_jax.appearance.ROBOT_COLORS`; in order if empty."""
     friction: float = 1.0
     """Sliding friction of the robots' collision geoms and the ground."""
     torque_robots: int = 0
@@ -151,17 +152,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
         item.add(spec, f"object/{name}", visual)
     robots.add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
     if visual:
-        spec.worldbody.add_light(
-            pos=(scene.track.length / 2, 0, 8),
-            dir=(0.2, 0.3, -1),
-            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            castshadow=True,
-            diffuse=(0.6, 0.6, 0.6),
-        )
-        spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
-        spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
-        spec.visual.quality.shadowsize = 4096
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
+        add_light(spec, (scene.track.length / 2, 0, 8))
     return spec, layout
 
 

@@ -14,14 +14,14 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from mqe_jax.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SITE_GROUP
+from mqe_jax.appearance.shapes import Ground
+from mqe_jax.appearance.walls import WALL_COLOR, WALL_GROUP, Style, gate_wall, side_wall
 from mqe_jax.collision import GROUND_BIT, WALL_BIT
 from mqe_jax.errors import InputError
 
 # A block parameter that may be a pair (easy, hard), interpolated by the track's difficulty in [0, 1].
 Ranged = float | tuple[float, float]
-
-WALL_COLOR = (0.17, 0.17, 0.2, 1.0)
-FLOOR_COLOR = (0.69, 0.69, 0.77, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -241,6 +241,10 @@ class Track:
     """Perlin-noise ground, or None for a flat floor."""
     walled: bool = True
     """Whether there are side walls."""
+    style: Style = "boards"
+    """Look of the walls."""
+    ground: Ground = dataclasses.field(default_factory=Ground)
+    """Look of the ground."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.difficulty <= 1.0:
@@ -282,6 +286,8 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
     layout = track.layout()
     world, solid = spec.worldbody, {"contype": WALL_BIT, "conaffinity": 0}
     _add_ground(spec, track)
+    if visual:
+        track.ground.add(world)
     for barrier in layout.barriers:
         normal = np.array([*barrier.normal, 0.0])
         world.add_geom(
@@ -290,23 +296,14 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             size=(0, 0, 1),
             pos=(*barrier.point, 0.0),
             zaxis=normal,
-            group=3,
+            group=HIDDEN_GROUP,
             **solid,
         )
         if visual:
             half = (track.wall_thickness / 2, barrier.length / 2 + track.wall_thickness, track.wall_height / 2)
             center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
             yaw = np.arctan2(normal[1], normal[0])
-            world.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=half,
-                pos=center,
-                rgba=WALL_COLOR,
-                contype=0,
-                conaffinity=0,
-                quat=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
-                group=1,
-            )
+            side_wall(world, track.style, center, half, float(yaw))
     for wall in layout.walls:
         half = np.array(wall.size) / 2
         if wall.anchor is None:
@@ -321,14 +318,20 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             size=half,
             pos=position,
             rgba=WALL_COLOR,
-            group=1,
+            group=HIDDEN_GROUP if visual and track.style == "fence" else WALL_GROUP,
             **solid,
         )
+        if visual and wall.anchor is not None:
+            inner = -np.sign(wall.center[1])
+            gate_wall(body, track.style, half, inner)
+            for name, z in (("bottom", -half[2]), ("top", half[2])):
+                place = (0, inner * half[1], z)
+                body.add_site(name=f"{GOAL_SITE}/{wall.name}/{name}", pos=place, group=SITE_GROUP)
     return layout
 
 
 def _add_ground(spec: mujoco.MjSpec, track: Track) -> None:
-    ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": FLOOR_COLOR, "group": 0}
+    ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": track.ground.color, "group": GROUND_GROUP}
     if track.rough is None:
         spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
         return

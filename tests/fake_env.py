@@ -30,10 +30,10 @@ ROBOT = (
 XML = f"""<mujoco><worldbody>
 <geom type="plane" size="0 0 1"/>
 <geom type="plane" size="0 0 1" pos="0 0 0" zaxis="1 0 0" group="3"/>
-<geom type="box" pos="0 0 .25" size=".02 1.5 .25"/>
-<geom type="box" pos="4 0 .25" size=".02 1.5 .25"/>
-<body name="left" mocap="true" pos="2 1.4 .25"><geom type="box" size=".05 1 .25"/></body>
-<body name="right" mocap="true" pos="2 -1.4 .25"><geom type="box" size=".05 1 .25"/></body>
+<geom type="box" pos="0 0 .25" size=".02 1.5 .25" group="1"/>
+<geom type="box" pos="4 0 .25" size=".02 1.5 .25" group="1"/>
+<body name="left" mocap="true" pos="2 1.4 .25"><geom type="box" size=".05 1 .25" group="1"/></body>
+<body name="right" mocap="true" pos="2 -1.4 .25"><geom type="box" size=".05 1 .25" group="1"/></body>
 {ROBOT.format(robot="a", y=-0.5, rgba="0 0 1 1")}{ROBOT.format(robot="b", y=0.5, rgba="0 1 0 1")}
 </worldbody></mujoco>"""
 

@@ -17,7 +17,8 @@ from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Pixels
 from mqe_jax.settings import check
-from mqe_jax.viz.cameras import Camera, default_camera
+from mqe_jax.viz.cameras import default_camera
+from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.geometry import rendering_model
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.render import render_frames

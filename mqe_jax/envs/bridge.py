@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.envs.state import Moment, State
@@ -96,7 +97,10 @@ class Go1Bridge(Duel[None, BridgeParams]):
         middle = (*self.center, params.top)
         span = second - first - length
         objects["deck"] = Platform(center=middle, size=(span, params.bridge_width, params.bridge_thickness))
-        track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(8.0)), width=6.0, walled=False)
+        ends = (first + length / 2, second - length / 2)
+        ground = grounds.river(params.platform_x, ends, (length, width, params.bridge_width), params.top)
+        blocks = (SpawnArea(2.0, back_wall=False), Plane(8.0))
+        track = Track(blocks=blocks, width=6.0, walled=False, ground=ground)
         return Scene(track, num_robots=2, objects=objects, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:

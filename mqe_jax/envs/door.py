@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
@@ -79,12 +80,12 @@ class Go1RevolvingDoor(Duel[None, DoorParams]):
         params = self.params
         wall = Gate(_WALL_LENGTH, width=params.gap)
         blocks = (SpawnArea(params.door.position[0] - _WALL_LENGTH / 2), wall, Plane(2.5), EndWall())
-        return Scene(
-            Track(blocks=blocks, width=params.track_width, wall_height=0.85),
-            num_robots=2,
-            objects={"door": params.door},
-            colors=(0, 2),
-        )
+        colors, half = (0, 2), params.track_width / 2
+        marks = (*grounds.pads(self.spawn_poses(), colors), *grounds.finish(params.line_x, (-half, half)))
+        length = params.door.position[0] + 3.0
+        ground = grounds.track(length, params.track_width, 2, marks, grounds.COURT)
+        track = Track(blocks=blocks, width=params.track_width, wall_height=0.85, ground=ground)
+        return Scene(track, num_robots=2, objects={"door": params.door}, colors=colors)
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Side by side in front of the door."""

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
@@ -84,6 +85,11 @@ class Football(QuadrupedEnv[S, F]):
             blocks=(SpawnArea(1.0), goal, Plane(length), goal, EndWall()),
             width=params.field_width,
             wall_height=params.wall_height,
+            ground=grounds.pitch(
+                (float(GOALS[1, 0]), float(GOALS[0, 0])),
+                params.field_width,
+                (params.goal_width, params.wall_height, _GOAL_DEPTH),
+            ),
         )
         robots = len(self.kick_off)
         return Scene(track, num_robots=robots, objects={"ball": params.ball}, colors=self.colors)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
@@ -81,8 +82,10 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
     def scene(self) -> Scene:
         params = self.params
         gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
-        track = Track(blocks=(SpawnArea(2.0), gate, Plane(1.0), EndWall()), width=params.track_width)
-        return Scene(track, num_robots=2)
+        blocks = (SpawnArea(2.0), gate, Plane(1.0), EndWall())
+        targets = [(params.target_x, side * params.target_y, 0.0) for side in (1, -1)]
+        ground = grounds.track(6.0, params.track_width, 4, grounds.pads(targets, (0, 1)))
+        return Scene(Track(blocks=blocks, width=params.track_width, ground=ground), num_robots=2)
 
     @property
     def observation_layout(self) -> ObservationLayout:

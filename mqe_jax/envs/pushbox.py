@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
@@ -109,7 +110,10 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     def scene(self) -> Scene:
         params = self.params
         gate = Gate(_GATE_LENGTH, width=params.gate_width, depth=_GATE_DEPTH, random=params.gate_random)
-        track = Track(blocks=(SpawnArea(_SPAWN_LENGTH), gate, EndWall()), width=params.track_width)
+        blocks = (SpawnArea(_SPAWN_LENGTH), gate, EndWall())
+        length, goal_x = _SPAWN_LENGTH + _GATE_LENGTH, _SPAWN_LENGTH + _GATE_LENGTH / 2
+        ground = grounds.warehouse(length, params.track_width, goal_x)
+        track = Track(blocks=blocks, width=params.track_width, ground=ground)
         return Scene(track, num_robots=2, objects={"box": params.box})
 
     def reset_objects(

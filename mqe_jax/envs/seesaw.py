@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
@@ -87,7 +88,9 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
 
     def scene(self) -> Scene:
         params = self.params
-        track = Track(blocks=(SpawnArea(2.0), Plane(8.0), EndWall()), width=params.track_width)
+        blocks = (SpawnArea(2.0), Plane(8.0), EndWall())
+        ground = grounds.climb(10.0, params.track_width, params.platform.center, params.platform.size)
+        track = Track(blocks=blocks, width=params.track_width, ground=ground)
         # Plank and platform use the ground's collision bits.
         return Scene(track, num_robots=2, objects={"seesaw": params.plank, "platform": params.platform})
 

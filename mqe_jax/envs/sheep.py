@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
@@ -122,7 +123,9 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         before, middle, behind = params.lengths
         spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_spacing)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
-        track = Track(blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()), width=params.track_width)
+        blocks = (spawn, Plane(middle), gate, Plane(behind), EndWall())
+        ground = grounds.meadow(before + middle + behind + 1.0, params.track_width, before + middle + 0.5)
+        track = Track(blocks=blocks, width=params.track_width, style="fence", ground=ground)
         flock = {f"sheep{number}": Sheep() for number in range(self.num_sheep)}
         return Scene(track, num_robots=2, objects=flock)
 

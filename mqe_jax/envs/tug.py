@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
@@ -95,7 +96,8 @@ class Go1Tug(Duel[TugState, TugParams]):
     def scene(self) -> Scene:
         cylinder = self.params.cylinder
         length, width = 2 * (cylinder.x - _START_X), 2 * (cylinder.reach + cylinder.radius)
-        track = Track(blocks=(Plane(_START_X), SpawnArea(length), EndWall()), width=width)
+        ground = grounds.halves((_START_X, _START_X + length), (-width / 2, width / 2))
+        track = Track(blocks=(Plane(_START_X), SpawnArea(length), EndWall()), width=width, ground=ground)
         return Scene(track, num_robots=2, objects={"cylinder": cylinder}, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:

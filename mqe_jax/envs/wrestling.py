@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.appearance import grounds
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.envs.state import Moment, State
@@ -89,7 +90,9 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
     def scene(self) -> Scene:
         params = self.params
         ring = Ring(center=params.platform.center, radius=params.ring_radius)
-        track = Track(blocks=(SpawnArea(2.0, back_wall=False), Plane(4.2)), width=6.0, walled=False)
+        ground = grounds.dohyo(params.platform.center, params.platform.size, params.ring_radius)
+        blocks = (SpawnArea(2.0, back_wall=False), Plane(4.2))
+        track = Track(blocks=blocks, width=6.0, walled=False, ground=ground)
         return Scene(track, num_robots=2, objects={"platform": params.platform, "ring": ring}, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:

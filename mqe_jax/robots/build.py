@@ -6,16 +6,9 @@ from typing import Any
 
 import mujoco
 
+from mqe_jax.appearance import HIDDEN_GROUP, ROBOT_COLORS, VISUAL_GROUP
 from mqe_jax.collision import robot_bits
-from mqe_jax.robots.robot import JOINT_NAMES, JOINTS, LEGS, Color, Link, Primitive, Robot
-
-# Robot colours by agent: 1 blue, 2 green, 3 red, 4 orange.
-COLORS: tuple[Color, ...] = (
-    (0.13, 0.59, 0.95, 1.0),
-    (0.36, 0.80, 0.26, 1.0),
-    (0.93, 0.28, 0.20, 1.0),
-    (0.98, 0.60, 0.12, 1.0),
-)
+from mqe_jax.robots.robot import JOINT_NAMES, JOINTS, LEGS, Link, Primitive, Robot
 
 _GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -73,9 +66,9 @@ def build_robot(
         friction: sliding friction of its collision geoms, which takes precedence over the other geom's.
         torque_control: actuators take torques (N m) instead of PD joint targets (rad).
         joint_mechanics: whether its joints have rotor inertia, damping and dry friction.
-        color: index of its colour in `COLORS`; `number` if None.
+        color: index of its colour in `ROBOT_COLORS`; `number` if None.
     """
-    agent_color = COLORS[(number if color is None else color) % len(COLORS)]
+    agent_color = ROBOT_COLORS[(number if color is None else color) % len(ROBOT_COLORS)]
     shapes = robot.shapes(contacts)
     contype, conaffinity = robot_bits(number)
     spec = mujoco.MjSpec()
@@ -91,7 +84,7 @@ def build_robot(
                     name=f"{leg}{shape.name}",
                     contype=contype,
                     conaffinity=conaffinity,
-                    group=3,
+                    group=HIDDEN_GROUP,
                     condim=3,
                     priority=2,
                     friction=(friction, 0.005, 0.0001),
@@ -103,7 +96,7 @@ def build_robot(
         for visual_shape in robot.visuals if visual else ():
             if visual_shape.link == link:
                 rgba = visual_shape.tinted(agent_color)
-                _add_geom(body, visual_shape.primitive, left, rgba=rgba, contype=0, conaffinity=0, group=2)
+                _add_geom(body, visual_shape.primitive, left, rgba=rgba, contype=0, conaffinity=0, group=VISUAL_GROUP)
 
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, robot.stand_height))
     trunk.add_freejoint(name="base")

@@ -24,9 +24,11 @@ from mqe_jax.robots.robot import (
 _CALF = Link(0.1580, (0.0063, -0.0013, -0.1223), (3.608e-3, 3.627e-3, 3.51e-5, 0.0, -1.33e-4, 0.0))
 _FOOT = Link(0.0600, (0.0, 0.0, 0.0), (9.6e-6, 9.6e-6, 9.6e-6, 0.0, 0.0, 0.0))
 
-_DARK = (0.13, 0.14, 0.16, 1.0)
-_GREY = (0.32, 0.34, 0.37, 1.0)
-_WHITE = (0.9, 0.95, 1.0, 1.0)
+_BLACK = (0.06, 0.06, 0.08, 1.0)
+_DARK = (0.19, 0.20, 0.23, 1.0)
+_GREY = (0.36, 0.38, 0.42, 1.0)
+_SILVER = (0.68, 0.70, 0.74, 1.0)
+_LIGHT = (0.70, 0.95, 1.0, 1.0)
 
 # Trunk box 0.376 x 0.094 x 0.114 and the head box 0.27 ahead of its centre as one capsule, wide enough to leave at most
 # 2 cm of their edges outside; hip cylinders r 0.046; thigh boxes 0.034 x 0.0245; calf boxes 0.016 x 0.016; feet.
@@ -39,28 +41,44 @@ _COLLISION = (
 )
 
 _VISUALS = (
-    VisualShape("trunk", box((0.155, 0.052, 0.048), (0.0, 0, 0.012)), tint=1.0),
-    VisualShape("trunk", ellipsoid((0.2, 0.056, 0.05), (0.0, 0, 0.024)), tint=1.0),
-    VisualShape("trunk", box((0.145, 0.045, 0.03), (0, 0, -0.03)), _DARK),
-    # Housings of the hip motors.
-    VisualShape("trunk", box((0.035, 0.075, 0.042), (0.188, 0, 0)), _DARK),
-    VisualShape("trunk", box((0.035, 0.075, 0.042), (-0.188, 0, 0)), _DARK),
-    # Neck, head, face and eyes.
-    VisualShape("trunk", capsule(0.03, (0.2, 0, 0.02), (0.255, 0, 0.028)), _DARK),
-    VisualShape("trunk", box((0.03, 0.046, 0.032), (0.275, 0, 0.034)), tint=1.0),
-    VisualShape("trunk", box((0.006, 0.04, 0.024), (0.304, 0, 0.034)), _DARK),
-    VisualShape("trunk", sphere(0.009, (0.309, 0.022, 0.04)), _WHITE),
-    VisualShape("trunk", sphere(0.009, (0.309, -0.022, 0.04)), _WHITE),
-    # Rails along the back.
-    VisualShape("trunk", capsule(0.008, (-0.13, 0.035, 0.068), (0.13, 0.035, 0.068)), _DARK),
-    VisualShape("trunk", capsule(0.008, (-0.13, -0.035, 0.068), (0.13, -0.035, 0.068)), _DARK),
-    VisualShape("hip", cylinder(0.043, (0, 0.03, 0), (0, 0.075, 0)), _GREY),
-    VisualShape("thigh", cylinder(0.04, (0, -0.022, 0), (0, 0.02, 0)), tint=1.0),
-    VisualShape("thigh", capsule(0.022, (0, 0, -0.02), (-0.012, 0, -0.11)), _DARK),
-    VisualShape("thigh", capsule(0.017, (-0.012, 0, -0.11), (0, 0, -0.213)), _DARK),
-    VisualShape("calf", capsule(0.013, (0, 0, 0), (0.008, 0, -0.1)), _GREY),
-    VisualShape("calf", capsule(0.01, (0.008, 0, -0.1), (0, 0, -0.213)), _GREY),
-    VisualShape("calf", sphere(0.02, (0, 0, -0.213)), _DARK),
+    # Shell with rounded edges in the agent's colour, dark belly.
+    VisualShape("trunk", box((0.15, 0.034, 0.052), (0.0, 0, 0.01)), tint=1.0),
+    VisualShape("trunk", capsule(0.024, (-0.145, 0.034, 0.038), (0.145, 0.034, 0.038)), tint=1.0),
+    VisualShape("trunk", capsule(0.024, (-0.145, -0.034, 0.038), (0.145, -0.034, 0.038)), tint=1.0),
+    VisualShape("trunk", box((0.152, 0.058, 0.026), (0.0, 0, 0.012)), tint=1.0),
+    VisualShape("trunk", box((0.125, 0.0595, 0.010), (0.0, 0, 0.006)), _SILVER),
+    VisualShape("trunk", box((0.155, 0.05, 0.024), (0, 0, -0.034)), _DARK),
+    # Motors of the hips, which close the trunk in front and behind.
+    VisualShape("trunk", cylinder(0.044, (0.148, 0.047, 0.0), (0.222, 0.047, 0.0)), _DARK),
+    VisualShape("trunk", cylinder(0.044, (0.148, -0.047, 0.0), (0.222, -0.047, 0.0)), _DARK),
+    VisualShape("trunk", cylinder(0.044, (-0.148, 0.047, 0.0), (-0.222, 0.047, 0.0)), _DARK),
+    VisualShape("trunk", cylinder(0.044, (-0.148, -0.047, 0.0), (-0.222, -0.047, 0.0)), _DARK),
+    VisualShape("trunk", box((0.03, 0.04, 0.034), (-0.186, 0, 0.014)), tint=1.0),
+    # Rails and handle on the back.
+    VisualShape("trunk", capsule(0.006, (-0.12, 0.026, 0.066), (0.12, 0.026, 0.066)), _DARK),
+    VisualShape("trunk", capsule(0.006, (-0.12, -0.026, 0.066), (0.12, -0.026, 0.066)), _DARK),
+    VisualShape("trunk", box((0.045, 0.02, 0.006), (-0.06, 0, 0.064)), _SILVER),
+    # Neck and head: angular snout, dark face with two cameras and a light below.
+    VisualShape("trunk", box((0.05, 0.036, 0.03), (0.2, 0, 0.016)), tint=1.0),
+    VisualShape("trunk", capsule(0.032, (0.235, 0.014, 0.034), (0.275, 0.014, 0.036)), tint=1.0),
+    VisualShape("trunk", capsule(0.032, (0.235, -0.014, 0.034), (0.275, -0.014, 0.036)), tint=1.0),
+    VisualShape("trunk", ellipsoid((0.022, 0.047, 0.035), (0.296, 0, 0.032)), _BLACK),
+    VisualShape("trunk", cylinder(0.013, (0.29, 0.021, 0.038), (0.315, 0.021, 0.038)), _SILVER),
+    VisualShape("trunk", cylinder(0.013, (0.29, -0.021, 0.038), (0.315, -0.021, 0.038)), _SILVER),
+    VisualShape("trunk", cylinder(0.0095, (0.29, 0.021, 0.038), (0.316, 0.021, 0.038)), _BLACK),
+    VisualShape("trunk", cylinder(0.0095, (0.29, -0.021, 0.038), (0.316, -0.021, 0.038)), _BLACK),
+    VisualShape("trunk", capsule(0.003, (0.312, 0.012, 0.014), (0.312, -0.012, 0.014)), _LIGHT),
+    # Legs: round covers in the agent's colour, tapered thighs, slim shanks, dark feet.
+    VisualShape("hip", cylinder(0.044, (0, 0.028, 0), (0, 0.062, 0)), _SILVER),
+    VisualShape("hip", cylinder(0.036, (0, 0.02, 0), (0, 0.075, 0)), _DARK),
+    VisualShape("thigh", cylinder(0.043, (0, -0.02, 0), (0, 0.019, 0)), tint=1.0),
+    VisualShape("thigh", cylinder(0.024, (0, 0.019, 0), (0, 0.024, 0)), _SILVER),
+    VisualShape("thigh", ellipsoid((0.03, 0.017, 0.085), (-0.004, 0, -0.075)), tint=0.85),
+    VisualShape("thigh", capsule(0.016, (-0.008, 0, -0.1), (0, 0, -0.213)), _GREY),
+    VisualShape("thigh", cylinder(0.021, (0, -0.017, -0.213), (0, 0.017, -0.213)), _DARK),
+    VisualShape("calf", capsule(0.012, (0, 0, 0), (0.012, 0, -0.09)), _GREY),
+    VisualShape("calf", capsule(0.009, (0.012, 0, -0.09), (0, 0, -0.205)), _SILVER),
+    VisualShape("calf", sphere(0.021, (0, 0, -0.213)), _BLACK),
 )
 
 GO1 = Robot(

@@ -29,8 +29,9 @@ _FOOT = (-0.002, 0, -0.213)
 
 _WHITE = (0.88, 0.89, 0.90, 1.0)
 _GREY = (0.62, 0.64, 0.66, 1.0)
-_DARK = (0.10, 0.11, 0.12, 1.0)
-_LIGHT = (0.75, 0.95, 1.0, 1.0)
+_BLACK = (0.05, 0.05, 0.07, 1.0)
+_DARK = (0.17, 0.18, 0.20, 1.0)
+_LIGHT = (0.70, 0.95, 1.0, 1.0)
 
 # As on the Go1: one capsule for trunk box and head cylinder, which leaves at most 2 cm of their edges outside. One
 # capsule follows the bent shank.
@@ -43,33 +44,38 @@ _COLLISION = (
 )
 
 _VISUALS = (
-    # Rounded light shell with a stripe along the back in the agent's colour.
-    VisualShape("trunk", ellipsoid((0.235, 0.072, 0.062), (0.0, 0, 0.012)), _WHITE, tint=0.25),
-    VisualShape("trunk", box((0.15, 0.058, 0.045), (0.0, 0, 0.008)), _WHITE, tint=0.25),
-    VisualShape("trunk", ellipsoid((0.19, 0.03, 0.022), (-0.01, 0, 0.062)), tint=1.0),
-    VisualShape("trunk", box((0.14, 0.046, 0.03), (0, 0, -0.032)), _DARK),
-    # Housings of the hip motors.
-    VisualShape("trunk", cylinder(0.044, (0.16, 0.045, 0), (0.225, 0.045, 0)), _GREY),
-    VisualShape("trunk", cylinder(0.044, (0.16, -0.045, 0), (0.225, -0.045, 0)), _GREY),
-    VisualShape("trunk", cylinder(0.044, (-0.16, 0.045, 0), (-0.225, 0.045, 0)), _GREY),
-    VisualShape("trunk", cylinder(0.044, (-0.16, -0.045, 0), (-0.225, -0.045, 0)), _GREY),
-    # Rounded head, dark face, light bar, and the dome of the lidar under the chin.
-    VisualShape("trunk", ellipsoid((0.065, 0.052, 0.043), (0.258, 0, 0.034)), _WHITE, tint=0.25),
-    VisualShape("trunk", box((0.022, 0.04, 0.03), (0.285, 0, 0.034)), _WHITE, tint=0.25),
-    VisualShape("trunk", ellipsoid((0.022, 0.05, 0.033), (0.308, 0, 0.034)), _DARK),
-    VisualShape("trunk", capsule(0.005, (0.326, -0.022, 0.046), (0.326, 0.022, 0.046)), _LIGHT),
-    VisualShape("trunk", cylinder(0.031, (0.292, 0, -0.012), (0.292, 0, 0.004)), _GREY),
-    VisualShape("trunk", sphere(0.031, (0.292, 0, -0.014)), _DARK),
+    # A stripe along the back and panels on the flanks in the agent's colour, on a rounded light shell.
+    VisualShape("trunk", ellipsoid((0.19, 0.034, 0.022), (-0.01, 0, 0.058)), tint=1.0),
+    VisualShape("trunk", ellipsoid((0.15, 0.0745, 0.034), (0.0, 0, 0.016)), tint=1.0),
+    VisualShape("trunk", box((0.16, 0.034, 0.056), (0.0, 0, 0.006)), _WHITE, tint=0.1),
+    VisualShape("trunk", capsule(0.03, (-0.155, 0.036, 0.032), (0.155, 0.036, 0.032)), _WHITE, tint=0.1),
+    VisualShape("trunk", capsule(0.03, (-0.155, -0.036, 0.032), (0.155, -0.036, 0.032)), _WHITE, tint=0.1),
+    VisualShape("trunk", box((0.165, 0.06, 0.024), (0.0, 0, 0.01)), _WHITE, tint=0.1),
+    VisualShape("trunk", box((0.14, 0.05, 0.026), (0, 0, -0.034)), _DARK),
+    # Motors of the hips.
+    VisualShape("trunk", cylinder(0.045, (0.155, 0.047, 0), (0.228, 0.047, 0)), _GREY),
+    VisualShape("trunk", cylinder(0.045, (0.155, -0.047, 0), (0.228, -0.047, 0)), _GREY),
+    VisualShape("trunk", cylinder(0.045, (-0.155, 0.047, 0), (-0.228, 0.047, 0)), _GREY),
+    VisualShape("trunk", cylinder(0.045, (-0.155, -0.047, 0), (-0.228, -0.047, 0)), _GREY),
+    VisualShape("trunk", box((0.03, 0.045, 0.036), (-0.19, 0, 0.014)), _WHITE, tint=0.1),
+    # Rounded head, dark face with a ring of light and a camera, and the dome of the lidar under the chin.
+    VisualShape("trunk", capsule(0.036, (0.2, 0.01, 0.026), (0.272, 0.01, 0.034)), _WHITE, tint=0.1),
+    VisualShape("trunk", capsule(0.036, (0.2, -0.01, 0.026), (0.272, -0.01, 0.034)), _WHITE, tint=0.1),
+    VisualShape("trunk", ellipsoid((0.03, 0.041, 0.032), (0.29, 0, 0.034)), _LIGHT),
+    VisualShape("trunk", ellipsoid((0.033, 0.036, 0.027), (0.291, 0, 0.034)), _BLACK),
+    VisualShape("trunk", sphere(0.009, (0.318, 0, 0.038)), _GREY),
+    VisualShape("trunk", cylinder(0.03, (0.288, 0, -0.014), (0.288, 0, 0.0)), _GREY),
+    VisualShape("trunk", sphere(0.03, (0.288, 0, -0.014)), _DARK),
     # Slim legs: round thigh motor in the agent's colour, light thigh and shank, dark foot.
-    VisualShape("hip", cylinder(0.04, (0, 0.035, 0), (0, 0.08, 0)), _GREY),
-    VisualShape("thigh", cylinder(0.044, (0, -0.02, 0), (0, 0.022, 0)), tint=1.0),
+    VisualShape("hip", cylinder(0.042, (0, 0.035, 0), (0, 0.075, 0)), _GREY),
+    VisualShape("thigh", cylinder(0.045, (0, -0.02, 0), (0, 0.022, 0)), tint=1.0),
     VisualShape("thigh", cylinder(0.03, (0, 0.022, 0), (0, 0.027, 0)), _WHITE),
-    VisualShape("thigh", capsule(0.02, (0, 0, -0.02), (-0.016, 0, -0.1)), _WHITE),
-    VisualShape("thigh", capsule(0.015, (-0.016, 0, -0.1), (0, 0, -0.213)), _WHITE),
-    VisualShape("calf", sphere(0.017, (0, 0, 0)), _DARK),
-    VisualShape("calf", capsule(0.009, (0, 0, 0), (0.014, 0, -0.12)), _GREY),
-    VisualShape("calf", capsule(0.008, (0.014, 0, -0.12), _FOOT), _GREY),
-    VisualShape("calf", sphere(0.022, _FOOT), _DARK),
+    VisualShape("thigh", ellipsoid((0.027, 0.016, 0.08), (-0.008, 0, -0.075)), _WHITE, tint=0.1),
+    VisualShape("thigh", capsule(0.015, (-0.012, 0, -0.1), (0, 0, -0.213)), _WHITE, tint=0.1),
+    VisualShape("calf", cylinder(0.02, (0, -0.017, 0), (0, 0.017, 0)), _DARK),
+    VisualShape("calf", capsule(0.011, (0, 0, 0), (0.014, 0, -0.12)), _GREY),
+    VisualShape("calf", capsule(0.009, (0.014, 0, -0.12), _FOOT), _GREY),
+    VisualShape("calf", sphere(0.023, _FOOT), _BLACK),
 )
 
 GO2 = Robot(

@@ -10,11 +10,11 @@ import numpy as np
 import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
+from mqe_jax.appearance import GROUND_GROUP
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
-_FLOOR = (0.69, 0.69, 0.77)
 _PLANES = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
@@ -96,7 +96,8 @@ class Stage:
     def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
         side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self._offset[-1, 1]) + 4.0]
         middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
-        colour = tuple(round(255 * c) for c in _FLOOR)
+        floor = np.flatnonzero(np.isin(self._model.geom_type, _PLANES) & (self._model.geom_group == GROUND_GROUP))[0]
+        colour = tuple(round(255 * float(c)) for c in self._model.geom_rgba[floor, :3])
         self._server.scene.add_box(
             "/world/floor", color=colour, dimensions=(*side, 0.02), position=(*middle, -0.012), cast_shadow=False
         )

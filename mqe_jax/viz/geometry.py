@@ -5,9 +5,10 @@ import copy
 import mujoco
 import numpy as np
 
+from mqe_jax.appearance import GROUND_GROUP, HIDDEN_GROUP
 from mqe_jax.viz.recording import Episode
 
-COLLISION_GROUP = 3
+COLLISION_GROUP = HIDDEN_GROUP
 
 
 def robot_bases(model: mujoco.MjModel) -> list[int]:
@@ -58,14 +59,21 @@ def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.nda
     return data.geom_xpos[geom] + (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
 
 
+def body_corners(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
+    """Returns the corners (8, 3) of the box along the world's axes about a body's visible geoms, m."""
+    geoms = model.body_geomadr[body] + np.arange(model.body_geomnum[body])
+    shown = [int(geom) for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
+    corners = np.concatenate([box_corners(model, data, geom) for geom in shown] or [data.xpos[body : body + 1]])
+    return np.array(np.meshgrid(*zip(corners.min(axis=0), corners.max(axis=0), strict=True))).reshape(3, -1).T
+
+
 def scenery_geoms(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the visible geoms that are neither ground nor part of a robot."""
+    """Returns the ids of the visible geoms that are neither ground, with what is painted on it, nor part of a robot."""
     robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
     return [
         geom
         for geom in range(model.ngeom)
-        if int(model.geom_type[geom]) not in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-        and int(model.geom_group[geom]) != COLLISION_GROUP
+        if int(model.geom_group[geom]) not in (GROUND_GROUP, COLLISION_GROUP)
         and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots
     ]
 

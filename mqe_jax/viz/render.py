@@ -13,12 +13,15 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
+from mqe_jax.appearance import GROUND_GROUP
+from mqe_jax.appearance.light import GROUND_MATERIAL
 from mqe_jax.errors import InputError
 from mqe_jax.interrupts import child
 from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
 from mqe_jax.settings import PathText, checked
-from mqe_jax.viz.cameras import Camera, cameras
+from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
+from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.top_view import draw_top
@@ -60,21 +63,22 @@ def _draw_gl(
     """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera for each."""
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight = size
-    vis.quality.shadowsize, vis.quality.offsamples = 2048, 4
+    vis.quality.shadowsize, vis.quality.offsamples = 4096, 4
+    grain(model)
     # One directional light and a headlight, together below saturation on a pale floor.
-    vis.headlight.ambient[:] = 0.38
-    vis.headlight.diffuse[:] = 0.22
+    vis.headlight.ambient[:] = 0.46
+    vis.headlight.diffuse[:] = 0.16
     vis.headlight.specular[:] = 0.0
-    # Shadows cover the scene: MuJoCo casts them around the light's position, up to `shadowclip` extents.
     low, high = extent(model, episode)
     model.stat.extent = float(np.linalg.norm(high - low) / 2)
-    vis.map.shadowclip = 1.0
+    # MuJoCo casts shadows around the light's position, up to `shadowclip` extents: over what the cameras see.
+    reach = min(model.stat.extent, 0.75 * max(camera.distance for camera in cameras))
+    vis.map.shadowclip = reach / model.stat.extent
     vis.map.znear, vis.map.zfar = 0.1, 10.0  # extents; a wider range causes z-fighting
     if model.nlight:
         # Tilted along one axis only: otherwise the software renderer draws stripes on the floor.
         model.light_dir[0] = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
-        model.light_pos[0] = (low + high) / 2 - 2 * model.stat.extent * model.light_dir[0]
-        model.light_diffuse[:] = 0.45
+        model.light_diffuse[:] = 0.44
         model.light_specular[:] = 0.05
     option = mujoco.MjvOption()
     option.geomgroup[COLLISION_GROUP] = 0
@@ -93,9 +97,17 @@ def _draw_gl(
             view.lookat[:] = camera.lookat
             view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
             pose(model, data, episode, index)
+            if model.nlight:
+                model.light_pos[0] = np.array(camera.lookat) - 2 * model.stat.extent * model.light_dir[0]
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view, option)
             yield renderer.render()
+
+
+def grain(model: mujoco.MjModel) -> None:
+    """Gives the ground its texture, where the model has one."""
+    material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, GROUND_MATERIAL)
+    model.geom_matid[model.geom_group == GROUND_GROUP] = material
 
 
 _SIZE = tuple[Pixels, Pixels]
