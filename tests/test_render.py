@@ -1,5 +1,6 @@
 """Rendering: content of the frames, written files, rejected input."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from PIL import Image, ImageSequence
 
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
-from mqe_jax.viz import cameras, clips, geometry, recording, render
+from mqe_jax.viz import cameras, clips, framing, geometry, legend, recording, render
 from tests.states import made, placed
 
 
@@ -35,6 +36,33 @@ def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, ep
     assert episode.reward == pytest.approx(0.05)
 
 
+def test_the_typical_episode_is_the_median_of_the_successful_ones(episode: recording.Episode) -> None:
+    rated = [(1.0, 0.3), (0.0, 0.9), (1.0, 0.1), (0.5, 0.7), (1.0, 0.2)]
+    episodes = [dataclasses.replace(episode, success=success, reward=reward) for success, reward in rated]
+    assert recording.typical(episodes) is episodes[4]  # of 0.5, then 0.1, 0.2 and 0.3
+    assert recording.typical(episodes[1:2]) is episodes[1]
+
+
+def test_success_is_settled_from_its_last_change_on(env: FakeEnv, episode: recording.Episode) -> None:
+    """Both robots are beyond x 1.2 from the ninth step on."""
+    assert episode.settled == pytest.approx(9 * env.dt)
+    assert episode.cut(slice(2, None)).settled == episode.settled
+
+
+def test_the_legend_names_teams_and_scripted_robots() -> None:
+    env = made("go1football-defender")
+    (team, own), (other, scripted) = legend.entries(env)
+    assert (team, len(own), other, len(scripted)) == ("team", 2, "scripted", 1)
+    assert own[0][2] > 200 and own[1][1] > 150 and scripted[0][0] > 200  # blue, green and red
+    frame = np.zeros((360, 640, 3), np.uint8)
+    shown = legend.legend(env, (640, 360))(frame)
+    for color in (*own, *scripted):
+        found = np.argwhere((shown == color).all(axis=-1))
+        assert len(found) > 20 and found[:, 0].min() > 300 and found[:, 1].max() < 320  # lower left
+    assert not frame.any() and not shown[:300].any()
+    assert legend.legend(env, (40, 20))(frame[:20, :40]).shape == (20, 40, 3)  # larger than the frame
+
+
 def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: recording.Episode) -> None:
     assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
     drawn = geometry.rendering_model(env.mj_model, episode)
@@ -44,7 +72,7 @@ def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv
     assert own == pytest.approx(2.4)  # the environment's own model is as it was
 
 
-def in_image(model: Any, camera: cameras.Camera, point: np.ndarray, aspect: float) -> float:
+def in_image(model: Any, camera: framing.Camera, point: np.ndarray, aspect: float) -> float:
     """Distance of a point's projection from the image centre: 1 is the edge."""
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])

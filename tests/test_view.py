@@ -102,7 +102,9 @@ def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: A
 
 def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(stage: Any) -> None:
     scene = stage.stage
-    walls = scene._wall_handles
+    solid = [scene._model.geom(geom).name.startswith("wall/") for geom in scene._walls]
+    walls = [wall for wall, is_wall in zip(scene._wall_handles, solid, strict=True) if is_wall]
+    assert len(walls) == 2
     centre = np.stack([wall.batched_positions for wall in walls]) - scene._offset
     half = np.stack([wall.batched_scales for wall in walls])
     assert np.all(np.abs(centre[..., 1]) + half[..., 1] < 1.55)

@@ -27,7 +27,7 @@ def crate(body: Any, half: np.ndarray) -> None:
                 add_box(body, DARK_WOOD, size, place)
     brace = float(np.hypot(half[1], half[2])) - 2 * thick
     for axis in (0, 1):
-        flat = np.array([brace, 0.8 * thick, half[axis] - 0.3 * thick])
+        flat = np.array([brace, 0.8 * thick, half[axis] + _PROUD / 2])
         angle = float(np.arctan2(half[2], half[1 - axis]))
         # The brace lies in the side's plane: its length turned about the side's normal.
         quat = _turned(axis, angle)

@@ -30,14 +30,17 @@ class Episode:
     """`success` on the last step; 0 if the recording was cut at its time limit."""
     reward: float = 0.0
     """Mean over steps of the sum of the reward terms."""
+    settled: float = 0.0
+    """Time from which `success` has its last value, s."""
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def cut(self, frames: slice) -> "Episode":
-        """Returns the episode with a part of its frames, such as every n-th."""
+        """Returns the episode with a part of its frames, such as every n-th; `settled` stays that of the whole."""
         poses = (x[frames] for x in (self.qpos, self.mocap_pos, self.mocap_quat))
-        return Episode(*poses, dt=self.dt * (frames.step or 1), success=self.success, reward=self.reward)
+        rest = {"success": self.success, "reward": self.reward, "settled": self.settled}
+        return Episode(*poses, dt=self.dt * (frames.step or 1), **rest)
 
 
 @checked(act=Callable, key=RandomKey, episodes=Candidates, seconds=ClipLength)
@@ -89,8 +92,11 @@ def record(
     for i in range(episodes):
         last = int(done[:, i].argmax()) if done[:, i].any() else len(done) - 1
         won = float(success[last, i]) if done[last, i] else 0.0
+        others = np.flatnonzero(success[: last + 1, i] != success[last, i])
+        settled = (int(others[-1]) + 2 if len(others) else 0) * float(env.dt)
         poses = (x[: last + 2, i] for x in frames)
-        recorded.append(Episode(*poses, dt=float(env.dt), success=won, reward=float(reward[: last + 1, i].mean())))
+        rest = {"success": won, "reward": float(reward[: last + 1, i].mean()), "settled": settled}
+        recorded.append(Episode(*poses, dt=float(env.dt), **rest))
     return recorded
 
 
@@ -99,3 +105,10 @@ def best(episodes: list[Episode]) -> Episode:
     if not episodes:
         fail("episodes", episodes, "at least one episode")
     return max(episodes, key=lambda episode: (episode.success, episode.reward))
+
+
+def typical(episodes: list[Episode]) -> Episode:
+    """Returns the median of the successful episodes, by success, then by average step reward; of all if none is."""
+    successful = [episode for episode in episodes if episode.success > 0] or episodes
+    ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))
+    return ranked[len(ranked) // 2]

@@ -23,6 +23,7 @@ from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
+from mqe_jax.viz.legend import legend
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.top_view import draw_top
 
@@ -63,7 +64,8 @@ def _draw_gl(
     """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera for each."""
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight = size
-    vis.quality.shadowsize, vis.quality.offsamples = 4096, 4
+    vis.quality.shadowsize, vis.quality.offsamples = 2048, 4
+    vis.quality.numslices, vis.quality.numstacks = 18, 8
     grain(model)
     # One directional light and a headlight, together below saturation on a pale floor.
     vis.headlight.ambient[:] = 0.46
@@ -152,7 +154,7 @@ def render_episode(
 
     Defaults: .mp4 960 x 540 at 25 frames/s, .gif and .webp 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow`
     for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the
-    middle).
+    middle). A legend tells the teams' colours.
     Without GL, the packages required for 3-D rendering are printed to standard error.
     """
     path = check_output(Path(path))
@@ -179,5 +181,5 @@ def render_episode(
             text = f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
             raise InputError(f"output: {text}; give a smaller width, fewer frames per second, or .mp4")
         views = cameras(rendering_model(env.mj_model, episode), episode, view or "follow", aspect)
-    write_clip(path, render_frames(env, episode, views, size, backend), fps)
+    write_clip(path, map(legend(env, size), render_frames(env, episode, views, size, backend)), fps)
     return backend or "matplotlib"
