@@ -21,6 +21,8 @@ import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
 
+from mqe_jax import zoo
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -94,7 +96,8 @@ def task_page(task: Any) -> str:
     """Returns the page of a task."""
     env, name = task(num_envs=1, impl="c"), task.name
     body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
-    clip = f"The scripted policy (`mqe render {name} --policy scripted`):\n\n![{task.title}]({_clip(name)})"
+    policy = "shipped" if name in zoo.names() else "scripted"
+    clip = f"A typical success of the {policy} policy (`mqe render {name}`):\n\n![{task.title}]({_clip(name)})"
     media = [clip] if _clip(name) else []
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",

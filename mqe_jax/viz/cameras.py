@@ -19,7 +19,9 @@ _MARGIN = np.array([0.4, 0.4, 0.25])  # around a robot's trunk, m
 _SMOOTHING = 0.6  # duration over which a following camera is averaged, s
 _SAMPLES = 24  # frames of an episode by which directions are compared
 _DISTANCES = (2.0, 16.0)  # of a following camera, m
-_DIRECTIONS = [(azimuth, elevation) for azimuth in (90.0, 60.0, 30.0, 0.0) for elevation in (-30.0, -38.0, -48.0)]
+_DIRECTIONS = [
+    (azimuth, elevation) for azimuth in (90.0, 60.0, 30.0, 0.0, 120.0) for elevation in (-30.0, -38.0, -48.0)
+]
 _BEHIND = 2.0  # m of distance that a camera may add to see the robots beside each other
 _HIDDEN = 12.0  # m of distance that a camera may add to see the targets all the time
 
@@ -44,9 +46,10 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     if view == "side":
         return _beside(model, episode)
     points, goals = _points(model, episode), goal_points(model, episode)
-    direction = _direction(model, episode, points, goals, aspect)
-    if view == "near":
-        return [fitted(model, np.concatenate([*points, goals]), direction, aspect, _DISTANCES)] * len(episode)
+    fixed = view == "near"
+    direction = _direction(model, episode, points, goals, aspect, fixed)
+    if fixed:
+        return _fixed(model, points, goals, direction, aspect)
     width = max(1, min(round(_SMOOTHING / episode.dt), len(episode) // 5))
     return smoothed(_following(model, points, goals, direction, aspect, width), width)
 
@@ -66,20 +69,19 @@ def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
 
 
 def _direction(
-    model: mujoco.MjModel, episode: Episode, points: list[np.ndarray], goals: np.ndarray, aspect: float
+    model: mujoco.MjModel, episode: Episode, points: list[np.ndarray], goals: np.ndarray, aspect: float, fixed: bool
 ) -> Camera:
-    """Returns a camera of the direction in which the targets are hidden least, then largest."""
+    """Returns a camera of the direction in which the targets are hidden least and never far away."""
     sample = np.unique(np.linspace(0, len(episode) - 1, _SAMPLES).astype(int))
     part = Episode(*(x[sample] for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)), dt=episode.dt)
     best, least = Camera((0.0, 0.0, 0.0), 1.0), np.inf
     for azimuth, elevation in _DIRECTIONS:
         camera = replace(best, azimuth=azimuth, elevation=elevation)
-        views = _following(model, [points[i] for i in sample], goals, camera, aspect, 0)
-        away = [
-            np.linalg.norm(points[i] - view.position, axis=-1).mean() for i, view in zip(sample, views, strict=True)
-        ]
-        behind = _BEHIND * _alignment(model, part, camera.axes[1])
-        cost = np.mean(away) + behind + _HIDDEN * hidden(model, part, views).mean(axis=0).max()
+        few = [points[i] for i in sample]
+        views = _fixed(model, few, goals, camera, aspect) if fixed else _following(model, few, goals, camera, aspect, 0)
+        away = [np.linalg.norm(box - view.position, axis=-1).mean() for box, view in zip(few, views, strict=True)]
+        unseen = hidden(model, part, views).mean(axis=0).max()
+        cost = max(away) + _BEHIND * _alignment(model, part, camera.axes[1]) + _HIDDEN * unseen
         if cost < least:
             best, least = camera, cost
     return best
@@ -95,6 +97,13 @@ def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> fl
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         values.append(1.0 - across.mean() if len(across) else 0.0)
     return float(np.mean(values))
+
+
+def _fixed(
+    model: mujoco.MjModel, points: list[np.ndarray], goals: np.ndarray, direction: Camera, aspect: float
+) -> list[Camera]:
+    """Returns the same camera for each frame, which contains the targets of all frames and the goal."""
+    return [fitted(model, np.concatenate([*points, goals]), direction, aspect, _DISTANCES)] * len(points)
 
 
 def _following(

@@ -24,10 +24,15 @@ def entries(env: Any) -> list[tuple[str, list[tuple[int, ...]]]]:
 
 
 def legend(env: Any, size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8."""
+    """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8.
+
+    One robot alone needs none.
+    """
+    labels = entries(env)
+    if sum(len(dots) for _, dots in labels) < 2:
+        return lambda frame: frame
     unit = max(size[1] / 360, 0.6)
     font = ImageFont.load_default(13 * unit)
-    labels = entries(env)
     width = sum(font.getlength(label) + unit * (14 * len(dots) + 16) for label, dots in labels)
     plate = Image.new("RGB", (round(width + 4 * unit), round(22 * unit)), _PAPER)
     draw, x, middle = ImageDraw.Draw(plate), 8 * unit, 11 * unit
