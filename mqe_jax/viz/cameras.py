@@ -7,7 +7,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.viz.framing import Camera, fitted, smoothed
-from mqe_jax.viz.geometry import body_corners, extent, pose, robot_bases
+from mqe_jax.viz.geometry import body_boxes, extent, pose, posed, robot_bases
 from mqe_jax.viz.recording import Episode
 from mqe_jax.viz.visibility import goal_points, hidden, targets
 
@@ -56,15 +56,14 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
 
 def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     """Returns the corners (8 x targets, 3) of boxes about the targets of each frame, m."""
-    data, robots, bodies = mujoco.MjData(model), robot_bases(model), targets(model, episode)
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    frames = []
+    data, bodies, robots = mujoco.MjData(model), targets(model, episode), len(robot_bases(model))
+    local, frames = body_boxes(model, bodies), []
+    margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for index in range(len(episode)):
         pose(model, data, episode, index)
-        boxes = [
-            data.xpos[body] + signs * _MARGIN if body in robots else body_corners(model, data, body) for body in bodies
-        ]
-        frames.append(np.concatenate(boxes))
+        boxes = posed(data, bodies, local)
+        boxes[:robots] = data.xpos[bodies[:robots], None] + margins
+        frames.append(boxes.reshape(-1, 3))
     return frames
 
 

@@ -1,6 +1,7 @@
 """Geometry of a scene: robot bodies, visible geoms, bounding boxes."""
 
 import copy
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -9,6 +10,7 @@ from mqe_jax.appearance import GROUND_GROUP, HIDDEN_GROUP
 from mqe_jax.viz.recording import Episode
 
 COLLISION_GROUP = HIDDEN_GROUP
+_SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of a box's corners
 
 
 def robot_bases(model: mujoco.MjModel) -> list[int]:
@@ -55,16 +57,30 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: in
 def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
     """Returns the corners (8, 3) of a geom's bounding box, world frame, m."""
     centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    return data.geom_xpos[geom] + (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
+    return data.geom_xpos[geom] + (centre + _SIGNS * half) @ data.geom_xmat[geom].reshape(3, 3).T
 
 
-def body_corners(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
-    """Returns the corners (8, 3) of the box along the world's axes about a body's visible geoms, m."""
-    geoms = model.body_geomadr[body] + np.arange(model.body_geomnum[body])
-    shown = [int(geom) for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
-    corners = np.concatenate([box_corners(model, data, geom) for geom in shown] or [data.xpos[body : body + 1]])
-    return np.array(np.meshgrid(*zip(corners.min(axis=0), corners.max(axis=0), strict=True))).reshape(3, -1).T
+def body_boxes(model: mujoco.MjModel, bodies: Sequence[int]) -> np.ndarray:
+    """Returns the corners (B, 8, 3) of the boxes about the bodies' visible geoms, each in its body's frame, m."""
+    boxes, rotation = [], np.zeros(9)
+    for body in bodies:
+        points = [np.zeros((1, 3))]
+        for geom in model.body_geomadr[body] + np.arange(model.body_geomnum[body]):
+            if model.geom_group[geom] == COLLISION_GROUP:
+                continue
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            corners = model.geom_aabb[geom, :3] + _SIGNS * model.geom_aabb[geom, 3:]
+            points.append(model.geom_pos[geom] + corners @ rotation.reshape(3, 3).T)
+        shown = np.concatenate(points[1:] or points)
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        boxes.append((low + high) / 2 + _SIGNS * (high - low) / 2)
+    return np.array(boxes).reshape(-1, 8, 3)
+
+
+def posed(data: mujoco.MjData, bodies: Sequence[int], boxes: np.ndarray) -> np.ndarray:
+    """Returns the corners (B, 8, 3) of boxes given in the frames of the bodies in the world frame, m."""
+    rotation = data.xmat[list(bodies)].reshape(-1, 3, 3)
+    return data.xpos[list(bodies), None] + boxes @ rotation.transpose(0, 2, 1)
 
 
 def scenery_geoms(model: mujoco.MjModel) -> list[int]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.appearance import GOAL_SITE, HIDDEN_GROUP
 from mqe_jax.viz.framing import Camera, projected
-from mqe_jax.viz.geometry import body_corners, moving_bodies, pose, robot_bases
+from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, posed, robot_bases
 from mqe_jax.viz.recording import Episode
 
 _SPAN = 0.18  # distance from a trunk's centre of the points that are looked for in front and behind, m
@@ -21,11 +21,6 @@ _CLEAR = 0.5  # opacity below which a geom hides nothing
 def targets(model: mujoco.MjModel, episode: Episode) -> list[int]:
     """Returns the ids of the bodies that a clip shows: robots, then moving objects and NPCs."""
     return [*robot_bases(model), *moving_bodies(model, episode)]
-
-
-def centers(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int]) -> np.ndarray:
-    """Returns the centres of the boxes about the bodies' visible geoms (B, 3), m."""
-    return np.array([body_corners(model, data, body).mean(axis=0) for body in bodies])
 
 
 def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
@@ -44,10 +39,11 @@ def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
 def in_frame(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera], aspect: float) -> np.ndarray:
     """Returns which targets' centres, then which goal points, are in the image of each frame (T, targets + P) bool."""
     data, bodies, goals = mujoco.MjData(model), targets(model, episode), goal_points(model, episode)
+    boxes = body_boxes(model, bodies)
     rows = []
     for index, camera in enumerate(views):
         pose(model, data, episode, index)
-        places = projected(model, camera, np.concatenate([centers(model, data, bodies), goals]), aspect)
+        places = projected(model, camera, np.concatenate([posed(data, bodies, boxes).mean(axis=1), goals]), aspect)
         rows.append(np.abs(places).max(axis=1) <= 1.0)
     return np.array(rows)
 
@@ -59,13 +55,13 @@ def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> 
     """
     model = copy.deepcopy(model)
     model.geom_group[model.geom_rgba[:, 3] < _CLEAR] = HIDDEN_GROUP
-    data, bodies = mujoco.MjData(model), np.array(targets(model, episode))
-    trunks = len(robot_bases(model))
+    data, bodies = mujoco.MjData(model), targets(model, episode)
+    trunks, local = len(robot_bases(model)), body_boxes(model, bodies)
     groups = np.array([group != HIDDEN_GROUP for group in range(mujoco.mjNGROUP)], np.uint8)
     rows = []
     for index, camera in enumerate(views):
         pose(model, data, episode, index)
-        boxes = np.array([body_corners(model, data, body) for body in bodies])
+        boxes = posed(data, bodies, local)
         span = 0.35 * np.ptp(boxes, axis=1) * (0, 0, 1)
         span[:trunks] = _SPAN * data.xmat[bodies[:trunks]].reshape(-1, 3, 3)[:, :, 0]
         points = boxes.mean(axis=1) + np.array([-1, 0, 1])[:, None, None] * span  # (3, targets, 3)
