@@ -97,7 +97,9 @@ def task_page(task: Any) -> str:
     env, name = task(num_envs=1, impl="c"), task.name
     body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
     policy = "shipped" if name in zoo.names() else "scripted"
-    clip = f"A typical success of the {policy} policy (`mqe render {name}`):\n\n![{task.title}]({_clip(name)})"
+    command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
+    against = " against itself" if len(env.teams) > 1 else ""
+    clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{task.title}]({_clip(name)})"
     media = [clip] if _clip(name) else []
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",

@@ -15,6 +15,7 @@ from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
+_OPAQUE = 0.5  # opacity below which geoms are left out: meshes of several colours have none
 _PLANES = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
@@ -157,7 +158,7 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
         body = int(model.geom_bodyid[geom])
         if int(model.geom_group[geom]) == COLLISION_GROUP or int(model.geom_type[geom]) in _PLANES:
             continue
-        if model.geom_rgba[geom, 3] == 0:
+        if model.geom_rgba[geom, 3] < _OPAQUE:
             continue
         if model.body_mocapid[body] >= 0 and int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_BOX):
             walls.append(geom)
