@@ -171,12 +171,17 @@ def read_rows(path: Path) -> Iterator[list[str]]:
 
 
 def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
-    """Reads a safetensors file of weights; an InputError says `what` it should be."""
+    """Reads a safetensors file of finite floating-point weights; an InputError says `what` it should be."""
+    import numpy as np
     from safetensors.numpy import load_file
 
     check_file(file, limits.WEIGHTS_BYTES)
-    with parsing(f"{what} {file}", "a safetensors file of numpy's types"):
-        return load_file(file)
+    with parsing(f"{what} {file}", "a safetensors file of finite floating-point numbers"):
+        arrays = load_file(file)
+        for name, array in arrays.items():
+            if array.dtype.kind not in "fV" or not np.isfinite(array).all():  # V: bfloat16
+                raise ValueError(f"{name} is not, dtype {array.dtype}")
+        return arrays
 
 
 @contextlib.contextmanager

@@ -79,7 +79,10 @@ class _Unpickler(_PurePython):
         if self._left < 0:
             raise ValueError(f"its tensors have more than {limits.WEIGHTS_BYTES} bytes")
         strides = [s * storage.itemsize for s in stride]
-        return np.array(np.lib.stride_tricks.as_strided(storage[offset:], size, strides), np.float32)
+        tensor = np.array(np.lib.stride_tricks.as_strided(storage[offset:], size, strides), np.float32)
+        if not np.isfinite(tensor).all():
+            raise ValueError("a tensor holds NaN or infinite numbers")
+        return tensor
 
 
 def read_state(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
