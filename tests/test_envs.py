@@ -203,6 +203,13 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
             VectorEnv(gate, 3).step(state, jnp.zeros(shape))
 
 
+def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any) -> None:
+    action = jnp.tile(jnp.array([0.5, 3.0, -1e6]), (2, 4))
+    after, clipped = gate_step(fresh, action), gate_step(fresh, jnp.clip(action, -1.0, 1.0))
+    jax.tree.map(np.testing.assert_array_equal, (after.data.ctrl, after.obs), (clipped.data.ctrl, clipped.obs))
+    assert np.abs(np.asarray(gate_step(fresh, 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl - after.data.ctrl)).max() > 0
+
+
 def test_overrides_reach_every_level() -> None:
     env = make("go1gate", impl="c", control="torque", gate_width=0.8, **{"rewards.collision": -5})
     assert env.params.gate_width == 0.8 and env.params.rewards.collision == -5.0

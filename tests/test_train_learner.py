@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from probes import Probe
+from probes import Probe, Traces
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import Evaluator, evaluate
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
@@ -257,6 +257,19 @@ def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     assert result.to_dict()["diverged"] == 0 and result.overflow == 5 * 30
     with pytest.raises(ValueError, match="episodes: 0"):
         evaluate(env, act, 0, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+
+
+def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
+    """Also those of different blocks, and of different evaluations in one program."""
+    env, recorder = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6), Traces()
+
+    def act(params: Any, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return jax.random.uniform(key, (4, 2, 1)), memory
+
+    evaluator = Evaluator(env, act, block=2, recorder=recorder)
+    evaluator(None, 4, jax.random.split(jax.random.PRNGKey(0), 2))
+    actions = np.concatenate([np.ravel(trace.action) for trace in recorder.all])
+    assert len(recorder.all) == 3 and len(np.unique(actions)) == actions.size == 6 * 2 * 4 * 2
 
 
 def test_memory_starts_anew_with_every_counted_episode() -> None:
