@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import fake_env
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -20,6 +19,7 @@ from safetensors.numpy import load_file
 from mqe_jax import cli
 from mqe_jax.cli import setup
 from mqe_jax.train.checkpoint import list_checkpoints
+from tests import fake_env
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}

@@ -23,10 +23,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.soak.fuzz import fuzz
-
 from mqe_jax.envs import TASKS
 from tests.soak.agreement import agreement, pairs
+from tests.soak.fuzz import fuzz
 from tests.soak.kills import disk, kills
 from tests.soak.memory import memory
 from tests.soak.play import play
