@@ -36,7 +36,7 @@ LONGEST = 1200
 """Characters of a message: what is allowed may be a list of names."""
 CASES = settings(
     max_examples=60,
-    deadline=2000,
+    deadline=20_000,
     derandomize=True,
     database=None,
     suppress_health_check=(HealthCheck.too_slow, HealthCheck.filter_too_much),
