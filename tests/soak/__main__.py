@@ -11,9 +11,10 @@ Parts, in this order if none is named; each gets its share of the time, and rows
     pairs       one step of every task, robot and control mode, on the engine against the C engine
 
 The results are written after every row to FOLDER/soak.json and FOLDER/soak.md. Exit code 1 if anything was wrong.
-With a GPU, 10^7 random steps of every task (about 14 s each at 700,000 steps/s, and a minute to compile):
+With a GPU, 10^7 random steps of every task take 15 minutes: 14 s each at 700,000 steps/s, and a minute to compile.
 
-    JAX_PLATFORMS=cuda,cpu python -m tests.soak play --engine warp --steps 10000000 --num-envs 4096
+    JAX_PLATFORMS=cuda,cpu python -m tests.soak play --engine warp --steps 10000000 --num-envs 4096 \\
+        --robot go1 --mode random-command --minutes 30
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mqe_jax.envs import TASKS
+from mqe_jax.robots import ROBOTS
 from tests.soak.agreement import agreement, pairs
 from tests.soak.fuzz import fuzz
 from tests.soak.kills import disk, kills
 from tests.soak.memory import memory
-from tests.soak.play import play
+from tests.soak.play import MODES, play
 from tests.soak.report import Options, Report
 
 PARTS: dict[str, Callable[[Report], None]] = {
@@ -47,6 +49,8 @@ def parser() -> argparse.ArgumentParser:
     defaults = Options()
     made.add_argument("--engine", default=defaults.engine, choices=("c", "jax", "warp"))
     made.add_argument("--task", action="append", dest="tasks", choices=list(TASKS), default=[], help="may be repeated")
+    made.add_argument("--robot", action="append", dest="robots", choices=list(ROBOTS), default=[], help="of play")
+    made.add_argument("--mode", action="append", dest="modes", choices=MODES, default=[], help="of play")
     for name in ("steps", "num_envs", "kills", "cases", "seed"):
         made.add_argument(f"--{name.replace('_', '-')}", type=int, default=getattr(defaults, name))
     return made
@@ -57,7 +61,7 @@ def main() -> int:
     given = vars(parser().parse_args())
     hours, minutes, folder = given.pop("hours"), given.pop("minutes"), given.pop("folder")
     parts = given.pop("parts") or list(PARTS)
-    given["tasks"] = tuple(given["tasks"])
+    given |= {name: tuple(given[name]) for name in ("tasks", "robots", "modes")}
     report = Report(folder, Options(**given), 60.0 * hours if minutes is None else minutes)
     for number, part in enumerate(parts):
         report.begin(len(parts) - number)

@@ -27,7 +27,9 @@ def agreement(report: Report) -> None:
     """Compares trajectories of all tasks with the C engine's; on the C engine, with positions shifted by 1e-6."""
     options = report.options
     for task in report.pending("agreement", options.tasks or list(TASKS)):
-        figures = disagreement(task, options.engine, record(task, seed=options.seed))
+        with jax.default_device(jax.devices("cpu")[0]):  # of the C engine
+            reference = record(task, seed=options.seed)
+        figures = disagreement(task, options.engine, reference)
         first = {name: value for name, value in figures.items() if name.endswith("_1")}
         wrong = [f"{name}: {value:.2g}" for name, value in first.items() if not value <= ONE_STEP]
         report.add("agreement", task, {name: float(f"{value:.3g}") for name, value in figures.items()}, wrong)
@@ -53,8 +55,10 @@ def pairs(report: Report) -> None:
 
 def one_step(task: str, robot: str, control: str, engine: str) -> tuple[dict[str, float], list[str]]:
     """Returns the difference after one step and how far robots moved, and what is wrong."""
-    env, states, action, after = stepped(task, robot, control)
-    moved = np.asarray(jax.vmap(env.read)(after.data).joint_velocity)
+    with jax.default_device(jax.devices("cpu")[0]):
+        env, *arrays = stepped(task, robot, control)
+    states, action, after = jax.device_get(arrays)
+    moved = after.data.qvel[:, env.index.joint_qvel]
     shown = (after.obs, after.privileged_obs, after.reward, *after.metrics.values(), after.data.qpos, after.data.qvel)
     wrong = [] if all(np.all(np.isfinite(leaf)) for leaf in shown) else ["not finite"]
     wrong += [] if after.obs.shape == (ENVS, env.num_agents, env.observation_size) else [f"obs {after.obs.shape}"]

@@ -70,7 +70,7 @@ def kills(report: Report) -> None:
             process.wait(moment)
         except subprocess.TimeoutExpired:
             ended += 1
-        wrong, said = [], _end(process, signal.Signals[kind])
+        said, wrong = _end(process, signal.Signals[kind])
         done = updates(run)
         if done >= UPDATES or (ended >= 5 and done > before):
             wrong += _compare(run, whole)
@@ -82,16 +82,24 @@ def kills(report: Report) -> None:
         shutil.rmtree(run, ignore_errors=True)
 
 
-def _end(process: subprocess.Popen[str], number: signal.Signals) -> str:
-    """Sends a signal to a program that may have ended; returns its last line."""
-    if process.poll() is None and number is not signal.SIGKILL:
-        try:
-            return end(process, number, seconds=20)[0]
-        except BaseException as error:  # of pytest.fail too
-            process.kill()
-            return f"{type(error).__name__}: {error}"
-    process.kill()
-    return (process.communicate()[1].splitlines() or [""])[-1][-100:]
+def _end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[str, list[str]]:
+    """Sends a signal to a program that may have ended; returns its last line, and what is wrong."""
+    if process.poll() is not None or number is signal.SIGKILL:
+        process.kill()
+        said = process.communicate()[1].splitlines() or [""]
+        wrong = [] if process.returncode in (0, -signal.SIGKILL) else [f"ended with {process.returncode}: {said[-3:]}"]
+        return said[-1][-100:], wrong
+    try:
+        return end(process, number, seconds=20)[0], []
+    except BaseException as error:  # also that of pytest.fail
+        process.kill()
+        early = process.returncode == 0 or not _handled(process)
+        return "", [] if early else [" ".join(str(error).split())[-200:]]
+
+
+def _handled(process: subprocess.Popen[str]) -> bool:
+    """Whether a signal ended the program by its own handler: Python's imports before that end without a word."""
+    return process.returncode not in (-signal.SIGINT, -signal.SIGTERM)
 
 
 def _compare(run: Path, whole: Path) -> list[str]:

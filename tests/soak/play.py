@@ -19,22 +19,29 @@ from tests.soak.report import Report
 BLOCK = 100
 """Environment steps of one compiled call."""
 BEHIND, BELOW = 0.1, -0.2  # m; a trunk further behind a wall of the track, or lower, is outside
-MODES = (("random", "command"), ("saturated", "command"), ("scripted", "command"), ("saturated", "torque"))
+MODES = ("random-command", "saturated-command", "scripted-command", "saturated-torque")
 """Kinds of play: actions of `tests.driving`, or the scripted policy, and the control mode."""
+RATES = {"c": 10_000, "jax": 20_000, "warp": 700_000}
+"""Environment steps per second by engine: two CPU cores, the GPU of an H100."""
+COMPILING = 60.0  # s
 
 
 def play(report: Report) -> None:
-    """Plays every task with every robot in every mode; the rows of the first robot come first."""
+    """Plays every task with every robot in every mode; the rows of the first robot and mode come first."""
     options = report.options
     rows = {
-        f"{task} {robot} {mode} {control}": (task, robot, mode, control)
-        for robot in robots.ROBOTS
-        for mode, control in MODES
+        f"{task} {robot} {mode}": (task, robot, *mode.split("-"))
+        for robot in options.robots or robots.ROBOTS
+        for mode in options.modes or MODES
         for task in options.tasks or TASKS
-        if mode != "scripted" or task in PLANNERS
+        if mode != "scripted-command" or task in PLANNERS
     }
+    count = len(list(report.pending("play", list(rows))))
+    seconds = count * (options.steps / RATES[options.engine] + COMPILING)
+    print(f"play: {count} rows of {options.steps} steps, about {seconds / 60:.0f} min", flush=True)
     for name in report.pending("play", list(rows)):
-        row = played(*rows[name], report)
+        task, robot, mode, control = rows[name]
+        row = played(task, robot, mode, control, report)
         counted = ("diverged", "outside", "overflow", "not_finite")
         report.add("play", name, row, [f"{kind} in {row[kind]} steps" for kind in counted if row[kind]])
 
@@ -68,7 +75,8 @@ def played(task: str, robot: str, mode: str, control: str, report: Report) -> di
         for name, value in counts.items():
             totals[name] = totals.get(name, 0) + int(np.sum(np.asarray(value)))
         steps += BLOCK * options.num_envs
-    return {"steps": steps, **totals, "seconds": round(time.perf_counter() - began)}
+    row = {"steps": steps, **totals, "seconds": round(time.perf_counter() - began)}
+    return row if steps >= options.steps else {**row, "partial": True}
 
 
 def outside(env: Any, data: Any) -> jax.Array:

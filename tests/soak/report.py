@@ -21,6 +21,10 @@ class Options:
     """Engine of play, agreement and pairs: c, jax or warp."""
     tasks: tuple[str, ...] = ()
     """Tasks of play and agreement; all if empty."""
+    robots: tuple[str, ...] = ()
+    """Robots of play; all if empty."""
+    modes: tuple[str, ...] = ()
+    """Modes of play; all if empty."""
     steps: int = 100_000
     """Environment steps of play per row."""
     num_envs: int = 256
@@ -60,9 +64,10 @@ class Report:
         return self._share - time.monotonic()
 
     def pending(self, part: str, names: Sequence[str]) -> Iterator[str]:
-        """Yields the names without a row while there is time."""
+        """Yields the names without a row, or with one whose time was over, while there is time."""
         for name in names:
-            if name not in self.parts.get(part, {}) and self.seconds_left() > 0.0:
+            row = self.parts.get(part, {}).get(name)
+            if (row is None or row.get("partial")) and self.seconds_left() > 0.0:
                 yield name
 
     def add(self, part: str, name: str, row: dict[str, Any], wrong: Sequence[str] = ()) -> None:
