@@ -42,10 +42,15 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
         {"recurrent": False, "hidden_sizes": (4, 4), "action_mean": "tanh", "activation": "elu"},
     ],
     "mat": [{"width": 8, "heads": 2, "blocks": 1}],
-    "walk": [{}],
+    "walk": [{"chunk_length": 2}],
 }
 """Settings of every registered network."""
-CASES = [{"name": name, **settings} for name in VARIANTS for settings in VARIANTS[name]]
+CASES = [
+    pytest.param({"name": name, **settings}, id=f"{name}{number}", marks=pytest.mark.soak if number else ())
+    for name in VARIANTS
+    for number, settings in enumerate(VARIANTS[name])
+]
+"""The first settings of each network; the others in the soak."""
 
 
 def pay_each(hidden: jax.Array, action: jax.Array) -> jax.Array:
@@ -104,7 +109,7 @@ def test_every_registered_network_is_here() -> None:
     assert set(VARIANTS) == {name for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
 
 
-@pytest.mark.parametrize("network", CASES, ids=[f"{case['name']}{number}" for number, case in enumerate(CASES)])
+@pytest.mark.parametrize("network", CASES)
 def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     network: dict[str, Any], tmp_path: Path
 ) -> None:
