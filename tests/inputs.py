@@ -103,6 +103,10 @@ TARGETS = {
 """Positional and needed arguments of each command."""
 
 
+LONG = ("view", "walk train", "walk eval", "tournament")
+"""Commands that run for long where a text happens to be allowed; they get numbers only, which never are."""
+
+
 def command_record(command: str) -> Any:
     """Returns the record of a command's flags; of `train` and `walk train` that of the settings."""
     return TrainConfig if isinstance(COMMANDS[command], str) else COMMANDS[command]
@@ -115,7 +119,7 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
     words = [*command.split(), *TARGETS.get(command, [])]
     fields = dict(numbers(command_record(command)))
     text = st.sampled_from(TEXTS) | st.text(max_size=20)
-    if fields and draw(st.integers(0, 3)):
+    if command in LONG or (fields and draw(st.integers(0, 3))):
         field = draw(st.sampled_from(sorted(fields)))
         value = draw(refused(fields[field]).filter(lambda x: not isinstance(x, list)))
         return [*words, f"--{field.replace('_', '-')}={value}"]

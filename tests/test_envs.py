@@ -14,6 +14,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make, register_task, replay
+from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
@@ -127,6 +128,14 @@ def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     bad = gate_step(state, jnp.full((2, 12), jnp.nan))
     assert bad.terminated and float(bad.metrics["diverged"]) == 1
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
+
+
+def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate: QuadrupedEnv, fresh: State) -> None:
+    ended = dataclasses.replace(fresh, truncated=jnp.array(True))
+    after = jax.jit(lambda state: autoreset(gate, state))(ended)
+    assert int(after.step) == 0 and np.abs(np.asarray(after.data.qpos - fresh.data.qpos)).max() > 1e-3
+    for key in (after.key, ended.key):
+        assert np.abs(np.asarray(jax.jit(gate.reset)(key).data.qpos - after.data.qpos)).max() > 1e-3
 
 
 def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:

@@ -37,7 +37,11 @@ def test_randomisation_reaches_the_physics() -> None:
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
     params = states.randomized
     assert np.ptp(np.asarray(params.friction)) > 0.3 and set(np.asarray(params.action_lag).tolist()) == {0, 1, 2}
-    step = jax.jit(jax.vmap(env.step))
+    step, neutral = jax.jit(jax.vmap(env.step)), states.data.ctrl
+    for waited in range(3):  # steps since the only action
+        states = step(states, jnp.full((16, 2, 12), float(waited == 0)))
+        moved = np.abs(np.asarray(states.data.ctrl - neutral)).max(-1) > 0.1
+        np.testing.assert_array_equal(moved, np.asarray(params.action_lag) == waited)
     for _ in range(60):
         states = step(states, jnp.zeros((16, 2, 12)))
     height = np.asarray(jax.vmap(env.read)(states.data).position_w)[..., 2].ravel()

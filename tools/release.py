@@ -111,7 +111,8 @@ def audit(tools: Path) -> int:
 
 def build() -> Path:
     """Builds the wheel into dist/; returns it."""
-    shutil.rmtree(DIST, ignore_errors=True)
+    for leftover in (DIST, ROOT / "build" / "lib"):  # of an earlier build, which would become part of the wheel
+        shutil.rmtree(leftover, ignore_errors=True)
     run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", DIST, ROOT)
     (wheel,) = DIST.glob("*.whl")
     return wheel
