@@ -130,6 +130,19 @@ def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
 
 
+def test_only_the_agents_trunks_count_as_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = made("go1football-defender")
+    read = env.read
+
+    @jax.jit
+    def collides(state: State, force: Array) -> Array:
+        monkeypatch.setattr(env, "read", lambda data: dataclasses.replace(read(data), trunk_force=force))
+        return env.step(state, jnp.zeros((2, 12))).metrics["collision"]
+
+    forces = {(100.0, 0.0, 0.0): 1, (0.0, 100.0, 0.0): 1, (0.0, 0.0, 100.0): 0}  # the third robot is the defender
+    assert {force: int(collides(initial(env), jnp.array(force))) for force in forces} == forces
+
+
 def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate: QuadrupedEnv, fresh: State) -> None:
     ended = dataclasses.replace(fresh, truncated=jnp.array(True))
     after = jax.jit(lambda state: autoreset(gate, state))(ended)
