@@ -125,6 +125,9 @@ def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     after = gate_step(broken, jnp.zeros((2, 12)))
     assert after.terminated and float(after.metrics["diverged"]) == 1
     assert np.all(np.asarray(after.reward) == 0) and np.isfinite(after.obs).all()
+    last = dataclasses.replace(broken, step=jnp.int32(gate.max_steps - 1))
+    ended = [gate_step(start, jnp.zeros((2, 12))) for start in (last, dataclasses.replace(last, data=state.data))]
+    assert [(bool(s.terminated), bool(s.truncated)) for s in ended] == [(True, False), (False, True)]  # never both
     bad = gate_step(state, jnp.full((2, 12), jnp.nan))
     assert bad.terminated and float(bad.metrics["diverged"]) == 1
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
