@@ -156,6 +156,17 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
 
+def test_a_bonus_for_entropy_widens_the_policy() -> None:
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
+    learner = make_learner(env, small(num_envs=4, ppo={"epochs": 2, "minibatches": 1, "entropy_coef": 1.0}))
+    state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
+    entropy = []
+    for _ in range(5):
+        state, metrics = update(state)
+        entropy.append(float(metrics["entropy"]))
+    assert np.all(np.diff(entropy) > 0.005), entropy
+
+
 def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn, permutation = [], jax.random.permutation
 
