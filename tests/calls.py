@@ -85,7 +85,10 @@ CALLS: dict[str, tuple[Callable[[Any], Any], Strategy]] = {
     "make(commands)": (lambda x: make("go1plane", impl="c", commands=x), but(_NO_NAMES, [])),
     "make(rewards)": (lambda x: _plane(rewards=x), but(_NO_NAMES, {})),
     "make(randomization)": (lambda x: _plane(randomization=x), but(_NO_NAMES, {})),
-    "make(spawn_joint_scale)": (lambda x: _plane(spawn_joint_scale=x), but(_NO_SIZES, (0, 0), (1, 1))),
+    "make(spawn_joint_scale)": (
+        lambda x: _plane(spawn_joint_scale=x),
+        but(_NO_SIZES, (0, 0), (1, 1), (-3, 100), (10**6, 10**6)),
+    ),
     "VectorEnv(num_envs)": (lambda x: VectorEnv(_plane(num_envs=1), x), COUNTS),
     "step(action)": (_step, st.sampled_from(_NO_ACTIONS)),
     "gymnasium.VectorEnv(num_envs)": (lambda x: gymnasium.VectorEnv("go1plane", x, impl="c"), COUNTS),
