@@ -36,13 +36,12 @@ SMALL = [*fake_env.SMALL, "--network.hidden-sizes", "4"]
 def fuzz(report: Report) -> None:
     """Draws inputs of every kind, until there are as many as wanted or the time is over."""
     setup.make_env = with_fake(setup.make_env)
-    kinds: list[Callable[[], Any]] = [flag_cases, file_cases, call_cases]
-    rows = [f"{kinds[i % 3].__name__} {i // 3}" for i in range(-(-report.options.cases // CHUNK))]
-    for number, name in enumerate(rows):
-        if name not in list(report.pending("fuzz", rows)):
-            continue
+    kinds = {kind.__name__.removesuffix("_cases"): kind for kind in (flag_cases, file_cases, call_cases)}
+    count = -(-report.options.cases // CHUNK)
+    rows = [f"{kind} {number}" for number in range(-(-count // len(kinds))) for kind in kinds][:count]
+    for name in report.pending("fuzz", rows):
         found: dict[str, list[str]] = {}
-        refused = _run(kinds[number % 3](), f"{report.options.seed} {name}", found)
+        refused = _run(kinds[name.split()[0]](), f"{report.options.seed} {name}", found)
         row = {"cases": CHUNK, "refused": refused, "failed": len(found)}
         report.add("fuzz", name, row, [f"{case}: {'; '.join(wrong)}" for case, wrong in found.items()])
 
