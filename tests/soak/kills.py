@@ -110,6 +110,8 @@ def _compare(run: Path, whole: Path) -> list[str]:
         assert_same_run(whole, run)
     except AssertionError as error:
         return [f"differs: {' '.join(str(error).split())[:300]}"]
+    if len({(folder / "evaluations.json").read_text() for folder in (whole, run)}) > 1:
+        return ["evaluations.json differs"]
     files = [{path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} for folder in (whole, run)]
     names = [{name for name in each if "tfevents" not in name} for each in files]
     return [f"files: {sorted(names[0] ^ names[1])}"] if names[0] != names[1] else []
