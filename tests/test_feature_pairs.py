@@ -45,12 +45,15 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "walk": [{"chunk_length": 2}],
 }
 """Settings of every registered network."""
+LONG = pytest.mark.soak
 CASES = [
-    pytest.param({"name": name, **settings}, id=f"{name}{number}", marks=pytest.mark.soak if number else ())
+    pytest.param(
+        {"name": name, **settings}, id=f"{name}{number}", marks=pytest.mark.soak if number or name == "walk" else ()
+    )
     for name in VARIANTS
     for number, settings in enumerate(VARIANTS[name])
 ]
-"""The first settings of each network; the others in the soak."""
+"""The first settings of each network of a team; the others, and the walk policy of a single robot, in the soak."""
 
 
 def pay_each(hidden: jax.Array, action: jax.Array) -> jax.Array:
