@@ -19,8 +19,10 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from mqe_jax import robots
 from mqe_jax.cli.arguments import parse
 from mqe_jax.cli.setup import parse_overrides
+from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build, load_yaml
 from mqe_jax.study.sweep import Sweep, load_sweep
@@ -217,3 +219,10 @@ def test_what_once_broke_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^[^\n]*$") as refused:
         reader(file)
     assert "input" in str(refused.value) and word in str(refused.value) and len(str(refused.value)) <= LONGEST
+
+
+@pytest.mark.parametrize("read", [read_torchscript, load_recording, robots.get], ids=lambda read: read.__name__)
+@pytest.mark.parametrize("value", [3, [], {}, None], ids=repr)
+def test_a_name_or_path_of_another_type_is_refused(read: Any, value: Any) -> None:
+    with pytest.raises(InputError, match=r"^[^\n]*$"):
+        read(value)
