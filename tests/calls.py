@@ -26,7 +26,7 @@ from tests import fake_env, inputs
 
 Strategy = st.SearchStrategy[Any]
 NAN, INF = float("nan"), float("inf")
-_NO_COUNTS = [NAN, INF, -INF, 1.5, 0, -1, True, None, "3", "many", [], [1], {}, 10**12, b"1", 1j, np.float32(2.5)]
+_NO_COUNTS = [NAN, INF, -INF, 1.5, 0, -1, True, None, "many", [], [1], {}, 10**12, b"1", 1j, np.float32(2.5)]
 _NO_NAMES = [3, 1.5, True, "", " ", "nope", "\x00", "a" * 5000, b"go1", [], {}, ["go1gate"], object(), NAN]
 _NO_TIMES = [NAN, INF, -1.0, 1e300, "long", [], {}, True, 1j]
 _NO_PATHS = ["", "/", ".", "/dev/zero", "/dev/full", "/proc/self/mem", "\x00", "nope", "a" * 5000, 3, 1.5, b"a", [], {}]

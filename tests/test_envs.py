@@ -218,6 +218,9 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
         gate.step(state, jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"action: dtype int32"):
         gate.step(state, jnp.zeros((2, 12), jnp.int32))
+    for nothing in (None, "go"):
+        with pytest.raises(InputError, match=r"action: .* must be an array of numbers"):
+            gate.step(state, nothing)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"action: contains NaN"):
         gate.step(state, jnp.full((2, 12), jnp.nan))
     for count, allowed in ((0, "greater than 0"), (1.5, "a valid integer")):
