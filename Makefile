@@ -13,7 +13,7 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 pytho
 TEST_JOBS ?= 2
 SOURCES := $(wildcard mqe_jax tests examples tools)
 
-.PHONY: help install demo test soak docs check fmt clean system browser npm
+.PHONY: help install demo test soak docs audit release check fmt clean system browser npm
 
 help: ## List the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -52,6 +52,12 @@ docs: $(STAMP) npm ## Build the documentation site into build/site
 
 soak: $(STAMP) ## Run the heavy tests too (about an hour)
 	MQE_SOAK=1 $(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
+
+audit: $(STAMP) ## Known vulnerabilities of the pinned packages, where the database can be reached
+	$(BIN)/python tools/release.py --audit
+
+release: $(STAMP) ## Wheel and bill of materials into dist/, tried with the README in an empty environment
+	$(BIN)/python tools/release.py
 
 check: $(STAMP) ## Lint, formatting, types
 	$(BIN)/ruff check $(SOURCES)

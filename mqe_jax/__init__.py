@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mqe_jax.opponents import versus
     from mqe_jax.policies import load_policy
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks", "versus"]
 
 

@@ -23,6 +23,16 @@ SETTLING = 100  # first environment steps that the histogram leaves out: the rob
 BINS = 4000  # of the histograms: shares of the speed limit up to 4, angles past the limit up to 1 rad
 
 
+def next_action(mode: str, action: jax.Array, key: jax.Array) -> jax.Array:
+    """Returns the actions (N, A, D) that follow `action`, at first zero; the modes are those of `drive`."""
+    value_key, flip_key = jax.random.split(key)
+    uniform = jax.random.uniform(value_key, action.shape, minval=-1.0)
+    if mode == WALK:
+        return jnp.where(jax.random.bernoulli(flip_key, 0.005, (len(action), 1, 1)), uniform, action)
+    flips = jax.random.bernoulli(flip_key, 0.08, action.shape) | (action == 0.0)
+    return uniform if mode == "random" else jnp.where(flips, jnp.sign(uniform), action)
+
+
 def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: int = 250) -> dict[str, Any]:
     """Drives robots on the C engine for `steps` environment steps in all.
 
@@ -47,14 +57,6 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
     limits = env.robot.joint_lower, env.robot.joint_upper
     torque_limits = np.asarray(env.robot.torque_limit)
     shape = (num_envs, 1, env.action_size)
-
-    def action_of(action: jax.Array, key: jax.Array) -> jax.Array:
-        value_key, flip_key = jax.random.split(key)
-        uniform = jax.random.uniform(value_key, shape, minval=-1.0)
-        if mode == WALK:
-            return jnp.where(jax.random.bernoulli(flip_key, 0.005, (num_envs, 1, 1)), uniform, action)
-        flips = jax.random.bernoulli(flip_key, 0.08, shape) | (action == 0.0)
-        return uniform if mode == "random" else jnp.where(flips, jnp.sign(uniform), action)
 
     def torque_speed(data: Any, target: jax.Array) -> jax.Array:
         """Counts joints (11, 11) by the PD controller's |torque| and |speed|, in tenths of their limits."""
@@ -81,7 +83,7 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
 
     def advance(carry: Any, key: jax.Array) -> Any:
         state, action = carry
-        action = action_of(action, key)
+        action = next_action(mode, action, key)
         speed, excess, histogram = substeps(state, action)
         state = vector.step(state, action)
         bins = [jnp.clip(x * BINS / top, 0, BINS - 1).astype(jnp.int32) for x, top in ((speed, 4.0), (excess, 1.0))]

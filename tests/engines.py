@@ -1,6 +1,6 @@
-"""Agreement of two engines on the same episodes, and random actions in crowds of environments on Warp.
+"""Agreement of two engines on the same episodes; `python -m tests.soak play` has random actions in many environments.
 
-`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`, or `... crowd FOLDER warp`. With `c`,
+`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`. With `c`,
 `agree` measures how fast trajectories of one engine separate from initial positions that differ by 1e-6. Options of
 `record`: `--num-envs N` environments of standing robots and as many in play, `--seed S`, `--solver-iterations I`.
 """
@@ -144,33 +144,10 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     return figures
 
 
-def crowd(task: str, num_envs: int = 4096, steps: int = 1000) -> dict[str, Any]:
-    """Random actions on Warp: steps with an overflow, diverged environments, and whether all numbers stayed finite."""
-    vector_env = VectorEnv(make(task, impl="warp", num_envs=num_envs), num_envs)
-    env: Any = vector_env.env
-
-    def advance(state: State, key: jax.Array) -> tuple[State, Any]:
-        action = jax.random.uniform(key, (num_envs, env.num_agents, env.action_size), minval=-1.0)
-        state = vector_env.step(state, action)
-        finite = jnp.all(jnp.isfinite(state.obs)) & jnp.all(jnp.isfinite(state.reward))
-        return state, (jnp.any(state.metrics["overflow"] > 0), jnp.sum(state.metrics["diverged"]), finite)
-
-    run = jax.jit(lambda s, k: jax.lax.scan(advance, s, k))
-    state = jax.jit(vector_env.reset)(jax.random.PRNGKey(0))
-    overflow, diverged, finite = run(state, jax.random.split(jax.random.PRNGKey(1), steps))[1]
-    return {
-        "num_envs": num_envs,
-        "steps": steps,
-        "overflows": int(np.sum(np.asarray(overflow))),
-        "diverged": int(np.sum(np.asarray(diverged))),
-        "finite": bool(np.all(np.asarray(finite))),
-    }
-
-
 def main() -> None:
     """Prints one JSON object a task."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "agree", "crowd"))
+    parser.add_argument("what", choices=("record", "agree"))
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("engine", choices=("jax", "warp", "c"))
     parser.add_argument("tasks", nargs="*", default=list(TASKS))
@@ -185,11 +162,9 @@ def main() -> None:
             file.parent.mkdir(parents=True, exist_ok=True)
             states: dict[str, Any] = record(task, options.num_envs, options.seed, options.solver_iterations)
             np.savez_compressed(file, **states)
-        elif options.what == "agree":
+        else:
             apart = disagreement(task, options.engine, np.load(file))
             figures = {name: float(f"{value:.4g}") for name, value in apart.items()}
-        else:
-            figures = crowd(task)
         seconds = round(time.perf_counter() - began)
         print(json.dumps({"task": task, "engine": options.engine, **figures, "s": seconds}), flush=True)
 

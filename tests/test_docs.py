@@ -77,6 +77,17 @@ def test_a_wrong_command_would_be_found() -> None:
             parse(wrong)
 
 
+def test_the_release_tries_every_command_of_the_readme() -> None:
+    import release
+
+    tried = release.readme_commands((ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {words[0] for words in tried} == {*release.SHORTER, *release.WITHOUT}
+    for words in tried:
+        assert words[-1] == "--help" or parse(words), words
+    with pytest.raises(KeyError):
+        release.readme_commands("| `mqe nothing` | a new command |")
+
+
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Every task has a page with its clip, observation and rewards; formulas and links need no other host."""
     pytest.importorskip("mkdocs")

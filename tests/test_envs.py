@@ -14,6 +14,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make, register_task, replay
+from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
@@ -124,9 +125,33 @@ def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     after = gate_step(broken, jnp.zeros((2, 12)))
     assert after.terminated and float(after.metrics["diverged"]) == 1
     assert np.all(np.asarray(after.reward) == 0) and np.isfinite(after.obs).all()
+    last = dataclasses.replace(broken, step=jnp.int32(gate.max_steps - 1))
+    ended = [gate_step(start, jnp.zeros((2, 12))) for start in (last, dataclasses.replace(last, data=state.data))]
+    assert [(bool(s.terminated), bool(s.truncated)) for s in ended] == [(True, False), (False, True)]  # never both
     bad = gate_step(state, jnp.full((2, 12), jnp.nan))
     assert bad.terminated and float(bad.metrics["diverged"]) == 1
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
+
+
+def test_only_the_agents_trunks_count_as_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = made("go1football-defender")
+    read = env.read
+
+    @jax.jit
+    def collides(state: State, force: Array) -> Array:
+        monkeypatch.setattr(env, "read", lambda data: dataclasses.replace(read(data), trunk_force=force))
+        return env.step(state, jnp.zeros((2, 12))).metrics["collision"]
+
+    forces = {(100.0, 0.0, 0.0): 1, (0.0, 100.0, 0.0): 1, (0.0, 0.0, 100.0): 0}  # the third robot is the defender
+    assert {force: int(collides(initial(env), jnp.array(force))) for force in forces} == forces
+
+
+def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate: QuadrupedEnv, fresh: State) -> None:
+    ended = dataclasses.replace(fresh, truncated=jnp.array(True))
+    after = jax.jit(lambda state: autoreset(gate, state))(ended)
+    assert int(after.step) == 0 and np.abs(np.asarray(after.data.qpos - fresh.data.qpos)).max() > 1e-3
+    for key in (after.key, ended.key):
+        assert np.abs(np.asarray(jax.jit(gate.reset)(key).data.qpos - after.data.qpos)).max() > 1e-3
 
 
 def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:
@@ -193,6 +218,9 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
         gate.step(state, jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"action: dtype int32"):
         gate.step(state, jnp.zeros((2, 12), jnp.int32))
+    for nothing in (None, "go"):
+        with pytest.raises(InputError, match=r"action: .* must be an array of numbers"):
+            gate.step(state, nothing)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"action: contains NaN"):
         gate.step(state, jnp.full((2, 12), jnp.nan))
     for count, allowed in ((0, "greater than 0"), (1.5, "a valid integer")):
@@ -201,6 +229,13 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
     for shape in ((2, 2, 12), (3, 12)):  # another number of environments, no axis of agents
         with pytest.raises(InputError, match=r"action: shape .*; expected \(3, 2, 12\) \(environments, agents"):
             VectorEnv(gate, 3).step(state, jnp.zeros(shape))
+
+
+def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any) -> None:
+    action = jnp.tile(jnp.array([0.5, 3.0, -1e6]), (2, 4))
+    after, clipped = gate_step(fresh, action), gate_step(fresh, jnp.clip(action, -1.0, 1.0))
+    jax.tree.map(np.testing.assert_array_equal, (after.data.ctrl, after.obs), (clipped.data.ctrl, clipped.obs))
+    assert np.abs(np.asarray(gate_step(fresh, 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl - after.data.ctrl)).max() > 0
 
 
 def test_overrides_reach_every_level() -> None:

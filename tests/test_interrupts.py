@@ -1,10 +1,12 @@
-"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; SIGKILL too leaves a run that resumes exactly."""
+"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; SIGKILL too leaves a run that resumes exactly.
+
+`python -m tests.soak kills` has signals at random moments.
+"""
 
 from __future__ import annotations
 
 import csv
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -12,7 +14,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import fake_env
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -20,6 +21,7 @@ from safetensors.numpy import load_file
 from mqe_jax import cli
 from mqe_jax.cli import setup
 from mqe_jax.train.checkpoint import list_checkpoints
+from tests import fake_env
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
@@ -203,35 +205,6 @@ def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:
     body = "import signal; print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
     command = ["env", "--ignore-signal=INT", sys.executable, "-c", PREFIX + body, str(tmp_path)]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True\n"
-
-
-@pytest.mark.soak
-@SIGNALS
-def test_signals_at_random_moments(number: signal.Signals, tmp_path: Path) -> None:
-    """20 signals, a third before the first update; each run is resumed and equals an uninterrupted one."""
-    whole, moments = tmp_path / "whole", random.Random(int(number))
-    began = time.monotonic()
-    process = start([*GATE, "--run-dir", str(whole)])
-    wait_for(lambda: updates(whole) > 0, process)
-    starting, began = time.monotonic() - began, time.monotonic()
-    assert process.wait() == 0
-    training = time.monotonic() - began
-    for i in range(20):
-        run_dir = tmp_path / f"run{i}"
-        command = [*GATE, "--run-dir", str(run_dir), "--resume"]
-        process = start(command)
-        wait_for(lambda process=process: handles(process, signal.SIGTERM), process)
-        if i % 3:
-            wait_for(lambda run_dir=run_dir: updates(run_dir) > 0, process)
-        moment = time.monotonic() + moments.uniform(0.0, training / 2 if i % 3 else starting)
-        while time.monotonic() < moment and updates(run_dir) < (90 if i % 3 else 1):
-            time.sleep(0.01)
-        done, began = updates(run_dir), time.monotonic()
-        lines = end(process, number)
-        saved = [int(path.stem.removeprefix("step_")) // 32 for path in list_checkpoints(run_dir)]
-        print(f"{number.name}: {done} updates, {time.monotonic() - began:.2f} s to end, {saved}, {lines}")
-        assert subprocess.run(command, capture_output=True).returncode == 0
-        assert_same_run(whole, run_dir)
 
 
 STEPS, ENVS, ROLLOUT = 12, 4, 8

@@ -65,6 +65,8 @@ def test_torque_falls_to_zero_at_the_speed_limit_and_brakes_above(name: str) -> 
         np.testing.assert_allclose(given(motors, -100.0, share * speed)[0], -limit, rtol=1e-5)
     np.testing.assert_allclose(given(motors, 0.0, (1.0 + BAND / 2) * speed)[0], -0.5 * limit, rtol=1e-4)
     np.testing.assert_allclose(given(motors, 100.0, 1.5 * speed)[0], -limit, rtol=1e-4)
+    asked = motors.limit(np, np.zeros(12), np.zeros(12), 5.0 * speed, np.ones(12), np.zeros((12, 3)))[0]
+    np.testing.assert_allclose(asked, -limit, rtol=1e-4)  # not left to the limits of the model's actuators
 
 
 @pytest.mark.parametrize("name", ["go1", "go2"])

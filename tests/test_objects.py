@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -64,6 +65,15 @@ def test_a_box_slides_under_more_than_its_friction_only() -> None:
         moved.append(data.qpos[index.qpos[0]] - 2.0)
     assert abs(moved[0]) < 0.02
     assert moved[1] == pytest.approx(0.3 * objects.GRAVITY / 2, rel=0.1)  # (0.8 - 0.5) g for a second
+
+
+def test_a_flock_gathers_at_the_speed_of_the_paper() -> None:
+    """Of two sheep without friction and dogs, each moves inward by two thirds of the restlessness on average."""
+    place, still, far = jnp.array([[-2.0, 0.0], [2.0, 0.0]]), jnp.zeros((2, 2)), jnp.array([[0.0, 50.0]])
+    move = functools.partial(flock, restlessness=0.3, step=STEP, friction=0.0)
+    velocity = jax.vmap(lambda key: move(key, place, still, far))(jax.random.split(jax.random.PRNGKey(0), 8192))
+    np.testing.assert_allclose(velocity.mean(0), [[0.2, 0.0], [-0.2, 0.0]], atol=0.03)
+    np.testing.assert_allclose(velocity.std(0), 0.6, atol=0.03)
 
 
 def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0, seed: int = 0) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -36,12 +37,47 @@ def test_randomisation_reaches_the_physics() -> None:
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
     params = states.randomized
     assert np.ptp(np.asarray(params.friction)) > 0.3 and set(np.asarray(params.action_lag).tolist()) == {0, 1, 2}
-    step = jax.jit(jax.vmap(env.step))
+    step, neutral = jax.jit(jax.vmap(env.step)), states.data.ctrl
+    for waited in range(3):  # steps since the only action
+        states = step(states, jnp.full((16, 2, 12), float(waited == 0)))
+        moved = np.abs(np.asarray(states.data.ctrl - neutral)).max(-1) > 0.1
+        np.testing.assert_array_equal(moved, np.asarray(params.action_lag) == waited)
     for _ in range(60):
         states = step(states, jnp.zeros((16, 2, 12)))
     height = np.asarray(jax.vmap(env.read)(states.data).position_w)[..., 2].ravel()
     payload = np.asarray(params.payload).ravel()
     assert np.corrcoef(height, payload)[0, 1] < -0.5
+
+
+def test_a_pushed_robot_slides_further_the_smoother_its_feet_are() -> None:
+    """Robots that stand are given 0.8 m/s ahead; the floor's friction, 1, does not replace theirs."""
+    env = make("go1plane", impl="c", control="position", num_envs=16, randomization={"friction": (0.05, 1.5)})
+    x, speed = env.index.base_qpos[:, 0], env.index.base_qvel[:, 0]
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
+    step = jax.jit(jax.vmap(env.step))
+    for _ in range(30):
+        state = step(state, jnp.zeros((16, 2, 12)))
+    start = state.data.qpos[:, x]
+    state = dataclasses.replace(state, data=state.data.replace(qvel=state.data.qvel.at[:, speed].set(0.8)))
+    for _ in range(45):
+        state = step(state, jnp.zeros((16, 2, 12)))
+    slid = np.asarray(state.data.qpos[:, x] - start).ravel()
+    friction = np.asarray(state.randomized.friction).ravel()
+    smooth, rough = slid[friction < 0.3], slid[friction > 1.0]
+    assert len(smooth) > 2 and len(rough) > 2
+    assert np.median(smooth) > np.median(rough) + 0.2, (smooth, rough)
+
+
+def test_pushes_come_once_per_period_on_average() -> None:
+    """A period of 0.05 s is 2.5 environment steps; the robots are in the air, where nothing else brakes them."""
+    env = make("go1plane", impl="c", control="position", randomization={"push": 10.0, "push_period": 0.05})
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 512))
+    after = jax.jit(jax.vmap(env.step))(states, jnp.zeros((512, 2, 12)))
+    columns = env.index.base_qvel[:, :2]
+    change = np.asarray(after.data.qvel[:, columns] - states.data.qvel[:, columns])
+    pushed = np.abs(change).max(-1) > 1.0  # m/s; 1% of the pushes are smaller
+    assert 0.35 < pushed.mean() < 0.45
+    assert np.abs(change).max() < 12.0 and np.abs(change.mean()) < 1.0
 
 
 def test_observation_noise_spares_the_one_hots() -> None:

@@ -33,6 +33,17 @@ def test_difficulty_interpolates_the_ranges_of_blocks() -> None:
         Track((Gate(width=3.5),)).layout()
 
 
+def test_walls_around_a_track_face_inward_at_its_edges() -> None:
+    track = Track(blocks=(SpawnArea(2.0), Gate(length=2.0, width=0.6), EndWall()), width=3.0)
+    walls = {wall.name: (wall.point, wall.normal) for wall in track.layout().barriers}
+    assert walls == {
+        "back0": ((0.0, 0.0), (1.0, 0.0)),
+        "end2": ((4.0, 0.0), (-1.0, 0.0)),
+        "side_right": ((2.0, -1.5), (0.0, 1.0)),
+        "side_left": ((2.0, 1.5), (0.0, -1.0)),
+    }
+
+
 def test_rough_ground_is_smooth_bounded_and_grows_with_difficulty() -> None:
     easy, half, hard = (ROUGH.heights(4.0, 3.0, difficulty) for difficulty in (0.0, 0.5, 1.0))
     assert hard.shape == (31, 41)

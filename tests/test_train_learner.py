@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from probes import Probe
+from probes import Probe, Traces
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import Evaluator, evaluate
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
@@ -156,6 +156,35 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
 
+def test_a_bonus_for_entropy_widens_the_policy() -> None:
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
+    learner = make_learner(env, small(num_envs=4, ppo={"epochs": 2, "minibatches": 1, "entropy_coef": 1.0}))
+    state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
+    entropy = []
+    for _ in range(5):
+        state, metrics = update(state)
+        entropy.append(float(metrics["entropy"]))
+    assert np.all(np.diff(entropy) > 0.005), entropy
+
+
+def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, permutation = [], jax.random.permutation
+
+    def noted(key: jax.Array, count: int) -> jax.Array:
+        order = permutation(key, count)
+        jax.debug.callback(lambda order: drawn.append(order.tolist()), order)
+        return order
+
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
+    learner = make_learner(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
+    state = jax.jit(learner.init)(jax.random.PRNGKey(0))
+    monkeypatch.setattr(jax.random, "permutation", noted)
+    jax.block_until_ready(jax.jit(learner.update)(state))
+    jax.effects_barrier()
+    assert len({tuple(order) for order in drawn}) == len(drawn) == 3
+    assert all(sorted(order) == list(range(8)) for order in drawn)
+
+
 def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) -> None:
     """Even environments end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
     metrics = one_pass.metrics[0]
@@ -257,6 +286,19 @@ def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     assert result.to_dict()["diverged"] == 0 and result.overflow == 5 * 30
     with pytest.raises(ValueError, match="episodes: 0"):
         evaluate(env, act, 0, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+
+
+def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
+    """Also those of different blocks, and of different evaluations in one program."""
+    env, recorder = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6), Traces()
+
+    def act(params: Any, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return jax.random.uniform(key, (4, 2, 1)), memory
+
+    evaluator = Evaluator(env, act, block=2, recorder=recorder)
+    evaluator(None, 4, jax.random.split(jax.random.PRNGKey(0), 2))
+    actions = np.concatenate([np.ravel(trace.action) for trace in recorder.all])
+    assert len(recorder.all) == 3 and len(np.unique(actions)) == actions.size == 6 * 2 * 4 * 2
 
 
 def test_memory_starts_anew_with_every_counted_episode() -> None:

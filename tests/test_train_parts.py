@@ -137,6 +137,7 @@ def test_running_statistics_merge_as_one_batch() -> None:
         statistics = running_update(statistics, part.reshape(-1, 1, 3))
     np.testing.assert_allclose(statistics.mean, data.mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(statistics.variance, data.var(axis=0), rtol=1e-4)
+    np.testing.assert_array_equal(running_normalize(statistics, jnp.array([1e6, -1e6, 3.0]))[:2], [10.0, -10.0])
     constant = running_update(running_init(1), jnp.full((10, 1), 7.0))
     np.testing.assert_allclose(running_normalize(constant, jnp.array([7.0])), [0.0], atol=1e-4)
 

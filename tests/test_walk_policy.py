@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import pathlib
 import pickle
 import zipfile
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -292,3 +294,33 @@ def test_a_physics_step_that_does_not_fit_the_policy_is_refused(monkeypatch: pyt
     monkeypatch.setattr("mqe_jax.walk.env.Scene", functools.partial(Scene, timestep=0.004))
     with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
         WalkEnv(GO1, impl="c")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Sliding:
+    """Physics without a model: joints move by 0.001 rad in a physics step, whatever their torques, which are kept."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    torque: jax.Array
+
+
+def test_an_actuator_network_gets_the_newest_error_first_and_keeps_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slide(data: Sliding, torque: jax.Array, **_: Any) -> tuple[Sliding, jax.Array]:
+        return Sliding(data.qpos + 1e-3, data.qvel + 1.0, torque), jnp.array(False)
+
+    def torque(_: Any, error: jax.Array, velocity: jax.Array) -> jax.Array:
+        weights = jnp.array([1.0, 10.0, 100.0])
+        return jnp.tensordot(weights, error, 1) + 0.01 * jnp.tensordot(weights, velocity, 1)
+
+    monkeypatch.setattr(actuators, "actuator_torque", torque)
+    joints = np.arange(12)[None]
+    index: Any = SimpleNamespace(joint_qpos=joints, joint_qvel=joints, actuator=joints, num_robots=1)
+    physics: Any = SimpleNamespace(step=slide, num_substeps=3, model=SimpleNamespace(nu=12))
+    network = actuators.NetworkActuators(physics, index, GO1, {})
+    start = Sliding(jnp.full(12, 1e-3), jnp.ones(12), jnp.zeros(12))
+    data, memory, _ = network.step(start, network.init_memory(), jnp.zeros((1, 12)), {}, None)
+    np.testing.assert_allclose(data.torque, 0.003 + 0.02 + 0.1 + (3 + 20 + 100) / 100, rtol=1e-5)
+    np.testing.assert_allclose(memory[0][:, 0, 0], [3e-3, 2e-3], rtol=1e-5)
+    np.testing.assert_allclose(memory[1][:, 0, 0], [3.0, 2.0])

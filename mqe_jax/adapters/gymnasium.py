@@ -23,6 +23,8 @@ from mqe_jax.adapters import task_env, team_reward
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
+from mqe_jax.limits import Environments
+from mqe_jax.settings import check
 
 
 def register() -> None:
@@ -122,6 +124,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             allowed = ", ".join(mode.value for mode in AutoresetMode)
             raise InputError(f"autoreset_mode: {autoreset_mode!r}; allowed: {allowed}") from None
         self.render_mode = render_mode
+        num_envs = check("num_envs", num_envs, Environments)
         if not isinstance(task, QuadrupedEnv):
             overrides = {"num_envs": num_envs, **overrides}
         self.env = task_env(task, max_steps=max_episode_steps, limit="max_episode_steps", **overrides)

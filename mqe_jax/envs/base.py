@@ -311,7 +311,10 @@ class QuadrupedEnv(Task[S, P]):
         return jnp.where(jnp.arange(self.num_agents) == agent, steps, 0.0).astype(jnp.int32)
 
     def _checked(self, action: jax.Array) -> jax.Array:
-        action = jnp.asarray(action)
+        try:
+            action = jnp.asarray(action)
+        except (TypeError, ValueError):
+            fail("action", action, "an array of numbers")
         shape = (self.num_agents, self.action_size)
         if action.shape != shape:
             raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")

@@ -19,7 +19,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 from mqe_jax.files import archive, parse_json, write_atomically
-from mqe_jax.settings import to_mapping
+from mqe_jax.settings import PathText, checked, to_mapping
 
 # Fields on which a step depends; the others are recomputed by it.
 _FIELDS = ("step", "anchors", "control", "actuators", "randomized", "task", "assistance", "frozen_steps", "key")
@@ -77,6 +77,7 @@ def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, a
     write_atomically(pathlib.Path(file), buffer.getvalue())
 
 
+@checked(file=PathText)
 def load_recording(file: str | pathlib.Path) -> Recording:
     """Reads a recording.
 

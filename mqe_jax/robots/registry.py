@@ -6,10 +6,12 @@ from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.go2 import GO2
 from mqe_jax.robots.robot import Robot
+from mqe_jax.settings import checked
 
 ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 
 
+@checked(name=str)
 def get(name: str) -> Robot:
     """Returns a robot by name.
 

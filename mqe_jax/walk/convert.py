@@ -6,9 +6,11 @@ import os
 
 import numpy as np
 
+from mqe_jax.settings import PathText, checked
 from mqe_jax.walk_policy import Params, nested_params
 
 
+@checked(path=PathText)
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Reads the float32 weights of a TorchScript file of a `torch.nn.Sequential`, without torch.
 

@@ -95,10 +95,10 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         window = jnp.concatenate([memory, obs], axis=-2)
-        mean, _ = mean_of(params, window.reshape(len(obs), -1))
+        mean, _ = mean_of(params, window.reshape(*window.shape[:-2], -1))
         log_std = settings.bounded_log_std(params["log_std"])
         action = mean if key is None else mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        return action[:, None], log_prob(action, mean, log_std)[:, None], window[:, 1:]
+        return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], window[..., 1:, :]
 
     def value(
         params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array

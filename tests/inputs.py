@@ -1,0 +1,239 @@
+"""Bad input as strategies of hypothesis: values that `mqe_jax.limits` refuses, hostile texts, damaged files.
+
+`refused(kind)` of a kind of numbers is outside its bounds or no such number; nothing of it may be accepted. Texts and
+damaged files may be accepted where they happen to be valid.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import typing
+import zipfile
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from hypothesis import strategies as st
+
+from mqe_jax import limits
+from mqe_jax.cli.arguments import COMMANDS
+from mqe_jax.envs import TASKS
+from mqe_jax.settings import hints_of, is_record
+from mqe_jax.study.sweep import Sweep
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.networks import NETWORKS
+from mqe_jax.walk.task import WalkTask
+
+Strategy = st.SearchStrategy[Any]
+NO_NUMBERS = ("nan", "many", "", " ", "1,5", "0x10", "{}", "[]", "[1", "*x", "'", "2026-01-01", "1e", "--1", "\u00bd")
+"""Texts that are no number."""
+TEXTS = (
+    *NO_NUMBERS, "inf", "-inf", "1e400", "-1e-320", "1_000", "true", "null", "none", "~", "&a [*a]", "{a: *a}",
+    "[" * 200, "{a: " * 100, "!!python/object/apply:os.getcwd []", "!!binary aGk=", "? [a]", "a: b: c", "a=b", "=",
+    "\x00", "\x1b[2J", "\u202e", "\ud800", "/", ".", "..", "/dev/zero", "/dev/full", "/proc/self/mem", "-", "--",
+    "%s%n", "9" * 400, "a" * 5000,
+)  # fmt: skip
+"""Hostile texts for flags and YAML."""
+
+
+# -- settings ----------------------------------------------------------------------------------------------------------
+
+
+def records() -> dict[str, Any]:
+    """Returns the records whose fields are settings, by name; those of a task are its parameters."""
+    found: dict[str, Any] = {"training": TrainConfig, "sweep": Sweep, "walk": WalkTask}
+    found |= {f"network {name}": kind for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
+    return found | {task: kind.Params for task, kind in TASKS.items()}
+
+
+def numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the dotted names and kinds of a record's numbers, those of nested records too."""
+    for name, hint in hints_of(record).items():
+        if (kind := number_in(hint)) is not None:
+            yield prefix + name, kind
+        elif is_record(hint):
+            yield from numbers(hint, f"{prefix}{name}.")
+
+
+def number_in(hint: Any) -> Any:
+    """Returns the kind of a field that is a number or none, else None."""
+    if typing.get_origin(hint) is Annotated and typing.get_args(hint)[0] in (int, float):
+        return hint
+    parts = () if typing.get_origin(hint) in (tuple, list, dict) else typing.get_args(hint)
+    return next((kind for part in parts if (kind := number_in(part)) is not None), None)
+
+
+def refused(kind: Any) -> Strategy:
+    """Values that a kind of numbers refuses."""
+    low, high = limits.bounds(kind)
+    beyond = [st.floats(max_value=low, exclude_max=True), st.floats(min_value=high, exclude_min=True)]
+    others: list[Strategy] = [st.just(float("nan")), st.booleans(), st.sampled_from(NO_NUMBERS)]
+    others += [st.just([1]), st.just({})]
+    if typing.get_args(kind)[0] is int:
+        beyond = [st.integers(max_value=int(low) - 1), st.integers(min_value=int(high) + 1)]
+        others += [st.integers(int(low), int(low) + 9).map(lambda x: x + 0.5), st.just("1.5")]
+    return st.one_of(*beyond, *others)
+
+
+def allowed(kind: Any) -> Strategy:
+    """Numbers within the bounds of a kind."""
+    low, high = limits.bounds(kind)
+    return st.integers(int(low), int(high)) if typing.get_args(kind)[0] is int else st.floats(low, high)
+
+
+@st.composite
+def wrong_settings(draw: st.DrawFn) -> tuple[str, str, Any]:
+    """A record's name, a dotted name of a number in it, and a value that it must refuse."""
+    known = records()
+    name = draw(st.sampled_from(sorted(known)))
+    fields = dict(numbers(known[name]))
+    field = draw(st.sampled_from(sorted(fields)))
+    return name, field, draw(refused(fields[field]))
+
+
+# -- command lines -----------------------------------------------------------------------------------------------------
+
+TARGETS = {
+    "train": ["fake"], "eval": ["fake"], "render": ["fake", "-o", "a.png"], "view": ["fake"], "bench": ["fake"],
+    "export": ["fake", "--onnx", "a.onnx"], "replay": ["a.npz"],
+    "walk convert": ["a.jit", "b.jit", "-o", "w.safetensors"],
+    "sweep": ["a.yaml"], "report": ["a"], "tournament": ["go1tug", "idle", "random", "-o", "cup"],
+}  # fmt: skip
+"""Positional and needed arguments of each command."""
+
+
+LONG = ("view", "walk train", "walk eval", "tournament")
+"""Commands that run for long where a text happens to be allowed; they get numbers only, which never are."""
+
+
+def command_record(command: str) -> Any:
+    """Returns the record of a command's flags; of `train` and `walk train` that of the settings."""
+    return TrainConfig if isinstance(COMMANDS[command], str) else COMMANDS[command]
+
+
+@st.composite
+def wrong_flags(draw: st.DrawFn) -> list[str]:
+    """Words of a command line with a number that is refused, or a hostile text anywhere."""
+    command = draw(st.sampled_from(sorted(set(COMMANDS) - {"demo", "tasks", "zoo"})))
+    words = [*command.split(), *TARGETS.get(command, [])]
+    fields = dict(numbers(command_record(command)))
+    text = st.sampled_from(TEXTS) | st.text(max_size=20)
+    if command in LONG or (fields and draw(st.integers(0, 3))):
+        field = draw(st.sampled_from(sorted(fields)))
+        value = draw(refused(fields[field]).filter(lambda x: not isinstance(x, list)))
+        return [*words, f"--{field.replace('_', '-')}={value}"]
+    flag = draw(st.sampled_from(["--set=", "--set=gate_width=", "--seed=", "--policy=", "--config=", "--nope=", ""]))
+    return [*words, flag + "nothing " * (not flag) + draw(text)]
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def yaml_text(draw: st.DrawFn, record: Any) -> str:
+    """YAML of a record's names with hostile values, as text since a value may be a fragment."""
+    names = [*hints_of(record), *(name for name, _ in numbers(record)), "nothing", "[a]", "1", "null"]
+    value = st.sampled_from(TEXTS) | st.text(max_size=30) | st.floats().map(str) | st.integers().map(str)
+    lines = draw(st.lists(st.tuples(st.sampled_from(names), value), min_size=1, max_size=4))
+    return "\n".join(f"{name}: {text}" for name, text in lines)
+
+
+@st.composite
+def damaged(draw: st.DrawFn, content: bytes) -> bytes:
+    """A file with bytes that are flipped, missing, added or repeated; mostly in its first kilobyte, the header's."""
+    for _ in range(draw(st.integers(1, 3))):
+        place = draw(st.integers(0, min(len(content), 1000)) | st.integers(0, len(content)))
+        end = place + draw(st.integers(1, 64))
+        new = draw(st.sampled_from(("flip", "cut", "drop", "add", "repeat")))
+        if new == "flip" and place < len(content):
+            flipped = content[place] ^ (1 << draw(st.integers(0, 7)))
+            content = content[:place] + bytes([flipped]) + content[place + 1 :]
+        else:
+            middle = {"add": content[place:end] + draw(st.binary(max_size=64)), "repeat": content[place:end] * 2}
+            content = content[:place] + middle.get(new, b"") + (b"" if new == "cut" else content[end:])
+    return content
+
+
+@st.composite
+def tensors_file(draw: st.DrawFn, content: bytes) -> bytes:
+    """A safetensors file whose header is changed: types, shapes, places, names, metadata of another type."""
+    size = struct.unpack("<Q", content[:8])[0]
+    header = json.loads(content[8 : 8 + size])
+    name = draw(st.sampled_from(sorted(header)))
+    junk = st.recursive(
+        st.none() | st.booleans() | st.integers() | st.text(max_size=9), lambda x: st.lists(x, max_size=3), max_leaves=6
+    )
+    if name == "__metadata__":
+        header[name][draw(st.sampled_from([*header[name], "more"]))] = draw(
+            st.sampled_from(["", "{}", "[]", "null", "3", "[" * 2000, '{"dims": 1}', '{"config": []}'])
+            | st.text(max_size=9)
+        )
+    elif draw(st.booleans()):
+        types = st.sampled_from(["F8_E4M3", "BF16", "BOOL", "I64", "F16", "C64", "F4", "U16"])
+        part = draw(st.sampled_from(["dtype", "shape", "data_offsets"]))
+        header[name][part] = draw(types | junk if part == "dtype" else junk | st.lists(st.integers(), max_size=4))
+    else:
+        header[draw(st.text(max_size=9))] = header.pop(name)
+    text = json.dumps(header).encode("utf-8", "replace")
+    length = draw(st.sampled_from([len(text)] * 6 + [0, 2**40, len(text) - 1]))
+    return struct.pack("<Q", length) + text + content[8 + size :]
+
+
+@st.composite
+def script_archive(draw: st.DrawFn, content: bytes) -> bytes:
+    """A TorchScript archive with another pickle, other sizes of storages, or members that lie about themselves."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = draw(st.sampled_from(sorted(members)))
+    kind = draw(st.sampled_from(("damaged", "empty", "twice", "large", "renamed", "hostile")))
+    if kind == "damaged":
+        members[name] = draw(damaged(members[name]))
+    elif kind == "hostile":
+        members[next(n for n in members if n.endswith("data.pkl"))] = draw(st.sampled_from(PICKLES))
+    else:
+        other = {"empty": b"", "large": bytes(2**21), "twice": members[name] * 2}.get(kind)
+        members[name if other is not None else name + draw(st.text("abc/.", max_size=5))] = other or members.pop(name)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member, data in members.items():
+            archive.writestr(member, data)
+    return draw(damaged(buffer.getvalue())) if draw(st.integers(0, 3)) == 0 else buffer.getvalue()
+
+
+def small_archive() -> bytes:
+    """Returns a TorchScript archive of one module without tensors."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("net/data.pkl", b"\x80\x02c__torch__\nModule\n)\x81}X\x01\x00\x00\x00aK\x01sb.")
+        archive.writestr("net/data/0", bytes(64))
+        archive.writestr("net/version", "3\n")
+    return buffer.getvalue()
+
+
+PICKLES = (
+    b"cos\nsystem\n(S'true'\ntR.",
+    b"c__torch__\nModule\n)\x81}(X\x01\x00\x00\x00aubc__torch__\nModule\n)\x81.",
+    b"\x80\x02]\x94h\x00a" + b"]" * 2000 + b".",
+    b"\x80\x02c__torch__\nM\n)\x81q\x00}X\x04\x00\x00\x00selfh\x00sb.",  # a module that contains itself
+    b"\x80\x02" + b"(" * 5000 + b".",
+    b"\x80\x04\x8d\xff\xff\xff\xff\xff\xff\xff\x7f",  # a text of 2^63 bytes
+    b"ctorch._utils\n_rebuild_tensor_v2\n((NI9\nI9\ntI0\nI0\ntR.",
+)
+"""Pickles that name foreign code, never end, or hold something else than tensors."""
+
+
+# -- the viewer's messages ---------------------------------------------------------------------------------------------
+
+
+def messages() -> Strategy:
+    """Values that a browser may send, packed by msgpack later: fields of the known messages with any values."""
+    value: Strategy = st.floats() | st.integers(-(2**63), 2**64 - 1) | st.text(max_size=70)
+    value |= st.none() | st.binary(max_size=9) | st.booleans()
+    vector = st.lists(value, max_size=5) | st.lists(st.floats(-9, 9), min_size=3, max_size=4)
+    kinds = ["ViewerCameraMessage", "GuiUpdateMessage", "GuiButtonHoldMessage", "CommandTriggerMessage", "Nothing"]
+    names = ["wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction"]
+    names += ["uuid", "updates", "frequency", "more"]
+    inner = st.fixed_dictionaries({"value": value})
+    fields = st.dictionaries(st.sampled_from(names), value | vector | inner, max_size=9)
+    return st.tuples(st.sampled_from(kinds), fields).map(lambda pair: {"type": pair[0], **pair[1]}) | value | vector

@@ -1,0 +1,169 @@
+"""Builds the wheel and its bill of materials, and tries the README's commands with it, in an empty environment.
+
+`python tools/release.py [--audit]` writes into dist/; with `--audit` it only looks up known vulnerabilities of the
+packages in constraints.txt. The commands run in another folder, which the source tree cannot be imported from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DIST = ROOT / "dist"
+EXTRAS = "render,view,export"
+"""Extras that the README's commands need."""
+SHORTER: dict[str, str] = {
+    "tasks": "",
+    "train": "--num-envs 8 --rollout-steps 8 --ppo.minibatches 1 --total-steps 128 --impl c",
+    "eval": "--episodes 2",
+    "zoo": "",
+    "render": "--seconds 1",
+    "tournament": "--episodes 2 -o cup",
+    "view": "--port 8765",
+    "export": "",
+    "bench": "--steps 2 --repeats 1",
+}
+"""Flags added to the README's command of each name, so that it takes seconds."""
+WITHOUT = {"sweep", "report", "walk"}
+"""Commands whose line in the README is a pattern: their help is printed."""
+SECONDS = 600
+
+
+def readme_commands(text: str) -> list[list[str]]:
+    """Returns the words of the README's `mqe` commands, shortened; `runs/a` and `runs/b` are named policies.
+
+    Raises:
+        KeyError: for a command that is neither in `SHORTER` nor in `WITHOUT`.
+    """
+    found = [shlex.split(line)[1:] for line in re.findall(r"^\| .*", text, re.MULTILINE) for line in _spans(line)]
+    commands = []
+    for words in found:
+        if words[0] in WITHOUT:
+            commands.append([*words[: 2 if words[0] == "walk" else 1], "--help"])
+        else:
+            commands.append([*words, *SHORTER[words[0]].split()])
+    names = {"runs/a": "idle", "runs/b": "random"}
+    return [[names.get(word) or word for word in words] for words in commands]
+
+
+def _spans(row: str) -> Iterator[str]:
+    """Yields the commands of a table's row: code that begins with `mqe` in its first cell."""
+    yield from (code for code in re.findall(r"`(mqe [a-z][^`]*)`", row.split(" | ")[0]))
+
+
+def readme_programs(text: str) -> list[str]:
+    """Returns the README's Python blocks."""
+    return re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def run(*command: object, folder: Path = ROOT) -> None:
+    """Runs a program without this tree on its path; CalledProcessError where it fails."""
+    print("$", *command, flush=True)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run([str(word) for word in command], cwd=folder, env=environment, check=True, timeout=SECONDS)
+
+
+def new_environment(folder: Path, *requirements: object) -> Path:
+    """Creates a virtual environment with packages of constraints.txt; returns its folder of programs."""
+    run(sys.executable, "-m", "venv", "--clear", folder)
+    pip = [folder / "bin" / "python", "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+    run(*pip, "-c", ROOT / "constraints.txt", *requirements)
+    return folder / "bin"
+
+
+def release_tools(folder: Path) -> Path:
+    """Returns the programs of the extra `release`, in an environment of their own."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    run(sys.executable, "-m", "venv", "--clear", folder)
+    run(folder / "bin" / "python", "-m", "pip", "install", "-q", *project["optional-dependencies"]["release"])
+    return folder / "bin"
+
+
+def audit(tools: Path) -> int:
+    """Prints known vulnerabilities of the pinned packages; 1 if there are any, 0 also where none can be looked up."""
+    command = [tools / "pip-audit", "--requirement", ROOT / "constraints.txt", "--disable-pip", "--no-deps"]
+    command += ["--format", "json", "--progress-spinner", "off"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=SECONDS)
+    try:
+        packages = json.loads(done.stdout)["dependencies"]
+    except (ValueError, KeyError):
+        print(f"audit: NOT DONE, the database cannot be reached: {(done.stderr.splitlines() or ['?'])[-1][:200]}")
+        return 0
+    looked_up = [package for package in packages if "vulns" in package]
+    for package in looked_up:
+        for found in package["vulns"]:
+            print(f"audit: {package['name']} {package['version']}: {found['id']}, fixed in {found['fix_versions']}")
+    without = "" if len(looked_up) == len(packages) else "; NOT DONE for the others, which the database does not have"
+    print(f"audit: {len(looked_up)} of {len(packages)} packages looked up{without}")
+    return int(any(package["vulns"] for package in looked_up))
+
+
+def build() -> Path:
+    """Builds the wheel into dist/; returns it."""
+    for leftover in (DIST, ROOT / "build" / "lib"):  # of an earlier build, which would become part of the wheel
+        shutil.rmtree(leftover, ignore_errors=True)
+    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", DIST, ROOT)
+    (wheel,) = DIST.glob("*.whl")
+    return wheel
+
+
+def try_readme(programs: Path, folder: Path) -> None:
+    """Runs the README's programs and commands in a folder, and checks that the package is the installed one."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    where = "import mqe_jax, sys; sys.exit(not mqe_jax.__file__.startswith(sys.prefix))"
+    run(programs / "python", "-c", where, folder=folder)
+    for program in readme_programs(text):
+        run(programs / "python", "-c", program, folder=folder)
+    for words in readme_commands(text):
+        if words[0] == "view":
+            view(programs, words, folder)
+        else:
+            run(programs / "mqe", *words, folder=folder)
+
+
+def view(programs: Path, words: Sequence[str], folder: Path) -> None:
+    """Starts the viewer and ends it as soon as it names its address."""
+    print("$", "mqe", *words, flush=True)
+    command = [str(programs / "mqe"), *words]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+        assert process.stderr is not None
+        said = next((line for line in process.stderr if "http://" in line), "")
+        process.terminate()
+        if not said or process.wait(30) != 143:
+            raise RuntimeError(f"mqe view said {said!r} and ended with {process.returncode}")
+
+
+def main() -> int:
+    """Builds and tries a release; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--audit", action="store_true", help="only look up known vulnerabilities")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tools = release_tools(folder / "tools")
+        found = audit(tools)
+        if arguments.audit:
+            return found
+        wheel = build()
+        programs = new_environment(folder / "venv", f"{wheel}[{EXTRAS}]")
+        bill = wheel.with_suffix(".cdx.json")
+        run(tools / "cyclonedx-py", "environment", programs / "python", "--output-file", bill)
+        (folder / "work").mkdir()
+        try_readme(programs, folder / "work")
+    print(f"release: {wheel.relative_to(ROOT)} and {bill.relative_to(ROOT)}")
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
