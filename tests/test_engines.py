@@ -21,6 +21,7 @@ import pytest
 
 from mqe_jax import engines
 from mqe_jax.engines import Engine
+from mqe_jax.engines.c import CEngine
 from mqe_jax.engines.host_call import host_call
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
@@ -285,3 +286,24 @@ def test_a_second_process_compiles_no_step_of_the_c_engine(tmp_path: Path) -> No
     )
     assert int(first[1]) >= 2 and int(second[1]) == 0 and int(second[0]) == int(first[0]) + int(first[1])
     assert first[2] == second[2]
+
+
+def test_a_divided_batch_is_stepped_as_a_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the last bit, with resets, from two threads at once."""
+    count = CEngine.DIVIDED
+    env = VectorEnv(make("go1plane", impl="c", num_envs=count, episode_length=0.06), count)
+    assert env.env.physics.parts(count) == 2 and env.env.physics.parts(count + 1) == 1
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (6, count, env.num_agents, env.action_size), minval=-1.0)
+    start = jax.jit(env.reset)(jax.random.PRNGKey(0))
+
+    def states() -> Any:
+        step = jax.jit(lambda state: jax.lax.scan(lambda s, a: (env.step(s, a), s.obs), state, actions))
+        return step.lower(start).compile(QUICK)(start)
+
+    divided = states()
+    monkeypatch.setattr(CEngine, "DIVIDED", count + 1)
+    whole = states()
+    assert bool(whole[0].step.max() < 6)  # the episodes ended
+    assert all(
+        np.array_equal(a, b, equal_nan=True) for a, b in zip(*map(jax.tree.leaves, (divided, whole)), strict=True)
+    )
