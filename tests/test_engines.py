@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -307,3 +308,18 @@ def test_a_divided_batch_is_stepped_as_a_whole_one(monkeypatch: pytest.MonkeyPat
     assert all(
         np.array_equal(a, b, equal_nan=True) for a, b in zip(*map(jax.tree.leaves, (divided, whole)), strict=True)
     )
+
+
+@pytest.mark.parametrize(
+    "task", ["go1plane", *(pytest.param(task, marks=pytest.mark.soak) for task in TASKS if task != "go1plane")]
+)
+def test_reset_and_step_are_lowered_for_a_tpu(task: str) -> None:
+    env = make(task, impl="jax", num_envs=2)
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    key = jax.ShapeDtypeStruct((2, 2), jnp.uint32)
+    action = jax.ShapeDtypeStruct((2, env.num_agents, env.action_size), jnp.float32)
+    for exported in (
+        jax.export.export(reset, platforms=["tpu"])(key),
+        jax.export.export(step, platforms=["tpu"])(jax.eval_shape(reset, key), action),
+    ):
+        assert exported.platforms == ("tpu",) and "custom_call @mqe" not in exported.mlir_module()
