@@ -23,6 +23,7 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from mqe_jax.cli import setup
 from mqe_jax.cli.bench import device_name
+from mqe_jax.cli.output import print_table
 from mqe_jax.files import replacing
 from mqe_jax.settings import override
 from mqe_jax.train.learner import make_learner
@@ -106,9 +107,8 @@ def shares(operations: Sequence[Operation]) -> dict[str, float]:
 
 def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, dict[str, float]]:
     """Returns the compiled program of a function, and its seconds: traced, compiled, and read from JAX's cache."""
-    seconds = {}
+    seconds, program = {}, None
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
-    program = None
     with tempfile.TemporaryDirectory() as folder:
         _cache(folder, 0.0)
         try:
@@ -118,9 +118,9 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, dict[s
                 seconds["trace_s"] = time.perf_counter() - began
                 program = lowered.compile()
                 seconds[name] = time.perf_counter() - began - seconds["trace_s"]
+            return program, seconds
         finally:
             _cache(*before)
-    return program, seconds
 
 
 def _cache(folder: str | None, least: float) -> None:
@@ -172,7 +172,6 @@ def profile(env: Any, vector: Any, key: jax.Array, *, steps: int, repeats: int) 
     }
     rates = _in_turn(runs, count * steps, repeats)
     operations = traced(lambda: whole(walking), whole.as_text(), "other")
-    memory = whole.memory_analysis()
     return {
         "num_envs": count,
         **rates,
@@ -181,7 +180,7 @@ def profile(env: Any, vector: Any, key: jax.Array, *, steps: int, repeats: int) 
         "kernels_per_step": len(operations) / steps,
         "copies_per_step": sum(operation.copy for operation in operations) / steps,
         "state_bytes_per_env": sum(leaf.nbytes for leaf in jax.tree.leaves(start[0])) / count,
-        "work_bytes_per_env": memory.temp_size_in_bytes / count,
+        "work_bytes_per_env": whole.memory_analysis().temp_size_in_bytes / count,
         **contacts(env, walking[0].data),
         "step": shares(operations),
     }
@@ -202,8 +201,8 @@ def _in_turn(runs: dict[str, tuple[Callable[..., Any], Any]], amount: int, repea
 
 def profile_training(task: str, impl: str, env: dict[str, Any], num_envs: int) -> dict[str, Any]:
     """Returns the seconds of a training update with the task's settings and its shares, `learner` among them."""
-    changes = {"num_envs": num_envs, "evaluation.every": None, "env": env}
-    config = override(setup.for_task(setup.base_config(task, None), task), changes)
+    config = setup.for_task(setup.base_config(task, None), task, env)
+    config = override(config, {"num_envs": num_envs, "evaluation.every": None})
     learner = make_learner(setup.environments(impl, config, 1)[0], config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     update = jax.jit(learner.update).lower(state).compile()
@@ -223,6 +222,9 @@ def run(command: Any) -> dict[str, Any]:
         row = profile(env, vector, jax.random.PRNGKey(command.seed), steps=command.steps, repeats=command.repeats)
         row["training"] = profile_training(command.task, command.impl, command.overrides(), num_envs)
         rows.append(row)
+        if not command.json:
+            parts = {f"{kind}/{part}": share for kind in ("step", "training") for part, share in row[kind].items()}
+            print_table({name: value for name, value in row.items() if name not in ("step", "training")} | parts)
     result = {"task": command.task, "impl": env.physics.impl, "device": device_name(), "jax": jax.__version__}
     if command.output is not None:
         draw(rows, command.output, f"{result['task']}, {result['impl']}, {result['device']}")
@@ -236,14 +238,12 @@ def draw(rows: Sequence[dict[str, Any]], path: Path, title: str) -> None:
     figure = Figure((9.0, 3.6), dpi=150, layout="constrained")
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("step", "training"), strict=True):
         names, floor = [str(row["num_envs"]) for row in rows], np.zeros(len(rows))
-        for part in (*SCOPES, "learner", "other", "idle"):
+        for number, part in enumerate((*SCOPES, "learner", "other", "idle")):
             values = np.array([100.0 * row[kind].get(part, 0.0) for row in rows])
-            if values.any():
-                axes.bar(names, values, bottom=floor, label=part, color="0.85" if part == "idle" else None)
-                floor = floor + values
-        axes.set(xlabel="environments", title="environment step" if kind == "step" else "training update")
-        axes.legend(frameon=False, fontsize=8)
-    figure.axes[0].set_ylabel("share of time (%)")
+            axes.bar(names, values, bottom=floor, label=part, color="0.85" if part == "idle" else f"C{number}")
+            floor = floor + values
+        axes.set(xlabel="environments", title=f"share of time (%): {kind}")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
     figure.suptitle(title)
     with replacing(path) as temporary:
         figure.savefig(temporary)
