@@ -2,10 +2,10 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mqe_jax import cli
@@ -49,7 +49,7 @@ def test_contacts_are_those_of_standing_robots() -> None:
     env = make("go1plane", impl="c", control="position", num_envs=4)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
     low = state.data.replace(qpos=state.data.qpos.at[:2, 2].set(0.27).at[2:, 2].set(5.0))
-    found = profile.contacts(env, SimpleNamespace(**{name: getattr(low, name) for name in vars(low)}))
+    found = profile.contacts(env.physics.model, {name: np.asarray(x) for name, x in profile.sampled(low).items()})
     assert found["contacts_max"] >= 4 and 0 < found["contacts_mean"] <= found["contacts_max"] / 2
     assert found["rows_max"] > found["contacts_max"]
 

@@ -30,8 +30,7 @@ from mqe_jax.train.learner import make_learner
 
 SCOPES = ("physics", "control", "task", "reset")
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%(\S+) = .*?\s([a-z][a-z\-]*)\(", re.MULTILINE)
-_CONTAINERS = ("while", "call", "conditional")
-_SAMPLE = 256  # environments in which contacts are counted
+_SAMPLE = 8  # environments in which contacts are counted in every step
 
 
 class Operation(NamedTuple):
@@ -77,10 +76,9 @@ def traced(run: Callable[[], Any], text: str, rest: str) -> list[Operation]:
                 if name not in known and not devices:
                     continue
                 part, kind = known.get(name, ("physics", ""))
-                if kind not in _CONTAINERS:
+                if kind not in ("while", "call", "conditional"):  # their operations are events too
                     copies = kind == "copy" or event.name.lower().startswith(("memcpy", "copy"))
-                    start = event.start_ns * 1e-9
-                    found.append(Operation(part, copies, start, start + event.duration_ns * 1e-9))
+                    found.append(Operation(part, copies, event.start_ns * 1e-9, event.end_ns * 1e-9))
     return found
 
 
@@ -98,10 +96,9 @@ def shares(operations: Sequence[Operation]) -> dict[str, float]:
         np.add.at(running, (place.reshape(times.shape)[:, side], column), sign)
     running = np.round(np.cumsum(running, axis=0))[:-1]
     count = running.sum(axis=1, keepdims=True)
-    length = np.diff(edges)[:, None]
-    total = length.sum()
-    found = (running / np.maximum(count, 1.0) * length).sum(axis=0) / total
-    idle = float(length[count == 0.0].sum() / total)
+    length = np.diff(edges)[:, None] / (edges[-1] - edges[0])
+    found = (running / np.maximum(count, 1.0) * length).sum(axis=0)
+    idle = float(length[count == 0.0].sum())
     return {**dict(zip(parts, map(float, found), strict=True)), "idle": idle}
 
 
@@ -129,15 +126,17 @@ def _cache(folder: str | None, least: float) -> None:
     reset_cache()
 
 
-def contacts(env: Any, data: Any) -> dict[str, float]:
-    """Returns mean and maximum of contacts and constraint rows over environments in these states (N, ...).
+def sampled(data: Any) -> dict[str, jax.Array]:
+    """Returns what contacts depend on, of the first environments of a batch."""
+    return {name: getattr(data, name)[:_SAMPLE] for name in ("qpos", "qvel", "mocap_pos", "mocap_quat", "ctrl")}
+
+
+def contacts(model: mujoco.MjModel, states: dict[str, np.ndarray]) -> dict[str, float]:
+    """Returns mean and maximum of contacts and constraint rows over states (M, ...) of `sampled`.
 
     They are those that MuJoCo's C engine finds, whatever the engine.
     """
-    model, found = env.physics.model, []
-    host = mujoco.MjData(model)
-    fields = ("qpos", "qvel", "mocap_pos", "mocap_quat", "ctrl")
-    states = {name: np.asarray(getattr(data, name))[:_SAMPLE] for name in fields}
+    host, found = mujoco.MjData(model), []
     for index in np.flatnonzero(np.isfinite(states["qpos"]).all(axis=1) & np.isfinite(states["qvel"]).all(axis=1)):
         for name, values in states.items():
             getattr(host, name)[:] = values[index]
@@ -159,13 +158,14 @@ def profile(env: Any, vector: Any, key: jax.Array, *, steps: int, repeats: int) 
     def step(carry: Any, _: None) -> Any:
         state, key = carry
         key, action_key = jax.random.split(key)
-        return (vector.step(state, jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)), key), None
+        state = vector.step(state, jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0))
+        return (state, key), sampled(state.data)
 
     bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
     start = (jax.jit(vector.reset)(key), key)
-    whole, seconds = compiled(lambda carry: jax.lax.scan(step, carry, None, steps)[0], start)
+    whole, seconds = compiled(lambda carry: jax.lax.scan(step, carry, None, steps), start)
     bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
-    walking = whole(start)
+    walking, states = whole(start)
     runs: dict[str, tuple[Callable[..., Any], Any]] = {
         "env_steps_per_s": (whole, walking),
         "bare_env_steps_per_s": (bare, jax.tree.map(jnp.copy, start[0].data)),
@@ -181,7 +181,7 @@ def profile(env: Any, vector: Any, key: jax.Array, *, steps: int, repeats: int) 
         "copies_per_step": sum(operation.copy for operation in operations) / steps,
         "state_bytes_per_env": sum(leaf.nbytes for leaf in jax.tree.leaves(start[0])) / count,
         "work_bytes_per_env": whole.memory_analysis().temp_size_in_bytes / count,
-        **contacts(env, walking[0].data),
+        **contacts(env.physics.model, {name: np.concatenate(np.asarray(x)) for name, x in states.items()}),
         "step": shares(operations),
     }
 
@@ -225,10 +225,10 @@ def run(command: Any) -> dict[str, Any]:
         if not command.json:
             parts = {f"{kind}/{part}": share for kind in ("step", "training") for part, share in row[kind].items()}
             print_table({name: value for name, value in row.items() if name not in ("step", "training")} | parts)
-    result = {"task": command.task, "impl": env.physics.impl, "device": device_name(), "jax": jax.__version__}
+    about = {"task": command.task, "impl": env.physics.impl, "device": device_name(), "jax": jax.__version__}
     if command.output is not None:
-        draw(rows, command.output, f"{result['task']}, {result['impl']}, {result['device']}")
-    return {**result, "profiles": rows}
+        draw(rows, command.output, ", ".join(about.values()))
+    return {**about, "profiles": rows}
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path, title: str) -> None:
