@@ -102,6 +102,7 @@ class Controller:
         default = jnp.tile(jnp.asarray(self.default_commands), (action.shape[0], 1))
         return default.at[:, self.skill.index(self.commands)].add(change)
 
+    @jax.named_scope("control")
     def targets(
         self,
         state: ControlState,

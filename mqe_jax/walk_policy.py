@@ -209,7 +209,7 @@ def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
         if tuple(flat[name].shape) != shape:
             raise InputError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
         part, layer, kind = name.split(".")
-        params[part].setdefault(layer, {})[kind] = jnp.asarray(flat[name], jnp.float32)
+        params[part].setdefault(layer, {})[kind] = jnp.asarray(np.asarray(flat[name], np.float32))
     return params
 
 

@@ -23,6 +23,8 @@ BAD = {
     "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
     "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
+    "sizes alone": (["bench", "go1gate", "--sizes", "8"], ["sizes", "--profile"]),
+    "profile's table": (["bench", "go1gate", "--profile", "--csv", "x.csv"], ["x.csv", "--json"]),
     "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
     "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
     "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),

@@ -5,6 +5,7 @@ Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 
 from __future__ import annotations
 
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ import tyro
 
 from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions
 from mqe_jax.cli.output import echo, print_table
+from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Episodes, Horizon
 from mqe_jax.settings import record
 
@@ -173,6 +175,13 @@ class Bench(TaskOptions):
     seed: Seed = 0
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Append the results as a row to this file."""
+    profile: bool = False
+    """Also measure what an environment step and a training update consist of: physics, walk policy (control),
+    observation and reward (task), reset, learner and idle time; kernels, contacts, compilation and memory."""
+    sizes: Annotated[list[Environments], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
+    """Numbers of environments of the profile. Default: --num-envs."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """Image of the profile to write, such as profile.png."""
 
     def run(self) -> dict[str, Any]:
         """Measures throughput; prints a table, or returns the object for `--json`."""
@@ -180,6 +189,14 @@ class Bench(TaskOptions):
 
         from mqe_jax.cli import bench, setup
 
+        if not self.profile and (self.sizes or self.output):
+            raise InputError("sizes and output need --profile")
+        if self.profile and self.csv is not None:
+            raise InputError(f"csv: {self.csv} is not allowed with --profile; use --json")
+        if self.profile:
+            from mqe_jax.cli.profile import run
+
+            return run(self)
         if self.csv is not None:
             bench.check_csv(self.csv)  # before the measurement, which would be lost
         env, vector_env = setup.make_env(self.task, self.impl, self.overrides(), self.num_envs)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -29,6 +29,8 @@ class CEngine(Engine):
     """MuJoCo's C engine as a pure JAX function; no contact is ever dropped."""
 
     impl = "c"
+    DIVIDED = 64
+    """Number of environments from which a batch is divided."""
 
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
@@ -38,7 +40,7 @@ class CEngine(Engine):
         content = np.zeros(mujoco.mj_sizeModel(self._model), np.uint8)
         mujoco.mj_saveModel(self._model, None, content)
         self._content = content.tobytes()
-        self._batches: dict[tuple[int, tuple[str, ...], bool], Batch] = {}
+        self._idle: dict[tuple[int, tuple[str, ...], bool], list[Batch]] = {}
         self._rows: dict[int, tuple[Motors, np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
         self._sizes = (model.nq, model.nv, model.nv, model.nsensordata)
@@ -53,6 +55,10 @@ class CEngine(Engine):
         if platform == "cpu":
             return None
         return f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
+
+    def parts(self, num_envs: int) -> int:
+        """Returns 2 for large batches: XLA computes one half while MuJoCo's threads step the other."""
+        return 2 if num_envs >= self.DIVIDED and num_envs % 2 == 0 else 1
 
     def blank(self) -> mjx.Data:
         return private.without_pointers(private.load_mjx().make_data(self.model, impl="cpp"))
@@ -93,31 +99,40 @@ class CEngine(Engine):
         lead = qpos.shape[:-1]
         count = int(np.prod(lead)) if lead else 1
         flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
+        key = count, names, forced
         with self._lock:
-            batch = self._batches.get((count, names, forced))
-            if batch is None:
-                batch = self._batches[count, names, forced] = Batch(self._model, nsim=count)
-                if self.motors is not None:
-                    self._rows[count] = self._repeated(self.motors, count)
-            start = {name: next(flat) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
-            for name, values in start.items():
-                batch.bind(name)[:] = values
-            if self._model.nmocap:
-                batch.bind("mocap_pos")[:] = next(flat)
-                batch.bind("mocap_quat")[:] = next(flat)
-            if forced:
-                batch.bind("xfrc_applied")[:] = next(flat)
-            batch.bind("time")[:] = 0.0
-            for name in names:
-                batch.expand(name)[:] = next(flat)
-            sensordata = batch.bind("sensordata")
-            if self.motors is None:
-                batch.step(nstep=substeps)
-            else:
-                self._drive(batch, self.motors, substeps, names, start)
-            parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
-            row = np.concatenate(parts, axis=1, dtype=np.float32)
+            if self.motors is not None and count not in self._rows:
+                self._rows[count] = self._repeated(self.motors, count)
+            idle = self._idle.setdefault(key, [])
+            batch = idle.pop() if idle else Batch(self._model, nsim=count)
+        try:
+            row = self._stepped(batch, names, forced, substeps, flat)
+        finally:
+            idle.append(batch)
         return row.reshape(*lead, -1)
+
+    def _stepped(
+        self, batch: Batch, names: tuple[str, ...], forced: bool, substeps: int, flat: Iterator[np.ndarray]
+    ) -> np.ndarray:
+        """Returns the results of a batch (N, sum of the sizes), from the arguments of the call (N, ...)."""
+        start = {name: next(flat) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+        for name, values in start.items():
+            batch.bind(name)[:] = values
+        if self._model.nmocap:
+            batch.bind("mocap_pos")[:] = next(flat)
+            batch.bind("mocap_quat")[:] = next(flat)
+        if forced:
+            batch.bind("xfrc_applied")[:] = next(flat)
+        batch.bind("time")[:] = 0.0
+        for name in names:
+            batch.expand(name)[:] = next(flat)
+        sensordata = batch.bind("sensordata")
+        if self.motors is None:
+            batch.step(nstep=substeps)
+        else:
+            self._drive(batch, self.motors, substeps, names, start)
+        parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
+        return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def _drive(
         self, batch: Batch, motors: Motors, substeps: int, names: tuple[str, ...], start: dict[str, np.ndarray]

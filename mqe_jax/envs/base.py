@@ -212,6 +212,7 @@ class QuadrupedEnv(Task[S, P]):
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
 
+    @jax.named_scope("task")
     def step(self, state: State[S], action: jax.Array) -> State[S]:
         """Advances one environment by one environment step.
 

@@ -133,11 +133,15 @@ class Evaluator:
 
             return _run_block(env, own_act, progress, key, memory, quota, block, trace_step)
 
-        def run(progress: _Progress, params: Any, keys: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
+        def run(
+            progress: _Progress, params: Any, keys: jax.Array, done_steps: jax.Array, quota: jax.Array
+        ) -> tuple[_Progress, Any]:
+            keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.split(key)[1], done_steps))(keys)
             progress, traces = jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
             return progress, None if trace_step is None else join_traces(traces)
 
-        self._begin = jax.jit(jax.vmap(lambda key: _begin(env, key, memory)))
+        # Random keys are computed inside of both: a program of its own for each would delay the first block.
+        self._begin = jax.jit(jax.vmap(lambda key: _begin(env, jax.random.split(key)[0], memory)))
         self._run = jax.jit(run)
 
     def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[EvalResult]:
@@ -145,11 +149,9 @@ class Evaluator:
         episodes = check("episodes", episodes, Episodes)
         count = self._env.num_envs
         quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
-        split = jax.vmap(jax.random.split)(keys)
-        progress = self._begin(split[:, 0])
+        progress = self._begin(keys)
         for done_steps in range(0, self._max_steps, self._block):
-            step_keys = jax.vmap(lambda key: jax.random.fold_in(key, done_steps))(split[:, 1])  # noqa: B023
-            progress, trace = self._run(progress, params, step_keys, jnp.asarray(quota))
+            progress, trace = self._run(progress, params, keys, np.uint32(done_steps), quota)
             if self._recorder is not None:
                 self._recorder.add(trace)
             if np.all(np.asarray(progress.finished) >= quota):

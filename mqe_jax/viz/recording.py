@@ -60,7 +60,7 @@ def record(
     numbers = episodes * round(seconds / env.dt) * (env.mj_model.nq + 7 * env.mj_model.nmocap)
     if 4 * numbers > CLIP_BYTES:
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
-    reset_key, act_key = jax.random.split(key)
+    length = 50
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
@@ -74,15 +74,22 @@ def record(
         success = state.metrics.get("success", jnp.zeros_like(reward))
         return (state, memory), (*now(state), done, reward, success)
 
-    chunk = jax.jit(lambda carry, keys: jax.lax.scan(one_step, carry, keys))
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(reset_key, episodes))
+    @jax.jit
+    def begin(key: jax.Array) -> Any:
+        return jax.vmap(env.reset)(jax.random.split(jax.random.split(key)[0], episodes))
+
+    @jax.jit
+    def chunk(carry: tuple[Any, Any], key: jax.Array, index: jax.Array) -> tuple[tuple[Any, Any], Any]:
+        keys = jax.random.split(jax.random.fold_in(jax.random.split(key)[1], index), length)
+        return jax.lax.scan(one_step, carry, keys)
+
+    state = begin(key)
     first = [np.asarray(x)[None] for x in now(state)]
     rows: list[Any] = []
-    steps, length = max(1, round(seconds / env.dt)), 50
+    steps = max(1, round(seconds / env.dt))
     carry = (state, memory)
     for index in range(-(-steps // length)):
-        keys = jax.random.split(jax.random.fold_in(act_key, index), length)
-        carry, out = chunk(carry, keys)
+        carry, out = chunk(carry, key, np.uint32(index))
         rows.append(jax.device_get(out))
         if np.concatenate([row[3] for row in rows]).any(0).all():
             break

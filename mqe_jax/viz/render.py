@@ -4,6 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
@@ -38,9 +39,18 @@ context.free()
 """
 
 
-@cache
+_probing = threading.Lock()
+
+
 def gl_backend() -> str | None:
-    """Returns the name of a working GL library (`egl` or `osmesa`), or None.
+    """Returns the name of a working GL library (`egl` or `osmesa`), or None; found once, in any thread."""
+    with _probing:
+        return _working_backend()
+
+
+@cache
+def _working_backend() -> str | None:
+    """Tries the GL libraries.
 
     Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
     `MUJOCO_GL`, where set, is the only candidate.

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
@@ -15,6 +14,7 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
+    from scipy.spatial import ConvexHull
 
     low, high = extent(model, episode)
     dpi = 100
