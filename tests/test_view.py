@@ -103,14 +103,14 @@ def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: A
 def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(stage: Any) -> None:
     scene = stage.stage
     walls = scene._wall_handles
-    centre = np.stack([wall.batched_positions for wall in walls]) - scene._offset
+    centre = np.stack([wall.batched_positions for wall in walls]) - scene.offset
     half = np.stack([wall.batched_scales for wall in walls])
     assert np.all(np.abs(centre[..., 1]) + half[..., 1] < 1.55)
     widths = 3.0 - 2 * half[..., 1].sum(0)
     np.testing.assert_allclose(widths, 0.6, atol=0.1)
     trunk = scene.bodies["robot 2"]
     scene.draw(stage.frame, (2, trunk))
-    want = stage.frame.qpos[2, stage.env.index.base_qpos[1, :2]] + scene._offset[2, :2]
+    want = stage.frame.qpos[2, stage.env.index.base_qpos[1, :2]] + scene.offset[2, :2]
     np.testing.assert_allclose(np.asarray(scene._root.position)[:2], -want, atol=1e-5)
     scene.release()
     np.testing.assert_allclose(scene._root.position, 0.0)
