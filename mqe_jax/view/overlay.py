@@ -11,7 +11,7 @@ from mjviser.conversions import merge_geoms
 from mqe_jax.viz.geometry import COLLISION_GROUP, pose
 from mqe_jax.viz.recording import Episode
 
-_METRES_PER_NEWTON = 0.004
+_METRES_PER_NEWTON, _LONGEST = 0.004, 1.0  # of an arrow, m
 _FORCE, _SHAPE = (224, 60, 40), (224, 138, 44)
 
 
@@ -88,6 +88,8 @@ def contact_arrows(
 ) -> np.ndarray:
     """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point, and its force as MuJoCo computes it.
 
+    250 N are one metre; arrows are not longer.
+
     Args:
         model: with the actuators of the physics.
         data: workspace.
@@ -104,6 +106,7 @@ def contact_arrows(
         mujoco.mj_contactForce(model, data, i, force)
         turn = contact.frame.reshape(3, 3).T
         second = model.geom_bodyid[contact.geom2] != 0  # the force acts on the second geom; the first may be the robot
+        arrow = _METRES_PER_NEWTON * (turn @ force[:3]) * (1.0 if second else -1.0)
         arrows[i, 0] = contact.pos
-        arrows[i, 1] = contact.pos + _METRES_PER_NEWTON * (turn @ force[:3]) * (1.0 if second else -1.0)
+        arrows[i, 1] = contact.pos + arrow * min(1.0, _LONGEST / max(float(np.linalg.norm(arrow)), 1e-9))
     return arrows

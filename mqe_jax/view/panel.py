@@ -187,12 +187,7 @@ class Panel:
             speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Real-time factor")
             length = (session.moments.maxlen or 1) * session.env.dt
             back = gui.add_slider(
-                "Back",
-                min=0.0,
-                max=length,
-                step=session.env.dt,
-                initial_value=0.0,
-                hint="Pauses; s before now",
+                "Back", min=0.0, max=length, step=session.env.dt, initial_value=0.0, hint="Pauses; s before now"
             )
 
         def set_paused(paused: bool) -> None:

@@ -35,7 +35,7 @@ class Viewer:
 
     def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, menu: Menu | None = None) -> None:
         """Starts the server and draws the session; `menu` lets the page choose others."""
-        self.server = open_server(host, port, f"mqe view {session.env.name}")
+        self.server = open_server(host, port, "mqe view")
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
         self._menu = menu
         self._show(session)
@@ -45,9 +45,8 @@ class Viewer:
         self.session = session
         self.server.scene.reset()
         self.server.gui.reset()
-        self.server.gui.configure_theme(
-            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
-        )
+        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
         model = session.env.mj_model
         self._stage = Stage(self.server, model, session.frame())
         self._overlay, self._shapes = Overlay(self.server, model, self._stage.offset), False
