@@ -1,4 +1,4 @@
-"""The examples at a small size, and the notebooks: committed with outputs, and run from top to bottom."""
+"""The examples at a small size, and the notebooks: committed without outputs, and run from top to bottom."""
 
 from __future__ import annotations
 
@@ -119,21 +119,12 @@ def check(notebook: Any, name: str) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_committed_with_the_outputs_of_one_run(path: Path) -> None:
-    """From top to bottom, without an error and without lines on standard error."""
+def test_notebooks_are_committed_without_outputs(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
-    kinds = {
-        output.output_type if output.output_type != "stream" else output.name for c in code for output in c.outputs
-    }
-    assert kinds <= {"display_data", "execute_result", "stdout"}
-    check(notebook, path.stem)
-
-
-def test_notebooks_stay_small() -> None:
-    assert sum(path.stat().st_size for path in NOTEBOOKS) < 150_000
+    assert code and all(not cell.outputs and cell.execution_count is None for cell in code)
+    assert path.stem in CLIPS
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
