@@ -2,8 +2,7 @@
 
     python examples/brax_ppo.py --seeds 0 1 2 --csv brax_ppo.csv
 
-needs `pip install 'mqe-jax[brax]'`. Brax 0.14.2 calls `jax.device_put_replicated`, which was removed in
-jax 0.10; `device_put_replicated` below replaces it.
+needs `pip install 'mqe-jax[brax]'`.
 """
 
 import argparse
@@ -13,8 +12,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
@@ -23,11 +20,6 @@ from mqe_jax.adapters.brax import Env, wrap
 NUM_ENVS, EVAL_ENVS = 64, 512
 # In training the approach reward has a larger weight, as in configs/demo.yaml; evaluations use the unmodified task.
 TRAINING_REWARDS = {"approach": 10.0}
-
-
-def device_put_replicated(tree, devices):
-    """Returns the tree with every leaf repeated along a new leading axis, one entry per device."""
-    return jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree)
 
 
 def train(
@@ -57,8 +49,6 @@ def train(
     networks = functools.partial(
         ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=(64, 64), value_hidden_layer_sizes=(64, 64)
     )
-    if not hasattr(jax, "device_put_replicated"):
-        jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
     ppo.train(
         environment=env,
         eval_env=eval_env,

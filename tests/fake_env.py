@@ -41,12 +41,13 @@ XML = f"""<mujoco><worldbody>
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FakeData:
-    """The three arrays of an `mjx.Data` that rendering reads, and ctrl."""
+    """The three arrays of an `mjx.Data` that rendering reads, ctrl and qvel."""
 
     qpos: jax.Array
     mocap_pos: jax.Array
     mocap_quat: jax.Array
     ctrl: jax.Array
+    qvel: jax.Array
 
 
 @jax.tree_util.register_dataclass
@@ -89,6 +90,7 @@ class FakeEnv:
             jnp.asarray(model.body_pos[mocap], jnp.float32),
             jnp.asarray(model.body_quat[mocap], jnp.float32),
             jnp.zeros(model.nu),
+            jnp.zeros(model.nv),
         )
         zero = jnp.zeros(())
         metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
@@ -99,7 +101,7 @@ class FakeEnv:
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
         move = 0.1 * jnp.clip(action[:, 0], -1.0, 1.0)
         qpos = state.data.qpos.at[self.robot_x].add(move)
-        data = FakeData(qpos, state.data.mocap_pos, state.data.mocap_quat, state.data.ctrl)
+        data = FakeData(qpos, state.data.mocap_pos, state.data.mocap_quat, state.data.ctrl, state.data.qvel)
         obs = qpos[self.robot_x][:, None]
         total = move.sum()
         metrics = {

@@ -1,4 +1,4 @@
-"""The Brax and JaxMARL adapters: their conventions, automatic resets and the two examples."""
+"""The Brax and JaxMARL adapters: their conventions, automatic resets, names of tasks, and the example."""
 
 from __future__ import annotations
 
@@ -194,47 +194,64 @@ def test_brax_ppo_example_trains() -> None:
     assert all(np.isfinite(row["return"]) and 0 < row["episode_length"] <= 25 for row in rows)
 
 
-@pytest.mark.soak
-def test_jaxmarl_ippo_example_trains(tmp_path: Path) -> None:
-    """The example's IPPO runs on JaxMARL's wrappers; its curve has a row per update and a plot."""
-    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
+def test_brax_knows_the_tasks_by_name() -> None:
+    brax_envs = pytest.importorskip("brax.envs", reason="needs the extra brax")
+    from mqe_jax.adapters.brax import Env
 
-    env = jaxmarl_ippo.Env("go1gate", impl="c", episode_length=0.5)
-    config = {**jaxmarl_ippo.CONFIG, "NUM_ENVS": 4, "NUM_STEPS": 50, "TOTAL_TIMESTEPS": 400}
-    rows = jaxmarl_ippo.own_ippo(config, env)
-    np.testing.assert_array_equal(rows[:, 0], [200, 400])
-    assert np.isfinite(rows).all() and (rows[:, 2] <= 25).all()
-    jaxmarl_ippo.plot(rows, tmp_path / "curve.png", "IPPO")
-    assert (tmp_path / "curve.png").stat().st_size > 1000
+    env = brax_envs.get_environment("go1gate", impl="c", control="position")
+    assert isinstance(env, Env) and env.action_size == 24
 
 
-def test_a_checkout_gets_our_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The baseline of a checkout creates the environment by JaxMARL's `make`; its metrics become the curve."""
+def test_jaxmarl_makes_the_tasks_and_still_its_own() -> None:
     jaxmarl = pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
-    monkeypatch.setattr(jaxmarl, "make", jaxmarl.make)
-    monkeypatch.delitem(sys.modules, "ippo_ff_mabrax", raising=False)
-    folder = tmp_path / "baselines" / "IPPO"
-    folder.mkdir(parents=True)
-    (folder / "ippo_ff_mabrax.py").write_text(
-        "import types, jax.numpy as jnp, jaxmarl\n"
-        "wandb = types.SimpleNamespace(init=lambda mode: None)\n"
-        "def make_train(config):\n"
-        "    env = jaxmarl.make(config['ENV_NAME'], **config['ENV_KWARGS'])\n"
-        "    values = jnp.full((3, 1), float(env.num_agents))\n"
-        "    metrics = {'returned_episode_returns': values, 'returned_episode_lengths': 5 * values}\n"
-        "    return lambda key: {'metrics': metrics}\n"
-    )
-    config = {**jaxmarl_ippo.CONFIG, "NUM_ENVS": 2, "NUM_STEPS": 10}
-    rows = jaxmarl_ippo.baseline_ippo(tmp_path, config, jaxmarl_ippo.Env(task_env("go1gate")))
-    np.testing.assert_array_equal(rows, [[20, 2, 10], [40, 2, 10], [60, 2, 10]])
+    from mqe_jax.adapters import jaxmarl as adapter
+
+    adapter.register()
+    assert isinstance(jaxmarl.make("go1gate", impl="c", control="position"), adapter.Env)
+    assert jaxmarl.registered_envs.count("go1gate") == 1
+    assert jaxmarl.make("MPE_simple_spread_v3").num_agents == 3
+    with pytest.raises(ValueError, match="go1gat is not in registered"):
+        jaxmarl.make("go1gat")
 
 
-def test_a_missing_checkout_is_named(tmp_path: Path) -> None:
-    """The error names the missing file."""
+def test_jaxmarl_world_state_and_discrete_actions() -> None:
+    """The world state is the privileged observation; an integer sets one command to its limit, 0 none."""
     pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    jaxmarl_ippo = importlib.import_module("jaxmarl_ippo")
+    from mqe_jax.adapters.jaxmarl import Env
 
-    with pytest.raises(SystemExit, match=r"ippo_ff_mabrax\.py does not exist"):
-        jaxmarl_ippo.baseline_ippo(tmp_path, jaxmarl_ippo.CONFIG, None)  # type: ignore[arg-type]
+    task = task_env("go1gate")
+    env = Env(task, discrete=True)
+    _, state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    assert jax.eval_shape(env.get_world_state, state).shape == (env.world_state_size(),)
+    assert env.world_state_size() == task.privileged_observation_size
+    space: Any = env.action_space("robot_0")
+    assert space.n == 7
+    table = [env._continuous(jnp.int32(i)) for i in range(7)]
+    np.testing.assert_array_equal(
+        table, [[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
+    )
+    integers = {agent: jnp.zeros(1, jnp.int32) for agent in env.agents}  # JaxMARL's MAPPO passes (1,)
+    assert jax.eval_shape(env.step_env, jax.random.PRNGKey(0), state, integers)[1].obs.shape == state.obs.shape
+    assert jax.eval_shape(env.get_avail_actions, state)["robot_1"].shape == (7,)
+
+
+def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+    """`python -m mqe_jax.adapters SCRIPT` passes the arguments on and finds modules beside the script."""
+    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    runner = importlib.import_module("mqe_jax.adapters.__main__")
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "beside_it.py").write_text("CONTROL = 'position'\n")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys, jaxmarl\nfrom beside_it import CONTROL\n"
+        "if __name__ == '__main__':\n"
+        "    env = jaxmarl.make(sys.argv[1], impl='c', control=CONTROL)\n"
+        "    print(env.name, env.num_agents, env.action_space('robot_0').shape)\n"
+    )
+    runner.main([str(script), "go1gate"])
+    assert capsys.readouterr().out == "go1gate 2 (12,)\n"
+    for wrong in ([], [str(tmp_path / "none.py")]):
+        with pytest.raises(SystemExit, match="2"):
+            runner.main(wrong)
+        assert "expected a Python file" in capsys.readouterr().err

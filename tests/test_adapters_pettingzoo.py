@@ -74,6 +74,18 @@ def test_teams_and_zero_sum_rewards_of_a_match() -> None:
     assert env.teams == (("robot_0",), ("robot_1",)) and env.metadata["name"] == "go1tug"
 
 
+def test_pettingzoo_knows_the_tasks_by_name() -> None:
+    """In both registries, once however often the module registers."""
+    import pettingzoo
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        adapter.register()
+        env = pettingzoo.make("parallel", "mqe/go1sheep-easy-v0", impl="c", control="position")
+    assert env.metadata["name"] == "go1sheep-easy"
+    assert {f"mqe/{task}-v0" for task in tasks()} <= set(pettingzoo.parallel_registry) & set(pettingzoo.aec_registry)
+
+
 def test_a_copy_is_a_new_environment_with_the_same_settings() -> None:
     """Vectorisers copy environments by pickling them."""
     env = adapter.parallel_env("go1gate", **SHORT)

@@ -140,4 +140,14 @@ def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:
     assert docs_pages.links("[the task](../mqe_jax/npc.py), [b](b.md)") == "the task (`mqe_jax/npc.py`), [b](b.md)"
     assert docs_pages.links("[mqe_jax/npc.py](../mqe_jax/npc.py)") == "mqe_jax/npc.py"
     assert docs_pages.links("[![a](../a.png)](a.md)") == "[![a](../a.png)](a.md)"
+    here = "https://github.com/someone/mqe_jax"
+    assert docs_pages.links("[a](../b.py) [c](d.md)", here) == f"[a]({here}/blob/main/b.py) [c](d.md)"
+    assert docs_pages.links("[a](../b.md)", here, "results") == "[a](../b.md)"
+    assert docs_pages.links("[a](../../b.py)", here, "results") == f"[a]({here}/blob/main/b.py)"
+    colab = docs_pages.links("[a](../n.ipynb)", here)
+    assert colab.endswith(
+        "([open in Colab](https://colab.research.google.com/github/someone/mqe_jax/blob/main/n.ipynb))"
+    )
+    assert docs_pages.repository(f'[project]\nurls.Repository = "{here}/"') == here
+    assert docs_pages.repository("[project]") == ""
     assert docs_pages.formulas("`$HOME` and $x^2$").startswith("`$HOME` and <math")

@@ -1,16 +1,19 @@
 """The viewer: its simulation, its scene and its arguments."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 from fake_env import FakeEnv
 from viewer import Driven, free_port, session
 
 from mqe_jax import cli, make
+from mqe_jax.errors import InputError
 from mqe_jax.view.session import HOLD_TIME, Drive
 
 LIMIT = np.array([1.0, 0.5, 0.5])
@@ -105,14 +108,14 @@ def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(st
     solid = [scene._model.geom(geom).name.startswith("wall/") for geom in scene._walls]
     walls = [wall for wall, is_wall in zip(scene._wall_handles, solid, strict=True) if is_wall]
     assert len(walls) == 2
-    centre = np.stack([wall.batched_positions for wall in walls]) - scene._offset
+    centre = np.stack([wall.batched_positions for wall in walls]) - scene.offset
     half = np.stack([wall.batched_scales for wall in walls])
     assert np.all(np.abs(centre[..., 1]) + half[..., 1] < 1.55)
     widths = 3.0 - 2 * half[..., 1].sum(0)
     np.testing.assert_allclose(widths, 0.6, atol=0.1)
     trunk = scene.bodies["robot 2"]
     scene.draw(stage.frame, (2, trunk))
-    want = stage.frame.qpos[2, stage.env.index.base_qpos[1, :2]] + scene._offset[2, :2]
+    want = stage.frame.qpos[2, stage.env.index.base_qpos[1, :2]] + scene.offset[2, :2]
     np.testing.assert_allclose(np.asarray(scene._root.position)[:2], -want, atol=1e-5)
     scene.release()
     np.testing.assert_allclose(scene._root.position, 0.0)
@@ -124,6 +127,104 @@ def test_cameras_follow_robots_and_the_ball() -> None:
 
     env = make("go1football-1vs1", impl="c", control="position", num_envs=1)
     assert list(followable(env.mj_model)) == ["robot 1", "robot 2", "ball"]
+
+
+def test_contact_forces_carry_the_robots() -> None:
+    """Of two Go1s that stand on their feet; robots are named by colour."""
+    pytest.importorskip("mjviser")
+    from mqe_jax.view.overlay import _METRES_PER_NEWTON, contact_arrows
+    from mqe_jax.view.readout import robot_labels
+    from mqe_jax.viz.recording import Episode
+
+    env = make("go1plane", impl="c", control="position", num_envs=1)
+    model, joints = env.mj_model, np.asarray(env.index.joint_qpos)
+    data = mujoco.MjData(model)
+    data.qpos[joints] = env.robot.default_joints
+    for i, base in enumerate(env.index.base_qpos):
+        data.qpos[base[:3]] = 2.0, i - 0.5, 0.29
+    data.ctrl[:] = data.qpos[joints].ravel()
+    mujoco.mj_step(model, data, 400)
+    frame = Episode(data.qpos[None], data.mocap_pos[None], data.mocap_quat[None], env.dt)
+    arrows = contact_arrows(model, mujoco.MjData(model), frame, data.qvel, data.ctrl)
+    weight = 9.81 * sum(model.body_subtreemass[model.body(f"robot{i}/trunk").id] for i in range(2))
+    force = (arrows[:, 1] - arrows[:, 0]).sum(0) / _METRES_PER_NEWTON
+    np.testing.assert_allclose(force, [0.0, 0.0, weight], atol=0.05 * weight)
+    assert len(arrows) >= 8 and np.all(np.abs(arrows[:, 0, 2]) < 0.01)
+    names = [label.partition(" (")[0] for label in robot_labels(model)]
+    assert names == ["robot 1", "robot 2"] and len(set(robot_labels(model))) == 2
+
+
+def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Path) -> None:
+    from mqe_jax.train.start import CONFIG_FILE
+    from mqe_jax.view.menu import Choice, Menu, find_runs
+
+    for name, task in (("b", "go1gate"), ("a", "go1tug"), ("no task", None)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "policy.safetensors").touch()
+        (tmp_path / name / CONFIG_FILE).write_text(f"task: {task or 'null'}\n")
+    (tmp_path / "unreadable").mkdir()
+    (tmp_path / "unreadable" / "policy.safetensors").touch()
+    (tmp_path / "unreadable" / CONFIG_FILE).write_text(": [")
+    (tmp_path / "unfinished").mkdir()
+    runs = find_runs([tmp_path, tmp_path])
+    assert {Path(run).name: task for run, task in runs.items()} == {"a": "go1tug", "b": "go1gate"}
+    menu = Menu(lambda choice: session(FakeEnv()), Choice("go1gate", "given.safetensors"), runs)
+    common = ("random", "idle", "forward")
+    gate, tug = (next(run for run, its in runs.items() if its == task) for task in ("go1gate", "go1tug"))
+    assert menu.policies("go1gate") == ("default", "go1gate", "scripted", *common, gate, "given.safetensors")
+    assert menu.policies("go1tug") == ("default", "go1tug", "scripted", *common, tug)
+    assert menu.policies("go1plane") == ("default", *common)
+    assert (menu.is_match("go1tug"), menu.is_match("go1gate")) == (True, False)
+
+
+def test_bars_point_to_the_side_of_their_sign_and_observations_come_in_blocks() -> None:
+    from mqe_jax.view.readout import bars, observation_table
+
+    page = bars(["up & on", "down", "none"], [0.2, -0.1, 0.0])
+    assert "up &amp; on" in page and "left:50%;width:50.0%" in page and "right:50%;width:25.0%" in page
+    layout = make("go1gate", impl="c", control="position", num_envs=1).observation_layout
+    table = observation_table(layout, np.arange(layout.size, dtype=float))
+    assert [row.split(" | ")[0][2:] for row in table.splitlines()[2:]] == [block.name for block in layout.blocks]
+    assert "0.00 1.00" in table and f"{layout.size - 1}.00 |" in table
+    assert observation_table(None, np.zeros(2)).endswith("| observation | 0.00 0.00 |")
+
+
+def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
+    """Widgets and keys of the last session are gone; overlays can be switched on and off in the new one."""
+    pytest.importorskip("mjviser")
+    from mqe_jax.view.menu import Choice, Menu
+    from mqe_jax.view.viewer import Viewer
+
+    def open_choice(choice: Choice) -> Any:
+        if choice.policy == "bad":
+            raise InputError("policy: bad")
+        return session(Driven(), num_envs=3)
+
+    viewer = Viewer(session(Driven()), port=free_port(), menu=Menu(open_choice, Choice("go1gate"), {}))
+    first, panel, gui = viewer.session, viewer._panel, viewer.server.gui
+    widgets, commands = len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)
+    assert not viewer._exchanged()
+    panel._wanted = Choice("go1gate", "bad")
+    assert not viewer._exchanged() and viewer.session is first and first.paused
+    panel._wanted = Choice("go1gate", "idle")
+    assert viewer._exchanged() and viewer.session is not first and viewer.session.num_envs == 3
+    assert (len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)) == (widgets, commands)
+    assert viewer._panel is not panel and viewer._panel.take_choice() is None
+    viewer._panel.shapes = viewer._panel.contacts = True
+    viewer._draw()
+    assert viewer._shapes and viewer._overlay._arrows is not None
+    viewer._panel.shapes = viewer._panel.contacts = False
+    viewer._draw()
+    assert not viewer._shapes and viewer._overlay._arrows is None
+    viewer.server.stop()
+
+
+def test_matches_are_counted_by_outcome() -> None:
+    run = session(FakeEnv())
+    run.outcomes, run.counts = ("win", "draw", "loss"), np.zeros(3, int)
+    run._count(np.array([True, False]), np.array([[False, False, True], [True, False, False]]))
+    run._count(np.array([True, True]), np.array([[True, False, False], [False, True, False]]))
+    assert run.counts.tolist() == [1, 1, 1] and run.last == ["win", "draw"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import http.server
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -78,11 +79,12 @@ def test_1000_bad_messages_leave_the_viewer_stepping(viewer: SimpleNamespace) ->
             else:
                 client.send(frame)
         client.update(panel.uuid("Speed"), 2.0)
-        client.update(panel.uuid("Driven"), "robot 1")
-        after = wait_for_panel(viewer, lambda after: "1 (driven)" in after.values["state"])
+        first = panel.widgets["Driven"]["props"]["options"][1]
+        client.update(panel.uuid("Driven"), first)
+        after = wait_for_panel(viewer, lambda after: "(driven)" in after.values["state"])
         later = wait_for_panel(viewer, lambda later: later.seconds > after.seconds)
-        changed = {"state": later.values["state"], "Speed": 2.0, "Driven": "robot 1"}
-        assert later.values == {**panel.values, **changed}
+        changed = {name: later.values[name] for name in ("state", "further text")}
+        assert later.values == {**panel.values, **changed, "Speed": 2.0, "Driven": first}
         assert viewer.process.poll() is None
         client.update(panel.uuid("Driven"), "none")
         client.update(panel.uuid("Speed"), 1.0)
@@ -135,7 +137,7 @@ class Page:
 
     def choose(self, label: str, option: str) -> None:
         self.page.get_by_label(label, exact=True).first.click()
-        self.page.get_by_role("option", name=option, exact=True).click()
+        self.page.get_by_role("option", name=re.compile(rf"^{option}\b")).click()
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +151,7 @@ def page(viewer: SimpleNamespace) -> Iterator[Page]:
 def test_a_robot_is_driven_from_the_page(page: Page) -> None:
     """Hold the drive button, then press keys: only the selected robot moves on the page."""
     page.choose("Driven", "robot 2")
-    page.until(lambda: "2 (driven)" in page.text())
+    page.until(lambda: "(driven)" in page.text())
     start = page.robots()
     button = page.page.get_by_role("button", name="Forward", exact=True)
     button.scroll_into_view_if_needed()
@@ -188,7 +190,7 @@ def test_the_page_pauses_steps_and_resets(page: Page) -> None:
     page.page.get_by_role("button", name="Continue", exact=True).click()
     page.until(lambda: seconds() > before + 0.5)
     page.choose("Camera", "robot 2")
-    page.until(lambda: page.page.get_by_label("Camera", exact=True).first.input_value() == "robot 2")
+    page.until(lambda: page.page.get_by_label("Camera", exact=True).first.input_value().startswith("robot 2"))
     assert page.page.locator("canvas").count() >= 2  # the scene, and the plots
     if folder := os.environ.get("MQE_SCREENSHOTS"):
         page.page.screenshot(path=str(Path(folder) / "view.png"))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from viewer import CAMERA, Client, Driven, free_port, session
 
@@ -111,6 +112,8 @@ def test_a_refused_value_changes_nothing_and_is_logged_in_a_line(shown: SimpleNa
         ("Environment", "3", "Environment is '3', allowed: 1, 2"),
         ("Camera", "x\n\x1b[2J", "Camera is 'x\\n\\x1b[2J', allowed: free, robot 1, robot 2"),
         ("Driven", 1, "Driven is 1.0, allowed: none, robot 1, robot 2"),
+        ("Back", -1.0, "Back is -1.0, allowed: 0.0 to 20.0"),
+        ("Contacts", 1, "Contacts is 1.0, allowed: true, false"),
         ("Pause", 0, "Pause is 0.0, allowed: true"),
         ("state", "text", "no widget"),
     )
@@ -130,6 +133,33 @@ def test_a_refused_value_changes_nothing_and_is_logged_in_a_line(shown: SimpleNa
     assert len(lines) == len(cases), lines
     for line, (_, _, words) in zip(lines, cases, strict=True):
         assert line.startswith("mqe: view: ignored a message: ") and words in line and len(line) < 250
+
+
+def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> None:
+    """The state, the bars and the observation are those of the chosen step; running on returns to the present."""
+    run, panel = shown.session, shown.panel
+    run.drive.env, run.drive.robot = 0, 0
+    for step in range(4):
+        run.drive.command = np.array([0.25 * step, 0.0, 0.0])
+        run.advance()
+    places = [moment.frame.qpos[0, run.env.robot_x[0]] for moment in run.moments]
+    with Client(shown.port) as client:
+        seen = client.panel()
+        client.update(seen.uuid("Back"), 2 * run.env.dt)
+        until(lambda: panel.back == 2)
+        assert run.paused and run.moment(panel.back).frame.qpos[0, run.env.robot_x[0]] == places[-3] != places[-1]
+        panel.show(np.zeros((2, 3)), 1.0)
+        client.update(seen.uuid("Contacts"), True)
+        until(lambda: panel.contacts)
+        client.update(seen.uuid("Contacts"), False)
+        client.update(seen.uuid("Pause"), True)
+        until(lambda: not run.paused)
+    with Client(shown.port) as client:
+        text = client.panel().values["state"]
+    assert f"at {(run.steps - 2) * run.env.dt:.2f} s, paused" in text and "| 1 (driven) | 0.00" in text
+    assert "episodes: success 0 of" in text and "| +0.25 |" in text
+    assert panel.back == 0 and run.moment(1000) is run.moments[0]
+    run.drive.command, run.drive.robot = np.zeros(3), None
 
 
 def test_log_lines_are_limited(shown: SimpleNamespace, said: Any) -> None:

@@ -66,7 +66,7 @@ class Panel:
     """The panel as a newly connected client sees it."""
 
     widgets: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Message that created each widget, by label; markdown as `state`."""
+    """Message that created each widget, by label; the first markdown as `state`."""
     commands: dict[str, str] = field(default_factory=dict)
     """Uuid of each command, by label."""
     values: dict[str, Any] = field(default_factory=dict)
@@ -138,7 +138,9 @@ class Client:
                 for name in message["updates"].keys() & {"value", "_markdown"}:
                     panel.values[labels[uuid]] = message["updates"][name]
             elif kind.startswith("Gui") and "props" in message:
-                label = "state" if kind == "GuiMarkdownMessage" else str(message["props"].get("label"))
+                label = str(message["props"].get("label"))
+                if kind == "GuiMarkdownMessage":
+                    label = "state" if "state" not in panel.widgets else "further text"
                 panel.widgets.setdefault(label, message)
                 labels[uuid] = label
         raise AssertionError("no end of the replay")
@@ -162,7 +164,7 @@ BAD_VALUES = (
     *(math.nan, math.inf, -math.inf, 0, 0.0, -1, 4.0001, 1e308, 2**63, False),
     *(None, "", "nan", "-1", "99", "robot 9", "x" * 20_000, "\n\x1b[2J", b"1", [], [1.0], {}, {"value": 1.0}),
 )
-"""Values that no widget accepts."""
+"""Values that no widget accepts, but for checkboxes and the slider `Back`."""
 BAD_NAMES = ("removed", "sync_cb", "update_cb", "props", "uuid", "is_button", "__class__", "_markdown", "min")
 BAD_NUMBERS = (math.nan, math.inf, 1e300, None, "1", True, [0.0], {})
 OTHERS = (
@@ -195,7 +197,8 @@ def _pick(rng: np.random.Generator, among: Any) -> Any:
 
 def _inputs(panel: Panel) -> list[str]:
     kinds = ("GuiSliderMessage", "GuiDropdownMessage", "GuiButtonMessage")
-    return [message["uuid"] for message in panel.widgets.values() if message["type"] in kinds]
+    widgets = panel.widgets.items()
+    return [message["uuid"] for label, message in widgets if message["type"] in kinds and label != "Back"]
 
 
 def _value(rng: np.random.Generator, panel: Panel) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
 Generated: one page per task (clip, sizes, observation, rewards, parameters) with an overview, and the pages
-reference/MODULE.md in the navigation of mkdocs.yml. Links to files outside docs/ become their paths, and LaTeX becomes
-MathML, so that the built site needs neither the repository nor another host.
+reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/ lead to the
+repository's address, `[project.urls]` in pyproject.toml; where it is not set they become paths, so that the built site
+needs neither the repository nor another host.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import dataclasses
 import functools
 import inspect
 import io
+import posixpath
 import re
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,19 +38,46 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def on_config(config: Any) -> Any:
+    """Sets the repository's address, from which the theme makes the link in the header."""
+    if address := repository():
+        config["repo_url"], config["repo_name"] = address, "/".join(address.split("/")[-2:])
+    return config
+
+
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Converts links and formulas of a page."""
-    return formulas(links(markdown))
+    return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
 
 
-def links(markdown: str) -> str:
-    """Replaces links to files of the repository outside docs/ by their names and paths."""
+def repository(text: str | None = None) -> str:
+    """Returns `Repository` of `[project.urls]` in pyproject.toml (or in the given text); empty where it is not set."""
+    project = tomllib.loads(text or (ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return project.get("urls", {}).get("Repository", "").rstrip("/")
+
+
+def links(markdown: str, address: str = "", folder: str = "") -> str:
+    """Leads links to files outside docs/, from a page in a folder of it, to the repository's address.
+
+    Notebooks get a second link, to Colab, where the address is on GitHub. Without an address links become the file's
+    name and path.
+    """
 
     def plain(match: re.Match[str]) -> str:
         text, path = match.groups()
         return text if path.rstrip("/").endswith(text.replace("\\", "")) else f"{text} (`{path}`)"
 
-    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", plain, markdown)
+    def linked(match: re.Match[str]) -> str:
+        text, path = match.groups()
+        path = posixpath.normpath(posixpath.join("docs", folder, "..", path))
+        if path.startswith("docs/"):
+            return match.group(0)
+        link = f"[{text}]({address}/blob/main/{path})"
+        hub = address.partition("https://github.com/")[2]
+        colab = f"https://colab.research.google.com/github/{hub}/blob/main/{path}"
+        return f"{link} ([open in Colab]({colab}))" if hub and path.endswith(".ipynb") else link
+
+    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", linked if address else plain, markdown)
 
 
 def formulas(markdown: str) -> str:

@@ -1,12 +1,16 @@
 """Adapters to the interfaces of other libraries: Gymnasium, PettingZoo, Brax, JaxMARL.
 
 Each module needs the library of the same name; without that library, importing it raises an InputError that names the
-extra to install.
+extra to install. `python -m mqe_jax.adapters SCRIPT` runs a script of such a library, which knows the tasks by name.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,10 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import envs
+from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
 from mqe_jax.limits import PositiveInt
 from mqe_jax.settings import check
+from mqe_jax.train.policy import Policy
 
 
 def missing(library: str, error: ImportError) -> InputError:
@@ -27,20 +33,43 @@ def missing(library: str, error: ImportError) -> InputError:
     )
 
 
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Hides what a library prints while it is imported, such as that packages which no task needs are missing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
 def task_env(
-    task: str | QuadrupedEnv, *, max_steps: int | None = None, limit: str = "max_steps", **overrides: Any
-) -> QuadrupedEnv:
-    """Returns the environment of a task; a given environment is returned unchanged and accepts no overrides.
+    task: str | QuadrupedEnv,
+    *,
+    opponent: str | Path | Policy | None = None,
+    max_steps: int | None = None,
+    limit: str = "max_steps",
+    **overrides: Any,
+) -> Any:
+    """Returns the environment of a task, or of team 0 of a match; a given environment accepts no overrides.
 
     Args:
         task: id, or an environment.
+        opponent: policy of team 1 of a match: what `mqe_jax.load_policy` accepts, or a policy; without one, the agents
+            of both teams act.
         max_steps: time limit in environment steps, instead of the task's.
         limit: name of the adapter's argument for `max_steps`, for errors.
         overrides: arguments of `mqe_jax.make`.
 
+    Returns:
+        A `QuadrupedEnv`, or with an opponent a `TeamEnv`.
+
     Raises:
-        InputError: from `mqe_jax.make`; for overrides of a given environment; for a time limit below one step.
+        InputError: from `mqe_jax.make` and `TeamEnv`; for overrides of a given environment; for a time limit below one
+            step.
     """
+    env = _made(task, max_steps, limit, overrides)
+    return env if opponent is None else TeamEnv(env, opponent)
+
+
+def _made(task: str | QuadrupedEnv, max_steps: int | None, limit: str, overrides: dict[str, Any]) -> QuadrupedEnv:
     if isinstance(task, QuadrupedEnv):
         if overrides or max_steps is not None:
             names = ", ".join([*overrides, *([limit] if max_steps is not None else [])])
@@ -55,19 +84,19 @@ def task_env(
     return envs.make(task, **overrides, episode_length=steps * dt)
 
 
-def agent_names(env: QuadrupedEnv) -> list[str]:
+def agent_names(env: TaskEnv) -> list[str]:
     """Returns `robot_0`, `robot_1`, ..."""
     return [f"robot_{i}" for i in range(env.num_agents)]
 
 
-def team_reward(env: QuadrupedEnv, reward: Any) -> Any:
+def team_reward(env: TaskEnv, reward: Any) -> Any:
     """Returns the mean reward (...) of team 0 from rewards (..., A): of all agents in cooperative tasks."""
     return reward[..., np.array(env.teams[0])].mean(-1)
 
 
-def select(env: QuadrupedEnv, choose: jax.Array, first: State, second: State, kept: tuple[str, ...] = ()) -> State:
+def select(env: TaskEnv, choose: jax.Array, first: State, second: State, kept: tuple[str, ...] = ()) -> State:
     """Returns `first` where `choose` () is true, else `second`, whose fields `kept` and shared buffers stay."""
-    names = {field.name for field in dataclasses.fields(State)}.difference(kept, ("data",))
+    names = {field.name for field in dataclasses.fields(second)}.difference(kept, ("data",))
     fields = {name: (getattr(first, name), getattr(second, name)) for name in names}
     merged = {n: jax.tree.map(lambda a, b: jnp.where(choose, a, b), *pair) for n, pair in fields.items()}
     return dataclasses.replace(second, data=env.physics.merge(choose, first.data, second.data), **merged)

@@ -1,5 +1,7 @@
 """Brax: `Env` over the joint observations and actions of all agents, flattened, and a wrapper for training.
 
+Importing this module registers every task under its id, for `brax.envs.get_environment` and `brax.envs.create`.
+
 `ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length)` trains with automatic resets to new
 episodes. Brax's own wrapper also works, except on Warp, but restarts an environment from the same initial state.
 """
@@ -7,22 +9,27 @@ episodes. Brax's own wrapper also works, except on Warp, but restarts an environ
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.adapters import missing, task_env, team_reward
+from mqe_jax import envs
+from mqe_jax.adapters import missing, quietly, task_env, team_reward
+from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
 
 try:
-    from brax.envs.base import Env as BraxEnv
-    from brax.envs.base import State, Wrapper
-    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+    with quietly():
+        from brax.envs import register_environment
+        from brax.envs.base import Env as BraxEnv
+        from brax.envs.base import State, Wrapper
+        from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 except ImportError as error:
     raise missing("brax", error) from None
 
@@ -30,22 +37,29 @@ except ImportError as error:
 FINAL_OBS = "AutoResetWrapper_final_obs"
 
 
+def register() -> None:
+    """Registers every task under its id; call it again after `mqe_jax.envs.register_task`."""
+    for task in envs.tasks():
+        register_environment(task, functools.partial(Env, task))  # pyright: ignore[reportArgumentType]
+
+
 class Env(BraxEnv):
     """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after agent.
 
-    The reward is the mean over the agents of team 0: all agents in cooperative tasks. `done` is 1 on termination.
+    With an `opponent`, A counts the agents of team 0. The reward is the mean over the agents of team 0: all agents in
+    cooperative tasks. `done` is 1 on termination.
     Truncation is left to Brax's EpisodeWrapper, which needs `episode_length` and would otherwise treat the time limit
     as a termination. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is the
     observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's `State`.
     """
 
-    env: QuadrupedEnv
+    env: TaskEnv
     """The task."""
     episode_length: int
     """Time limit, environment steps."""
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
-        """Creates the environment from a task id or an environment; `overrides` are arguments of `mqe_jax.make`."""
+        """Creates the environment from a task id or an environment; see `task_env` for the overrides."""
         self.env = task_env(task, **overrides)
         self.episode_length = self.env.max_steps
 
@@ -104,7 +118,7 @@ class AutoReset(Wrapper):
         info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}
         cleared = state.replace(done=jnp.zeros_like(state.done), info=info)  # pyright: ignore[reportAttributeAccessIssue]
         after = self.env.step(cleared, action)
-        task: QuadrupedEnv = self.env.unwrapped.env  # pyright: ignore[reportAttributeAccessIssue]
+        task: Any = self.env.unwrapped.env  # pyright: ignore[reportAttributeAccessIssue]
 
         def restart(own: TaskState, done: jax.Array) -> TaskState:
             # EpisodeWrapper may end an episode earlier than the task's time limit.
@@ -130,6 +144,16 @@ def wrap(
     return AutoReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
+def _device_put_replicated(tree: Any, devices: Any) -> Any:
+    """Returns the tree with every leaf repeated along a new leading axis, one entry per device."""
+    return jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree)
+
+
 def _task_state(state: State) -> TaskState:
     own: Any = state.pipeline_state
     return own
+
+
+register()
+if not hasattr(jax, "device_put_replicated"):  # trainers of Brax 0.14.2 call what jax 0.10 has removed
+    jax.device_put_replicated = _device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]

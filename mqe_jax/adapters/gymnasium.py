@@ -61,7 +61,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             task: id, or an environment.
             render_mode: None or 'rgb_array'.
             render_size: width and height, pixels.
-            overrides: arguments of `mqe_jax.make`.
+            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
         """
         self.render_mode = render_mode
         self.env = task_env(task, **overrides)
@@ -116,7 +116,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             max_episode_steps: time limit, instead of the task's.
             render_mode: None or 'rgb_array'.
             render_size: width and height, pixels.
-            overrides: arguments of `mqe_jax.make`.
+            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
         """
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)

@@ -13,7 +13,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from mqe_jax.adapters import select
-from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
+from mqe_jax.envs import State
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Pixels
 from mqe_jax.settings import check
@@ -47,7 +48,7 @@ class _Kind:
     """Environments that share compiled functions."""
 
     key: Any
-    env: QuadrupedEnv = dataclasses.field(compare=False)
+    env: TaskEnv = dataclasses.field(compare=False)
 
 
 class HostEnvs:
@@ -56,7 +57,7 @@ class HostEnvs:
     A reset without a seed continues the environment's PRNG stream and starts the same episode as an automatic reset.
     """
 
-    env: QuadrupedEnv
+    env: TaskEnv
     """The task."""
     num_envs: int
     """N."""
@@ -64,11 +65,7 @@ class HostEnvs:
     """The environments' states; None before the first reset."""
 
     def __init__(
-        self,
-        env: QuadrupedEnv,
-        num_envs: int,
-        render_mode: str | None = None,
-        render_size: tuple[int, int] = RENDER_SIZE,
+        self, env: TaskEnv, num_envs: int, render_mode: str | None = None, render_size: tuple[int, int] = RENDER_SIZE
     ) -> None:
         num_envs = check("num_envs", num_envs, Environments)
         width, height = check("render_size", render_size, tuple[Pixels, Pixels])
@@ -79,7 +76,9 @@ class HostEnvs:
         self.state: State | None = None
         self._mode, self._size = render_mode, (width, height)
         self._camera: Camera | None = None
-        key = (type(self.env), self.env.params, self.env.impl, self.env.control, self.env.physics.num_envs)
+        match = self.env.match if isinstance(self.env, TeamEnv) else self.env
+        opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
+        key = (type(match), match.params, match.impl, match.control, match.physics.num_envs, opponent)
         try:
             self._begin, self._step = _compile(_Kind(key, self.env))
         except TypeError:  # parameters that cannot be hashed

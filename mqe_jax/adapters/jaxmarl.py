@@ -1,27 +1,54 @@
-"""JaxMARL: `MultiAgentEnv` over the agents `robot_0`, `robot_1`, ..."""
+"""JaxMARL: `MultiAgentEnv` over the agents `robot_0`, `robot_1`, ...
+
+Importing this module adds every task, under its id, to `jaxmarl.make` and `jaxmarl.registered_envs`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mqe_jax.adapters import agent_names, missing, select, task_env
+from mqe_jax import envs
+from mqe_jax.adapters import agent_names, missing, quietly, select, task_env
+from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
 
 try:
-    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
-    from jaxmarl.environments.spaces import Box
+    with quietly():
+        import jaxmarl
+        from jaxmarl import registration
+        from jaxmarl.environments.multi_agent_env import MultiAgentEnv
+        from jaxmarl.environments.spaces import Box, Discrete
 except ImportError as error:
     raise missing("jaxmarl", error) from None
 
 Arrays = dict[str, jax.Array]
+
+
+def register() -> None:
+    """Makes every task known to `jaxmarl.make`, which has no registry for others' environments, under its id.
+
+    Replaces that function by one that creates an `Env` for a task and calls the original for other ids.
+    """
+    jaxmarl.registered_envs.extend(task for task in envs.tasks() if task not in jaxmarl.registered_envs)
+    if getattr(jaxmarl.make, "knows_tasks", False):
+        return
+    original = jaxmarl.make
+
+    @functools.wraps(original)
+    def make(env_id: str, **env_kwargs: Any) -> MultiAgentEnv:
+        return Env(env_id, **env_kwargs) if env_id in envs.tasks() else original(env_id, **env_kwargs)
+
+    make.__dict__["knows_tasks"] = True
+    jaxmarl.make = registration.make = make
 
 
 class Env(MultiAgentEnv):
@@ -31,16 +58,30 @@ class Env(MultiAgentEnv):
     are true on termination and on truncation.
     """
 
-    env: QuadrupedEnv
+    env: TaskEnv
     """The task."""
+    action_table: np.ndarray | None
+    """The action of each integer (1 + 2 action_size, action_size); None without discrete actions."""
 
-    def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
-        """Creates the environment from a task id or an environment; `overrides` are arguments of `mqe_jax.make`."""
+    def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
+        """Creates the environment.
+
+        Args:
+            task: id, or an environment.
+            discrete: whether actions are integers, as JaxMARL's MAPPO and Q-learning need: 0 is the zero action,
+                2 i + 1 and 2 i + 2 are +1 and -1 in dimension i, zero in the others.
+            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
+        """
         self.env = task_env(task, **overrides)
         super().__init__(self.env.num_agents)
+        size = self.env.action_size
         self.agents = agent_names(self.env)
         self.observation_spaces = {a: Box(-jnp.inf, jnp.inf, (self.env.observation_size,)) for a in self.agents}
-        self.action_spaces = {a: Box(-1.0, 1.0, (self.env.action_size,)) for a in self.agents}
+        self.action_table = np.zeros((1 + 2 * size, size), np.float32) if discrete else None
+        if self.action_table is not None:
+            self.action_table[1::2], self.action_table[2::2] = np.eye(size), -np.eye(size)
+        space = Discrete(1 + 2 * size) if discrete else Box(-1.0, 1.0, (size,))
+        self.action_spaces = dict.fromkeys(self.agents, space)
 
     @property
     def name(self) -> str:
@@ -52,13 +93,13 @@ class Env(MultiAgentEnv):
         """Agents of each team."""
         return {f"team_{i}": [self.agents[j] for j in team] for i, team in enumerate(self.env.teams)}
 
-    @partial(jax.jit, static_argnums=0)
+    @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array) -> tuple[Arrays, State]:
         """Starts an episode."""
         state = self.env.reset(key)
         return self.get_obs(state), state
 
-    @partial(jax.jit, static_argnums=0)
+    @functools.partial(jax.jit, static_argnums=0)
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None = None
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
@@ -68,8 +109,9 @@ class Env(MultiAgentEnv):
         environments and cannot be selected.
         """
         _, after, rewards, dones, infos = self.step_env(key, state, actions)
+        task: Any = self.env
         if reset_state is None:
-            after = autoreset(self.env, after)
+            after = autoreset(task, after)
         else:
             after = select(self.env, dones["__all__"], reset_state, after, kept=("final_obs",))
         return self.get_obs(after), after, rewards, dones, infos
@@ -80,7 +122,7 @@ class Env(MultiAgentEnv):
         """Advances by one environment step without a reset; the key replaces the state's own random key."""
         if not set(self.agents) <= set(actions):
             raise InputError(f"actions: for {list(actions)}; expected one for each of {', '.join(self.agents)}")
-        action = jnp.stack([actions[agent] for agent in self.agents])
+        action = jnp.stack([self._continuous(actions[agent]) for agent in self.agents])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated
         values = {"truncation": after.truncated.astype(jnp.float32), **after.metrics}
@@ -92,7 +134,23 @@ class Env(MultiAgentEnv):
         """Returns the agents' observations (O,)."""
         return {agent: state.obs[i] for i, agent in enumerate(self.agents)}
 
-    @partial(jax.jit, static_argnums=0)
+    @functools.partial(jax.jit, static_argnums=0)
     def get_avail_actions(self, state: State) -> Arrays:
-        """Returns all true (action_size,) bool: continuous actions are always available."""
-        return {agent: jnp.ones(self.env.action_size, bool) for agent in self.agents}
+        """Returns all true, (action_size,) bool or one per discrete action: all are always available."""
+        size = self.env.action_size if self.action_table is None else len(self.action_table)
+        return {agent: jnp.ones(size, bool) for agent in self.agents}
+
+    def get_world_state(self, state: State) -> jax.Array:
+        """Returns the privileged observation (P,), for centralised critics."""
+        return state.privileged_obs
+
+    def world_state_size(self) -> int:
+        """Returns its length P."""
+        return self.env.privileged_observation_size
+
+    def _continuous(self, action: jax.Array) -> jax.Array:
+        """Returns the action (action_size,) of an integer () or (1,), or a continuous action unchanged."""
+        return action if self.action_table is None else jnp.asarray(self.action_table)[jnp.reshape(action, ())]
+
+
+register()

@@ -1,6 +1,7 @@
 """PettingZoo: `ParallelEnv` over the agents `robot_0`, `robot_1`, ...
 
-`parallel_env(task)` creates the parallel environment, `env(task)` its turn-based form (AEC).
+`parallel_env(task)` creates the parallel environment, `env(task)` its turn-based form (AEC). Importing this module
+registers every task as `mqe/TASK-v0`, for `pettingzoo.make("parallel", id)` and `pettingzoo.make("aec", id)`.
 """
 
 from __future__ import annotations
@@ -12,16 +13,26 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import EzPickle
 
+from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 
 try:
+    import pettingzoo
     from pettingzoo import AECEnv, ParallelEnv
     from pettingzoo.utils import OrderEnforcingWrapper, parallel_to_aec
 except ImportError as error:
     raise missing("pettingzoo", error) from None
+
+
+def register() -> None:
+    """Registers every task as `mqe/TASK-v0`; call it again after `mqe_jax.envs.register_task`."""
+    for task in envs.tasks():
+        if f"mqe/{task}-v0" not in pettingzoo.parallel_registry:
+            pettingzoo.register("parallel", f"mqe/{task}-v0", f"{__name__}:parallel_env", kwargs={"task": task})
+            pettingzoo.register("aec", f"mqe/{task}-v0", f"{__name__}:env", kwargs={"task": task})
 
 
 def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> QuadrupedParallelEnv:
@@ -68,7 +79,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
             max_cycles: time limit in environment steps, instead of the task's.
             render_mode: None or 'rgb_array'.
             render_size: width and height, pixels.
-            overrides: arguments of `mqe_jax.make`.
+            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
         """
         EzPickle.__init__(
             self, task, max_cycles=max_cycles, render_mode=render_mode, render_size=render_size, **overrides
@@ -144,3 +155,6 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
 
     def _by_agent(self, values: np.ndarray) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, values, strict=True))
+
+
+register()

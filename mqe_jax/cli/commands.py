@@ -20,15 +20,16 @@ from mqe_jax.settings import record
 
 @record
 class Tasks:
-    """List the tasks with their agents, observation and action sizes, and time limits."""
+    """List the tasks with their agents, sizes, time limits, and whether a trained policy is shipped."""
 
     json: Json = False
 
     def run(self) -> dict[str, Any]:
         """Lists the tasks with their default parameters."""
-        from mqe_jax.envs import TASKS
+        from mqe_jax import zoo
+        from mqe_jax.envs import PLANNERS, TASKS
 
-        rows = []
+        rows, shipped = [], zoo.names()
         for name, task in TASKS.items():
             env = task(control="position", num_envs=1)  # the same sizes, without loading the walk policy
             rows.append(
@@ -36,19 +37,26 @@ class Tasks:
                     "task": name,
                     "title": task.title,
                     "agents": env.num_agents,
+                    "teams": len(env.teams),
                     "observation": env.observation_size,
                     "privileged": env.privileged_observation_size,
                     "time_limit_s": env.params.episode_length,
+                    "shipped_policy": name in shipped,
                 }
             )
         if not self.json:
-            print(f"{'task':<22} {'title':<22} agents  observation  time limit")
+            print("The tasks with their default parameters; `mqe render TASK -o clip.mp4` shows one.\n")
+            print(f"{'task':<22} {'title':<18} {'agents':<7} observation  time limit  policy")
             for row in rows:
+                team = row["agents"] // row["teams"]
+                agents = f"{team}" if row["teams"] == 1 else f"{team} vs {team}"
+                policy = "shipped" if row["shipped_policy"] else "scripted" if row["task"] in PLANNERS else "none"
                 print(
-                    f"{row['task']:<22} {row['title']:<22} {row['agents']:>6}  {row['observation']:>11}"
-                    f"  {row['time_limit_s']:>8g} s"
+                    f"{row['task']:<22} {row['title']:<18} {agents:<7} {row['observation']:>11}"
+                    f"  {row['time_limit_s']:>8g} s  {policy}"
                 )
-            print("\nactions per agent: command 3 (velocities for the walk policy), position 12, torque 12")
+            print("\nobservation: numbers per agent; policy: a trained one is shipped (`mqe zoo`), or scripted only")
+            print("actions per agent: command 3 (velocities for the walk policy), position 12, torque 12")
         return {"tasks": rows}
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import importlib.util
 import socket
+from pathlib import Path
 from typing import Annotated
 
 from annotated_types import Ge, Le
@@ -20,7 +22,7 @@ _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 @record
 class View(PolicyOptions):
-    """Show a task or a trained run in the browser, with teleoperation and live plots."""
+    """Show a task or a trained run in the browser, with teleoperation and live plots; the page can choose others."""
 
     num_envs: Annotated[int, Ge(1), Le(16)] = 1
     """Number of environments, side by side: 1 to 16."""
@@ -36,10 +38,21 @@ class View(PolicyOptions):
         _check_address(self.host, self.port)
         env, vector_env, policy = self.environments(self.num_envs)
 
+        from mqe_jax.view.menu import DEFAULT, Choice, Menu, find_runs
         from mqe_jax.view.session import Session
         from mqe_jax.view.viewer import Viewer
 
-        viewer = Viewer(Session(env, vector_env, policy, self.seed), self.host, self.port)
+        def open_choice(choice: Choice) -> Session:
+            """Creates another session, with the task's default parameters; a run has its own ones."""
+            names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
+            target = choice.policy if choice.policy in runs else choice.task
+            options = dataclasses.replace(self, target=target, policy=names[0], opponent=names[1], set=[])
+            return Session(*options.environments(self.num_envs), self.seed)
+
+        runs = find_runs([Path("runs"), Path(self.target).parent])
+        own = self.policy or (self.target if Path(self.target).exists() else DEFAULT)
+        menu = Menu(open_choice, Choice(env.name, own, self.opponent or DEFAULT), runs)
+        viewer = Viewer(Session(env, vector_env, policy, self.seed), self.host, self.port, menu)
         if self.host not in _LOCAL:
             echo(f"mqe: warning: every machine that reaches {self.host} can open this page and control the robots")
         echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")

@@ -118,6 +118,8 @@ def _check_value(widget: Any, message: Update) -> None:
     value = message.updates.value
     if isinstance(widget, viser.GuiSliderHandle):
         fits, allowed = isinstance(value, float) and widget.min <= value <= widget.max, f"{widget.min} to {widget.max}"
+    elif isinstance(widget, viser.GuiCheckboxHandle):
+        fits, allowed = isinstance(value, bool), "true, false"
     elif isinstance(widget, viser.GuiDropdownHandle):
         fits, allowed = value in widget.options, ", ".join(widget.options)
     elif isinstance(widget, viser.GuiButtonHandle):

@@ -1,4 +1,4 @@
-"""The control panel in the browser: state, buttons, keys, live plots."""
+"""The control panel in the browser: choices, state, buttons, keys, readouts, live plots."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from mqe_jax.view.menu import DEFAULT, Choice, Menu
+from mqe_jax.view.readout import bars, observation_table
 from mqe_jax.view.session import DRIVEN, Session
 
 # Label, direction in fractions of the maximum command (vx, vy, yaw rate), key that increments the command.
@@ -36,17 +38,50 @@ class Panel:
     """Label of the followed body, or `free`."""
     env: int
     """Index of the selected environment, for plots, state, camera and teleoperation."""
+    back: int
+    """Number of steps by which the shown step lies back."""
+    contacts: bool
+    """Whether contacts are shown."""
+    shapes: bool
+    """Whether collision shapes are shown."""
 
-    def __init__(self, server: Any, session: Session, bodies: Sequence[str], on_camera: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        server: Any,
+        session: Session,
+        bodies: Sequence[str],
+        on_camera: Callable[[], None],
+        robots: Sequence[str] = (),
+        menu: Menu | None = None,
+    ) -> None:
+        """Adds the controls to a page.
+
+        Args:
+            server: of the page.
+            session: the simulation.
+            bodies: labels of the bodies that the camera can follow.
+            on_camera: called when another one is chosen.
+            robots: labels of the agents, by default `robot 1`, ...
+            menu: the choices of task and policies; none are offered without it.
+        """
         self._session, self._gui = session, server.gui
         self._on_camera = on_camera
+        self._robots = tuple(robots) or tuple(f"robot {i + 1}" for i in range(session.env.num_agents))
         self._wanted_steps, self._wants_reset = 0, False
-        self.camera, self.env = FREE, 0
+        self._wanted: Choice | None = None
+        self.camera, self.env, self.back = FREE, 0, 0
+        self.contacts = self.shapes = False
         self._state = self._gui.add_markdown("")
+        if menu is not None:
+            self._add_menu(menu)
         self._add_run()
         self._add_view(bodies)
         if session.drivable:
             self._add_drive()
+        with self._gui.add_folder("Reward terms in this step"):
+            self._bars = self._gui.add_html("")
+        with self._gui.add_folder("Observation of the driven robot (default: robot 1)", expand_by_default=False):
+            self._observation = self._gui.add_markdown("")
         self._add_plots()
 
     def take_steps(self) -> int:
@@ -59,22 +94,50 @@ class Panel:
         wanted, self._wants_reset = self._wants_reset, False
         return wanted
 
+    def take_choice(self) -> Choice | None:
+        """Returns the choice made since the last call, or None."""
+        wanted, self._wanted = self._wanted, None
+        return wanted
+
+    def say(self, text: str) -> None:
+        """Shows a text in place of the state."""
+        self._state.content = text
+
     def show(self, positions: np.ndarray, real_time: float) -> None:
         """Shows the robots' positions (A, 3), m, in the selected environment, and the real-time factor."""
         session = self._session
-        commands = session.commands[-1][self.env] if session.commands else np.zeros((len(positions), 3))
+        index = session.at(self.back) if session.moments else 0
+        commands = session.commands[index][self.env] if session.commands else np.zeros((len(positions), 3))
         rows = []
         for agent, (x, y, z) in enumerate(positions):
             vx, vy, turn = commands[agent]
             chosen = session.drivable and (session.drive.env, session.drive.robot) == (self.env, agent)
-            driven = " (driven)" if chosen else ""
-            rows.append(f"| {agent + 1}{driven} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
-        pace = "paused" if session.paused else f"{real_time:.2f} x real time"
-        reward = float(session.rewards[-1][self.env, -1]) if session.rewards else 0.0
-        head = f"**{session.env.name}** at {session.steps * session.env.dt:.2f} s, {pace}\n\n"
-        head += f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step\n\n"
+            name = self._robots[agent].removeprefix("robot ") + (" (driven)" if chosen else "")
+            rows.append(f"| {name} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
+        head = f"**{session.env.name}** at {(session.steps - self.back) * session.env.dt:.2f} s, "
+        head += ("paused" if session.paused else f"{real_time:.2f} x real time") + "\n\n"
+        head += self._score(float(session.rewards[index][self.env, -1]) if session.rewards else 0.0)
         head += "| robot | x | y | z | vx | vy | turn |\n|---|---|---|---|---|---|---|\n"
         self._state.content = head + "\n".join(rows)
+        self._read_out(index)
+
+    def _score(self, reward: float) -> str:
+        """Returns the lines with episode, reward, and the outcomes of the episodes that ended."""
+        session = self._session
+        text = f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step\n\n"
+        counts = ", ".join(f"{name} {count}" for name, count in zip(session.outcomes, session.counts, strict=True))
+        team = f"{self._robots[0]}'s team" if len(session.outcomes) > 1 else "episodes"
+        last = f"; last: {session.last[self.env]}" if session.last[self.env] else ""
+        return text + f"{team}: {counts} of {session.episodes.sum()}{last}\n\n"
+
+    def _read_out(self, index: int) -> None:
+        """Shows reward terms and observation of a step of the history."""
+        session = self._session
+        if session.rewards:
+            terms = [name.removeprefix("reward/") for name in (*session.terms[:-1], "sum")]
+            self._bars.content = bars(terms, session.rewards[index][self.env].tolist())
+        obs = session.moment(self.back).obs[self.env, session.drive.robot or 0]
+        self._observation.content = observation_table(getattr(session.env, "observation_layout", None), obs)
 
     def plot(self) -> None:
         """Updates the plots with the recent history of the selected environment."""
@@ -92,6 +155,29 @@ class Panel:
 
     # -- controls -----------------------------------------------------------------------------------------------
 
+    def _add_menu(self, menu: Menu) -> None:
+        gui, shown = self._gui, menu.shown
+        with gui.add_folder("Task and policies"):
+            task = gui.add_dropdown("Task", menu.tasks, initial_value=shown.task)
+            names = menu.policies(shown.task)
+            policy = gui.add_dropdown("Policy", names, initial_value=shown.policy)
+            opponent = gui.add_dropdown(
+                "Opponent", names, initial_value=shown.opponent, visible=menu.is_match(shown.task), hint="Of team 1"
+            )
+            load = gui.add_button("Load", hint="Starts with the chosen task and policies")
+
+        def offer(_: Any) -> None:
+            for dropdown in (policy, opponent):
+                dropdown.options = menu.policies(str(task.value))
+            opponent.visible = menu.is_match(str(task.value))
+
+        def choose(_: Any) -> None:
+            rival = str(opponent.value) if menu.is_match(str(task.value)) else DEFAULT
+            self._wanted = Choice(str(task.value), str(policy.value), rival)
+
+        task.on_update(offer)
+        load.on_click(choose)
+
     def _add_run(self) -> None:
         gui, session = self._gui, self._session
         with gui.add_folder("Run"):
@@ -99,10 +185,24 @@ class Panel:
             step = gui.add_button("One step")
             reset = gui.add_button("Reset")
             speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Real-time factor")
+            length = (session.moments.maxlen or 1) * session.env.dt
+            back = gui.add_slider(
+                "Back", min=0.0, max=length, step=session.env.dt, initial_value=0.0, hint="Pauses; s before now"
+            )
+
+        def set_paused(paused: bool) -> None:
+            session.paused = paused
+            pause.label = "Continue" if paused else "Pause"
 
         def toggle(_: Any) -> None:
-            session.paused = not session.paused
-            pause.label = "Continue" if session.paused else "Pause"
+            set_paused(not session.paused)
+            if not session.paused:
+                back.value, self.back = 0.0, 0
+
+        def scrub(_: Any) -> None:
+            self.back = round(float(back.value) / session.env.dt)
+            if self.back:
+                set_paused(True)
 
         def one(_: Any) -> None:
             self._wanted_steps = min(self._wanted_steps + 1, _MOST_STEPS)
@@ -114,6 +214,7 @@ class Panel:
             session.speed = float(speed.value)
 
         speed.on_update(pace)
+        back.on_update(scrub)
         for button, key, label, action in (
             (pause, "P", "Pause or continue", toggle),
             (step, "N", "One step", one),
@@ -131,6 +232,8 @@ class Panel:
             )
             numbers = tuple(str(i + 1) for i in range(session.num_envs))
             env = gui.add_dropdown("Environment", numbers, initial_value="1", visible=session.num_envs > 1)
+            contacts = gui.add_checkbox("Contacts", False, hint="Contact points and forces in this environment")
+            shapes = gui.add_checkbox("Collision shapes", False)
 
         def follow(_: Any) -> None:
             self.camera = str(camera.value)
@@ -139,12 +242,17 @@ class Panel:
         def choose(_: Any) -> None:
             self.env = session.drive.env = int(env.value) - 1
 
+        def overlay(_: Any) -> None:
+            self.contacts, self.shapes = bool(contacts.value), bool(shapes.value)
+
         camera.on_update(follow)
         env.on_update(choose)
+        contacts.on_update(overlay)
+        shapes.on_update(overlay)
 
     def _add_drive(self) -> None:
         gui, drive = self._gui, self._session.drive
-        names = tuple(f"robot {i + 1}" for i in range(self._session.env.num_agents))
+        names = self._robots
         with gui.add_folder("Drive"):
             robot = gui.add_dropdown("Driven", (NONE, *names), initial_value=NONE, hint="Teleoperated robot")
             keys = " ".join(key for _, _, key in DIRECTIONS)

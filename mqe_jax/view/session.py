@@ -21,6 +21,24 @@ HOLD_TIME = 0.35
 """Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
 
 
+OUTCOMES = ("win", "draw", "loss")
+"""Outcomes of an episode of a match for team 0."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What is drawn of a step."""
+
+    frame: Episode
+    """Poses, those of an environment in each frame."""
+    qvel: np.ndarray
+    """Velocities (N, nv)."""
+    ctrl: np.ndarray
+    """Actuator targets (N, nu)."""
+    obs: np.ndarray
+    """Observations of the agents (N, A, O)."""
+
+
 @dataclass
 class Drive:
     """Teleoperation of one robot: a command set by keys, plus the commands of held buttons."""
@@ -75,8 +93,14 @@ class Session:
     """Environment steps so far."""
     episodes: np.ndarray
     """Number of finished episodes of each environment (N,)."""
+    outcomes: tuple[str, ...]
+    """Names of the outcomes of an episode: win, draw and loss in a match, else success."""
+    counts: np.ndarray
+    """How many finished episodes of all environments had each outcome."""
+    last: list[str]
+    """Outcome of the last finished episode of each environment, empty before its end and where none applies."""
 
-    def __init__(self, env: Any, vector_env: Any, policy: Policy, seed: int = 0, history: float = 10.0) -> None:
+    def __init__(self, env: Any, vector_env: Any, policy: Policy, seed: int = 0, history: float = 20.0) -> None:
         """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
         self.paused, self.speed, self.drive = False, 1.0, Drive(np.zeros(3))
@@ -92,13 +116,18 @@ class Session:
             self._gain, self.drive.limit = (skill.column(field, DRIVEN) for field in ("gain", "limit"))
         self.steps = 0
         self.episodes = np.zeros(self.num_envs, int)
+        self.outcomes, self.last = ("success",), [""] * self.num_envs
         self.reset()
+        if f"team0/{OUTCOMES[0]}" in self.state.metrics:
+            self.outcomes = OUTCOMES
+        self.counts = np.zeros(len(self.outcomes), int)
         rewards = [name for name in self.state.metrics if name.startswith("reward/")]
         self.terms = (*rewards, "average_step_reward")
         length = max(2, round(history / env.dt))
         self.times: deque[float] = deque(maxlen=length)
         self.rewards: deque[np.ndarray] = deque(maxlen=length)  # (N, terms)
         self.commands: deque[np.ndarray] = deque(maxlen=length)  # (N, A, 3)
+        self.moments: deque[Moment] = deque(maxlen=length)
 
     def reset(self) -> None:
         """Resets all environments."""
@@ -114,17 +143,38 @@ class Session:
         if self.drivable and self.drive.robot is not None:
             mask[self.drive.env, self.drive.robot] = True
             driven[self._columns] = self.drive.now() / self._gain
-        self.state, self.memory, done, rewards, commands = self._step(self.state, self.memory, key, mask, driven)
+        self.state, self.memory, done, ended, rewards, commands = self._step(self.state, self.memory, key, mask, driven)
         self.steps += 1
         self.episodes += np.asarray(done)
+        self._count(np.asarray(done), np.asarray(ended))
         self.times.append(self.steps * self.env.dt)
         self.rewards.append(np.asarray(rewards))
         self.commands.append(np.asarray(commands))
+        self.moments.append(self.moment())
+
+    def moment(self, back: int = 0) -> Moment:
+        """Returns the current step, or that of `back` steps ago, at most the oldest of the history."""
+        if back and self.moments:
+            return self.moments[self.at(back)]
+        data = self.state.data
+        poses = map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat))
+        arrays = map(np.asarray, (data.qvel, data.ctrl, self.state.obs))
+        return Moment(Episode(*poses, dt=self.env.dt), *arrays)
+
+    def at(self, back: int) -> int:
+        """Returns the index into the history of the step `back` steps ago, at most its oldest."""
+        return -1 - min(back, len(self.moments) - 1)
 
     def frame(self) -> Episode:
         """Returns the current poses, those of an environment in each frame."""
-        data = self.state.data
-        return Episode(*map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat)), dt=self.env.dt)
+        return self.moment().frame
+
+    def _count(self, done: np.ndarray, ended: np.ndarray) -> None:
+        """Counts the outcomes (N, K) of the environments whose episode ended (N,)."""
+        self.counts += np.sum(done[:, None] & ended, axis=0)
+        for index in np.flatnonzero(done):
+            names = [name for name, is_it in zip(self.outcomes, ended[index], strict=True) if is_it]
+            self.last[index] = names[0] if names else "no success"
 
     def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
         env = self.env
@@ -145,4 +195,6 @@ class Session:
         memory = jax.tree.map(restart, memory, self._first_memory)
         names = [name for name in state.metrics if name.startswith("reward/")]
         rewards = jnp.stack([state.metrics[name] for name in (*names, "average_step_reward")], axis=-1)
-        return state, memory, done, rewards, commands
+        names = [name if name in state.metrics else f"team0/{name}" for name in self.outcomes]
+        ended = jnp.stack([state.metrics[name] > 0 for name in names], axis=-1)
+        return state, memory, done, ended, rewards, commands

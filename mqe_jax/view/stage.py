@@ -32,6 +32,8 @@ class Stage:
 
     bodies: dict[str, int]
     """Ids of the bodies that a camera can follow, by label."""
+    offset: np.ndarray
+    """Place of each environment (N, 3), m."""
 
     def __init__(self, server: Any, model: mujoco.MjModel, frame: Episode) -> None:
         self._server, self._model = server, model
@@ -41,7 +43,7 @@ class Stage:
         low, high = extent(rendering_model(self._model, first), first)
         self.centre, self.size = (low + high) / 2, high - low
         shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
-        self._offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
+        self.offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
         self._mocap: np.ndarray | None = None
         self.bodies = followable(self._model)
         self._root = server.scene.add_frame("/world", show_axes=False)
@@ -71,7 +73,7 @@ class Stage:
         turns = np.zeros((self._count, self._model.nbody, 4))
         for i in range(self._count):
             pose(self._model, self._data, frame, i)
-            positions[i], turns[i] = self._data.xpos + self._offset[i], self._data.xquat
+            positions[i], turns[i] = self._data.xpos + self.offset[i], self._data.xquat
         return positions, turns
 
     def _place(self, batches: list[_Batch], positions: np.ndarray, turns: np.ndarray) -> None:
@@ -91,11 +93,11 @@ class Stage:
         boxes = [_wall_boxes(self._model, frame.cut(slice(i, i + 1)), self._walls) for i in range(self._count)]
         for index, handle in enumerate(self._wall_handles):
             centre, turn, size = (np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3))
-            handle.batched_positions = centre + self._offset.astype(np.float32)
+            handle.batched_positions = centre + self.offset.astype(np.float32)
             handle.batched_wxyzs, handle.batched_scales = turn, size
 
     def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
-        side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self._offset[-1, 1]) + 4.0]
+        side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0]
         middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
         floor = np.flatnonzero(np.isin(self._model.geom_type, _PLANES) & (self._model.geom_group == GROUND_GROUP))[0]
         colour = tuple(round(255 * float(c)) for c in self._model.geom_rgba[floor, :3])

@@ -7,7 +7,11 @@ import time
 import numpy as np
 import viser
 
+from mqe_jax.errors import InputError
+from mqe_jax.view.menu import Menu
+from mqe_jax.view.overlay import Overlay
 from mqe_jax.view.panel import FREE, Panel
+from mqe_jax.view.readout import robot_labels
 from mqe_jax.view.server import open_server
 from mqe_jax.view.session import Session
 from mqe_jax.view.stage import Stage
@@ -29,27 +33,42 @@ class Viewer:
     url: str
     """Address of the page."""
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.session = session
-        self.server = open_server(host, port, f"mqe view {session.env.name}")
+    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, menu: Menu | None = None) -> None:
+        """Starts the server and draws the session; `menu` lets the page choose others."""
+        self.server = open_server(host, port, "mqe view")
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
-        self.server.gui.configure_theme(
-            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
-        )
-        self._stage = Stage(self.server, session.env.mj_model, session.frame())
-        self._panel = Panel(self.server, session, tuple(self._stage.bodies), self._aim)
+        self._menu = menu
+        self._show(session)
+
+    def _show(self, session: Session) -> None:
+        """Builds scene and panel of a session, in place of the last ones."""
+        self.session = session
+        self.server.scene.reset()
+        self.server.gui.reset()
+        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
+        model = session.env.mj_model
+        self._stage = Stage(self.server, model, session.frame())
+        self._overlay, self._shapes = Overlay(self.server, model, self._stage.offset), False
+        robots = robot_labels(model)
+        named = {f"robot {i + 1}": label for i, label in enumerate(robots)}
+        self._bodies = {named.get(label, label): body for label, body in self._stage.bodies.items()}
+        agents = robots[: session.env.num_agents]
+        self._panel = Panel(self.server, session, tuple(self._bodies), self._aim, agents, self._menu)
         camera = self.server.initial_camera
         camera.position, camera.look_at = self._view()
         camera.fov = _FIELD_OF_VIEW
 
     def run(self) -> None:
         """Steps and renders at the session's speed until an exception; then stops the server."""
-        dt = self.session.env.dt
         due = drawn = shown = time.monotonic()
         self.session.advance()  # compiles the step
         due, counted = time.monotonic(), self.session.steps
         try:
             while True:
+                if self._exchanged():
+                    due, counted = time.monotonic(), self.session.steps
+                dt = self.session.env.dt
                 now = time.monotonic()
                 stepped = self._step_if_due(now, due)
                 if stepped:
@@ -59,7 +78,7 @@ class Viewer:
                 now = time.monotonic()
                 if now - drawn >= 1 / DRAW_RATE:
                     drawn = now
-                    self._stage.draw(self.session.frame(), self._followed())
+                    self._draw()
                 if now - shown >= 1 / PANEL_RATE:
                     real_time = (self.session.steps - counted) * dt / (now - shown)
                     shown, counted = now, self.session.steps
@@ -69,6 +88,35 @@ class Viewer:
                     time.sleep(max(0.001, min(due - now, 0.01)))
         finally:
             self.server.stop()
+
+    def _exchanged(self) -> bool:
+        """Opens the session that was chosen on the page, if any; keeps the present one where that is not possible."""
+        choice = self._panel.take_choice()
+        if choice is None or self._menu is None:
+            return False
+        self._panel.say(f"loading **{choice.task}**, which compiles its step")
+        try:
+            session = self._menu.open(choice)
+            session.advance()
+        except InputError as error:
+            self._panel.say(f"not loaded: {error}")
+            self.session.paused = True
+            return False
+        self._menu.shown = choice
+        self._show(session)
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = self._view()
+        return True
+
+    def _draw(self) -> None:
+        """Draws the step that the panel shows."""
+        moment, panel = self.session.moment(self._panel.back), self._panel
+        self._stage.draw(moment.frame, self._followed())
+        if panel.shapes != self._shapes:
+            self._shapes = panel.shapes
+            self._overlay.show_shapes(self._shapes)
+        self._overlay.contacts = panel.contacts
+        self._overlay.draw(moment.frame, panel.env, moment.qvel[panel.env], moment.ctrl[panel.env])
 
     def _step_if_due(self, now: float, due: float) -> bool:
         """Handles reset and single-step requests, advances if the next step is due; returns whether it was due."""
@@ -83,13 +131,13 @@ class Viewer:
 
     def _positions(self) -> np.ndarray:
         """Returns the agents' positions (A, 3), m, in the selected environment."""
-        env = self.session.env
-        return self.session.frame().qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
+        env, frame = self.session.env, self.session.moment(self._panel.back).frame
+        return frame.qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
 
     def _followed(self) -> tuple[int, int] | None:
         if self._panel.camera == FREE:
             return None
-        return self._panel.env, self._stage.bodies[self._panel.camera]
+        return self._panel.env, self._bodies[self._panel.camera]
 
     def _view(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns camera position and look-at point (3,), m, for the whole scene or the followed body."""

@@ -1,0 +1,103 @@
+"""Trains Narrow Gate with TorchRL's multi-agent PPO, a central critic and shared parameters, through PettingZoo.
+
+    pip install 'mqe-jax[pettingzoo]' torchrl
+    python examples/torchrl_mappo.py --steps 20000
+
+TorchRL steps one environment on the host: the example demonstrates compatibility, not speed.
+"""
+
+import argparse
+from importlib import import_module
+from typing import Any
+
+from mqe_jax.adapters import pettingzoo
+
+BATCH, EPOCHS, MINIBATCHES = 2000, 8, 4
+# In training the approach reward has a larger weight, as in configs/demo.yaml.
+TRAINING_REWARDS = {"approach": 10.0}
+GROUP = "robot"
+"""TorchRL's group of the agents robot_0, robot_1, ..."""
+
+
+def train(task: str = "go1gate", steps: int = 20_000, batch: int = BATCH, **settings: Any) -> list[float]:
+    """Trains; returns the mean return of an agent over the episodes that ended in each batch, NaN without any.
+
+    Args:
+        task: id.
+        steps: environment steps.
+        batch: environment steps between updates.
+        settings: arguments of `mqe_jax.adapters.pettingzoo.parallel_env`, such as `opponent`.
+    """
+    # Imported by name: TorchRL is not an extra of mqe-jax.
+    torch: Any = import_module("torch")
+    envs: Any = import_module("torchrl.envs")
+    collectors: Any = import_module("torchrl.collectors")
+    objectives: Any = import_module("torchrl.objectives")
+    torch.manual_seed(0)
+    env = envs.PettingZooWrapper(pettingzoo.parallel_env(task, **settings))
+    total = (GROUP, "episode_reward")
+    env = envs.TransformedEnv(env, envs.RewardSum(in_keys=[env.reward_key], out_keys=[total]))
+    actor, critic = networks(env)
+    loss = objectives.ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_coeff=1e-3, normalize_advantage=True)
+    loss.set_keys(
+        reward=env.reward_key,
+        action=env.action_key,
+        value=(GROUP, "state_value"),
+        done=(GROUP, "done"),
+        terminated=(GROUP, "terminated"),
+    )
+    loss.make_value_estimator(objectives.ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=5e-4)
+    returns = []
+    for data in collectors.Collector(env, actor, frames_per_batch=batch, total_frames=steps):
+        ended = data["next", GROUP, "done"]
+        returns.append(float(data["next", *total][ended].mean()))
+        print(f"return {returns[-1]:.3f}", flush=True)
+        for _ in range(EPOCHS):
+            with torch.no_grad():
+                loss.value_estimator(
+                    data, params=loss.critic_network_params, target_params=loss.target_critic_network_params
+                )
+            for part in data[torch.randperm(len(data))].chunk(MINIBATCHES):
+                values = loss(part)
+                (values["loss_objective"] + values["loss_critic"] + values["loss_entropy"]).backward()
+                torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
+                optimizer.step()
+                optimizer.zero_grad()
+    return returns
+
+
+def networks(env: Any) -> tuple[Any, Any]:
+    """Returns the policy, shared by the agents, and the central critic."""
+    torch: Any = import_module("torch")
+    tensordict: Any = import_module("tensordict.nn")
+    modules: Any = import_module("torchrl.modules")
+    observation, action = (GROUP, "observation"), env.full_action_spec_unbatched[env.action_key]
+    agents, size = action.shape
+    settings = {"n_agent_inputs": env.observation_spec[observation].shape[-1], "n_agents": agents}
+    settings |= {"share_params": True, "depth": 2, "num_cells": 64, "activation_class": torch.nn.Tanh}
+    mean = modules.MultiAgentMLP(n_agent_outputs=2 * size, centralised=False, **settings)
+    mean = torch.nn.Sequential(mean, tensordict.NormalParamExtractor())
+    parameters = [(GROUP, "loc"), (GROUP, "scale")]
+    actor = modules.ProbabilisticActor(
+        tensordict.TensorDictModule(mean, in_keys=[observation], out_keys=parameters),
+        spec=action,
+        in_keys=parameters,
+        out_keys=[env.action_key],
+        distribution_class=modules.TanhNormal,
+        return_log_prob=True,
+    )
+    value = modules.MultiAgentMLP(n_agent_outputs=1, centralised=True, **settings)
+    critic = tensordict.TensorDictModule(value, in_keys=[observation], out_keys=[(GROUP, "state_value")])
+    return actor, critic
+
+
+def main() -> None:
+    """Runs the example."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--steps", type=int, default=20_000)
+    train("go1gate", parser.parse_args().steps, rewards=TRAINING_REWARDS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""A match against a fixed opponent as an environment of team 0 alone; `opponents.Versus` is its batched form."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.errors import InputError
+from mqe_jax.policies import SimplePolicy, load_opponent, team_size
+from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.types import Memory
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TeamState(State):
+    """State of a match as seen by team 0, with T agents; observations, rewards and metrics are those of team 0."""
+
+    rival_obs: jax.Array
+    """Observations of the opponent's agents (T, O)."""
+    rival_memory: Memory
+    """Recurrent state of the opponent, leading axis 1."""
+
+
+class TeamEnv:
+    """One match as an environment of team 0, in which the opponent controls team 1.
+
+    It has what the adapters use of `QuadrupedEnv`: sizes and spaces are those of team 0, everything else the match's.
+    """
+
+    match: QuadrupedEnv
+    """The match."""
+    opponent: Policy
+    """The policy of team 1."""
+    num_agents: int
+    """Number of agents of a team T."""
+
+    def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
+        """Creates the environment.
+
+        Args:
+            match: a task with two teams.
+            opponent: what `mqe_jax.load_policy` accepts, or a policy; one that samples its actions does so here.
+
+        Raises:
+            InputError: for a task that is not a match, an opponent that cannot be read, or one of another task.
+        """
+        if len(match.teams) != 2:
+            raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
+        self.match = match
+        self.opponent = load_opponent(opponent, match) if isinstance(opponent, str | Path) else opponent
+        self.num_agents = team_size(match)
+        if (self.opponent.task, self.opponent.agents) != (match.name, self.num_agents):
+            raise InputError(
+                f"opponent: a policy of {self.opponent.agents} agents on {self.opponent.task}; {match.name} needs one "
+                f"of {self.num_agents}"
+            )
+        self._source = str(opponent) if isinstance(opponent, str | Path) else None
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "match":  # while an instance is being copied
+            raise AttributeError(name)
+        return getattr(self.match, name)
+
+    @property
+    def teams(self) -> tuple[tuple[int, ...], ...]:
+        """The only team."""
+        return (tuple(range(self.num_agents)),)
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Box:
+        """Actions of team 0 (T, action_size) in [-1, 1]."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (self.num_agents, self.match.action_size), np.float32)
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Observations of team 0 (T, O)."""
+        return gymnasium.spaces.Box(-np.inf, np.inf, (self.num_agents, self.match.observation_size), np.float32)
+
+    @property
+    def identity(self) -> Hashable:
+        """A value that is equal for opponents that act alike; compared where compiled functions are shared."""
+        if isinstance(self.opponent, TrainedPolicy):
+            digest = hashlib.sha256()
+            for leaf in jax.tree.leaves(self.opponent.arrays):
+                digest.update(np.asarray(leaf).tobytes())
+            return str(self.opponent.architecture), digest.hexdigest()
+        named = isinstance(self.opponent, SimplePolicy) and self._source is not None
+        return self._source if named else id(self.opponent)
+
+    def with_num_envs(self, num_envs: int) -> TeamEnv:
+        """Returns an environment whose engine holds `num_envs` environments; see `QuadrupedEnv.with_num_envs`."""
+        match = self.match.with_num_envs(num_envs)
+        if match is self.match:
+            return self
+        larger = TeamEnv(match, self.opponent)
+        larger._source = self._source
+        return larger
+
+    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
+        """Returns a randomised initial state; see `QuadrupedEnv.reset`."""
+        state = self.match.reset(key, assistance)
+        memory = self.opponent.initial_memory(1)
+        return self._seen(TeamState(**vars(state), rival_obs=state.obs, rival_memory=memory))
+
+    def step(self, state: State, action: jax.Array) -> TeamState:
+        """Advances by one environment step with the actions of team 0 (T, action_size); the opponent acts for team 1.
+
+        Raises:
+            InputError: for actions of another shape, and as `QuadrupedEnv.step`.
+        """
+        shape = (self.num_agents, self.match.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)")
+        own: Any = state  # a `TeamState`; the match's step keeps its further fields
+        key = jax.random.fold_in(own.key, 1)
+        rival, memory = self.opponent.act(own.rival_obs[None], own.rival_memory, key)
+        both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.asarray(rival[0], jnp.float32)])
+        after: Any = self.match.step(own, both)
+        return self._seen(dataclasses.replace(after, rival_memory=memory))
+
+    def _seen(self, state: TeamState) -> TeamState:
+        """Reduces observations, rewards and metrics of all agents to those of team 0."""
+        own = slice(0, self.num_agents)
+        return dataclasses.replace(
+            state,
+            obs=state.obs[own],
+            final_obs=state.final_obs[own],
+            reward=state.reward[own],
+            metrics={name: value for name, value in state.metrics.items() if not name.startswith("team1/")},
+            rival_obs=state.obs[self.num_agents :],
+        )
+
+
+TaskEnv = QuadrupedEnv | TeamEnv
+"""What the adapters adapt: a task, or a match against an opponent."""

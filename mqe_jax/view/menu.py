@@ -1,0 +1,75 @@
+"""What can be chosen in the page: a task, its policy and opponent from the package and from run folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mqe_jax import zoo
+from mqe_jax.envs import PLANNERS, TASKS
+from mqe_jax.envs.match import Match
+from mqe_jax.errors import InputError
+from mqe_jax.train.policy import POLICY_FILE
+from mqe_jax.train.runner import load_run_config
+from mqe_jax.view.session import Session
+
+DEFAULT = "default"
+"""The policy that `mqe view TASK` shows."""
+_LONGEST = 64  # of an option, characters; messages are no longer
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A task with its policies, `DEFAULT` where none is named."""
+
+    task: str
+    """Id of the task."""
+    policy: str = DEFAULT
+    """Policy of all agents, or of team 0 of a match."""
+    opponent: str = DEFAULT
+    """Policy of team 1 of a match."""
+
+
+@dataclass
+class Menu:
+    """The choices, and how one becomes a session."""
+
+    open: Callable[[Choice], Session]
+    """Creates the session of a choice; raises an InputError where that is not possible."""
+    shown: Choice
+    """The choice on the page."""
+    runs: dict[str, str] = field(default_factory=dict)
+    """Task of each run folder."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The ids of all tasks."""
+        return tuple(TASKS)
+
+    def policies(self, task: str) -> tuple[str, ...]:
+        """Returns the policies of a task."""
+        shipped = (task,) if task in zoo.names() else ()
+        scripted = ("scripted",) if task in PLANNERS else ()
+        runs = tuple(run for run, its_task in self.runs.items() if its_task == task)
+        found = (DEFAULT, *shipped, *scripted, "random", "idle", "forward", *runs)
+        own = (self.shown.policy, self.shown.opponent) if task == self.shown.task else ()
+        return (*found, *(name for name in dict.fromkeys(own) if name not in found))
+
+    def is_match(self, task: str) -> bool:
+        """Returns whether a task has two teams."""
+        return issubclass(TASKS[task], Match)
+
+
+def find_runs(folders: Sequence[Path]) -> dict[str, str]:
+    """Returns the task of each run folder with a policy directly below the folders, in order; others are left out."""
+    found = {}
+    for folder in folders:
+        for path in sorted(folder.glob(f"*/{POLICY_FILE}")):
+            try:
+                task = load_run_config(path.parent).task
+            except InputError:
+                continue
+            if task in TASKS and len(str(path.parent)) <= _LONGEST:
+                found[str(path.parent)] = task
+    return found

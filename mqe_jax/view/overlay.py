@@ -1,0 +1,112 @@
+"""What the scene can show over the robots: contact points with their forces, and collision shapes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from mjviser.conversions import merge_geoms
+
+from mqe_jax.viz.geometry import COLLISION_GROUP, pose
+from mqe_jax.viz.recording import Episode
+
+_METRES_PER_NEWTON, _LONGEST = 0.004, 1.0  # of an arrow, m
+_FORCE, _SHAPE = (224, 60, 40), (224, 138, 44)
+
+
+class Overlay:
+    """Contacts of one environment and collision shapes of all, drawn below the movable root frame of a `Stage`."""
+
+    contacts: bool
+    """Whether contact points and forces are drawn."""
+
+    def __init__(self, server: Any, model: mujoco.MjModel, offset: np.ndarray) -> None:
+        """Draws nothing yet; `offset` (N, 3) is the place of each environment, m."""
+        self._server, self._model, self._data, self._offset = server, model, mujoco.MjData(model), offset
+        self.contacts = False
+        self._arrows: Any = None
+        self._shapes: list[tuple[int, Any]] = []
+
+    def show_shapes(self, shown: bool) -> None:
+        """Adds or removes the collision shapes of robots and objects, as wire frames."""
+        for _, handle in self._shapes:
+            handle.remove()
+        self._shapes = [(body, self._add(body, geoms)) for body, geoms in self._bodies().items()] if shown else []
+
+    def draw(self, frame: Episode, index: int, qvel: np.ndarray, ctrl: np.ndarray) -> None:
+        """Places the shapes of all environments, and draws the contacts of environment `index`."""
+        if self._shapes:
+            positions, turns = [], []
+            for i in range(len(frame)):
+                pose(self._model, self._data, frame, i)
+                positions.append(self._data.xpos + self._offset[i])
+                turns.append(self._data.xquat.copy())
+            for body, handle in self._shapes:
+                handle.batched_positions = np.stack([x[body] for x in positions]).astype(np.float32)
+                handle.batched_wxyzs = np.stack([x[body] for x in turns]).astype(np.float32)
+        if self._arrows is not None:
+            self._arrows.remove()
+            self._arrows = None
+        if self.contacts:
+            arrows = contact_arrows(self._model, self._data, frame.cut(slice(index, index + 1)), qvel, ctrl)
+            if len(arrows):
+                self._arrows = self._server.scene.add_arrows(
+                    "/world/contacts",
+                    (arrows + self._offset[index]).astype(np.float32),
+                    _FORCE,
+                    shaft_radius=0.012,
+                    head_radius=0.03,
+                    head_length=0.05,
+                )
+
+    def _bodies(self) -> dict[int, list[int]]:
+        """Returns the collision geoms of moving bodies, by body."""
+        found: dict[int, list[int]] = {}
+        for geom in np.flatnonzero(self._model.geom_group == COLLISION_GROUP):
+            body = int(self._model.geom_bodyid[geom])
+            if body:
+                found.setdefault(body, []).append(int(geom))
+        return found
+
+    def _add(self, body: int, geoms: list[int]) -> Any:
+        mesh, count = merge_geoms(self._model, geoms), len(self._offset)
+        return self._server.scene.add_batched_meshes_simple(
+            f"/world/shapes/{body}",
+            np.asarray(mesh.vertices),
+            np.asarray(mesh.faces),
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            batched_positions=np.zeros((count, 3)),
+            batched_colors=_SHAPE,
+            lod="off",
+            wireframe=True,
+        )
+
+
+def contact_arrows(
+    model: mujoco.MjModel, data: mujoco.MjData, frame: Episode, qvel: np.ndarray, ctrl: np.ndarray
+) -> np.ndarray:
+    """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point, and its force as MuJoCo computes it.
+
+    250 N are one metre; arrows are not longer.
+
+    Args:
+        model: with the actuators of the physics.
+        data: workspace.
+        frame: one pose.
+        qvel: velocities (nv,) in this pose.
+        ctrl: actuator targets (nu,).
+    """
+    pose(model, data, frame, 0)
+    data.qvel[:], data.ctrl[:] = qvel, ctrl
+    mujoco.mj_forward(model, data)
+    arrows, force = np.zeros((data.ncon, 2, 3)), np.zeros(6)
+    for i in range(data.ncon):
+        contact = data.contact[i]
+        mujoco.mj_contactForce(model, data, i, force)
+        turn = contact.frame.reshape(3, 3).T
+        second = model.geom_bodyid[contact.geom2] != 0  # the force acts on the second geom; the first may be the robot
+        arrow = _METRES_PER_NEWTON * (turn @ force[:3]) * (1.0 if second else -1.0)
+        arrows[i, 0] = contact.pos
+        arrows[i, 1] = contact.pos + arrow * min(1.0, _LONGEST / max(float(np.linalg.norm(arrow)), 1e-9))
+    return arrows
