@@ -191,7 +191,7 @@ def policy_function(policy: Policy, observation_size: int) -> tuple[Function, Sh
 def normal_numbers(noise: jax.Array | None, used: Callable[[int], None] = lambda size: None) -> Iterator[None]:
     """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros without them.
 
-    A graph has no random keys, so its noise is an input. Compiled functions must not run within it, as they are cached.
+    A graph has no random keys, so its noise is an input. Nothing is compiled within, as JAX would keep it.
     """
     position = 0
 
@@ -201,14 +201,14 @@ def normal_numbers(noise: jax.Array | None, used: Callable[[int], None] = lambda
         used(position)
         return jnp.zeros(shape, dtype) if noise is None else noise[first:position].reshape(shape)
 
-    with mock.patch.object(jax.random, "normal", normal):
+    with jax.disable_jit(), mock.patch.object(jax.random, "normal", normal):
         yield
 
 
 def _noise_size(function: Callable[[], Any]) -> int:
     """Returns how many normal numbers a function draws."""
     sizes = [0]
-    with jax.disable_jit(), normal_numbers(None, sizes.append):
+    with normal_numbers(None, sizes.append):
         jax.eval_shape(function)
     return sizes[-1]
 
