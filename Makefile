@@ -36,7 +36,7 @@ system: ## Install the GL libraries for rendering, where possible
 browser: ## Install Debian's Chromium for the test of `mqe view`, where possible
 	@bash tools/install.sh chromium
 
-npm: ## Install Debian's npm for the libraries of the page docs/play, where possible
+npm: ## Install Debian's npm for the libraries of `mqe play-site`, where possible
 	@bash tools/install.sh npm
 
 demo: $(STAMP) system ## Train Narrow Gate on the CPU, evaluate before and after, write to runs/demo
@@ -47,7 +47,7 @@ test: $(STAMP) ## Run the tests
 
 docs: $(STAMP) npm ## Build the documentation site into build/site
 	NO_MKDOCS_2_WARNING=1 JAX_PLATFORMS=cpu $(BIN)/mkdocs build --strict --quiet
-	JAX_PLATFORMS=cpu $(BIN)/python tools/play.py build/site/play
+	JAX_PLATFORMS=cpu $(BIN)/mqe play-site -o build/site/play || echo "docs: the site has no page play/"
 	@echo "docs: open build/site/index.html"
 
 soak: $(STAMP) ## Run the heavy tests too (about an hour)

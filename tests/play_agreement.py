@@ -1,19 +1,17 @@
-"""Measures how MuJoCo in the browser agrees with the C engine here, on the scene of docs/play.
+"""Measures how a page of `mqe play-site` agrees with the package: its physics, and how often its teams succeed.
 
-`python -m tests.play_agreement build/site/play --json docs/play/agreement.json` needs Node and a page completed by
-tools/play.py. Episodes of the environment under the page's policy give initial states and joint targets; the page's
-code replays them in WebAssembly. Reported are the largest differences of the states after 1 and 20 environment steps,
-over all robots and rollouts, against the environment and against MuJoCo here on the page's MJCF in double precision.
-Then the page's code plays episodes of its own, whose successes are counted.
+`python -m tests.play_agreement FOLDER --json FILE` needs Node. Episodes of the environment (C engine, one task after
+another, with the page's first policy) give initial states, actions and the NPCs' noise. The page's code replays them in
+WebAssembly with its graphs. Reported are the largest differences of the states after 1 and 20 environment steps. Then
+the page plays episodes of its own; their mean outcomes are reported.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import subprocess
-import sys
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,116 +19,108 @@ import jax
 import mujoco
 import numpy as np
 
-from mqe_jax.cli.setup import make_env
-from mqe_jax.policies import load_policy
+from mqe_jax.export.site import Entry, entries
+from mqe_jax.export.task import TaskFunctions, normal_numbers, state_arrays
+from mqe_jax.policies import all_agents
 
-TOOLS = Path(__file__).parents[1] / "tools"
-sys.path.insert(0, str(TOOLS))
-
-import play  # noqa: E402
-
-CHECK = TOOLS / "play_check.mjs"
+CHECK = Path(__file__).with_name("play_check.mjs")
 STEPS = (1, 20)
 """Environment steps after which states are compared."""
 
 Rollout = dict[str, Any]
-"""`qpos`, `qvel` and `anchors` at the start, `targets` (T, R, 12), and `states`, a (qpos, qvel) after every step."""
+"""`states` of the environment, one more than `actions` (T, A, D) and `noise` (T, K)."""
 
 
-def record(env: Any, policy: Any, count: int, steps: int) -> list[Rollout]:
-    """Returns rollouts of the environment under a policy."""
-    reset, step = jax.jit(env.reset), jax.jit(env.step)
-    rollouts = []
-    for key in jax.random.split(jax.random.PRNGKey(0), count):
-        state = reset(key)
-        start = {"qpos": state.data.qpos, "qvel": state.data.qvel, "anchors": state.anchors}
-        rollout: Rollout = {name: np.asarray(value, float).tolist() for name, value in start.items()}
-        rollout |= {"targets": [], "states": []}
-        for _ in range(steps):
-            action, _ = policy.act(state.obs, ())
-            state = step(state, action)
-            rollout["targets"].append(np.asarray(state.data.ctrl, float)[env.index.actuator].tolist())
-            rollout["states"].append((np.asarray(state.data.qpos, float), np.asarray(state.data.qvel, float)))
-        rollouts.append(rollout)
-    return rollouts
+def record(entry: Entry, steps: int, seed: int = 0, change: Any = lambda state, step: state) -> Rollout:
+    """Returns an episode of the environment under an entry's first policy; `change` may replace the state of a step."""
+    env, policy = entry.env, next(iter(entry.policies.values()))
+    both = all_agents(env, policy, policy if len(env.teams) > 1 else None)
+    size = TaskFunctions(env).control_inputs.get("noise", (0,))[0]
+    reset, key = jax.jit(env.reset), jax.random.PRNGKey(seed)
+    state, memory = reset(key), both.initial_memory(1)
+
+    @jax.jit
+    def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:
+        action, memory = both.act(state.obs[None], memory, key)
+        noise = jax.random.normal(jax.random.fold_in(key, 1), (size,))
+        with normal_numbers(noise):
+            return env.step(state, action[0]), memory, action[0], noise
+
+    states, rows = [state], []
+    for number, step_key in enumerate(jax.random.split(key, steps)):
+        state = change(state, number)
+        states[-1] = state
+        state, memory, action, noise = step(state, memory, step_key)
+        states.append(state)
+        rows.append(jax.device_get((action, noise)))
+    return {"states": jax.device_get(states), "actions": [row[0] for row in rows], "noise": [row[1] for row in rows]}
 
 
-def replay(env: Any, xml: str, rollout: Rollout) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns (qpos, qvel) after every step of a rollout's targets in MuJoCo here, in double precision."""
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = rollout["qpos"], rollout["qvel"]
-    data.mocap_pos[:] = env.compiled.wall_positions(np.asarray(rollout["anchors"]))
-    states = []
-    motors = env.compiled.motors
-    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
-    for targets in rollout["targets"]:
-        for _ in range(env.physics.num_substeps):
-            joints = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
-            data.ctrl[:], armature = motors.limit(np, np.ravel(targets), *joints, gain, bias)
-            model.dof_armature[motors.joint_qvel] = armature
-            mujoco.mj_step(model, data)
-            joints = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
-            data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel] = motors.clamp(np, *joints)
-        states.append((data.qpos.copy(), data.qvel.copy()))
-    return states
-
-
-def run_page(folder: Path, rollouts: list[Rollout], episodes: int) -> dict[str, Any]:
-    """Returns what tools/play_check.mjs prints of rollouts and of episodes of the page's own."""
-    plain = [{name: value for name, value in rollout.items() if name != "states"} for rollout in rollouts]
-    given = json.dumps({"rollouts": plain, "episodes": list(range(episodes))})
-    done = subprocess.run(["node", CHECK, folder], input=given, capture_output=True, text=True, check=True)
+def run_page(folder: Path, task: str, rollouts: list[Rollout], episodes: int) -> dict[str, Any]:
+    """Returns what play_check.mjs prints of rollouts and of episodes of the page's own."""
+    plain = []
+    for rollout in rollouts:
+        first = rollout["states"][0]
+        start = {**state_arrays(first), "mocap_pos": first.data.mocap_pos, "obs": first.obs}
+        start = {name: np.ravel(value).tolist() for name, value in start.items()}
+        plain.append({"start": start} | {name: np.stack(rollout[name]).tolist() for name in ("actions", "noise")})
+    given = json.dumps({"task": task, "rollouts": plain, "episodes": list(range(episodes))})
+    done = subprocess.run(["node", CHECK, folder], input=given, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def differences(env: Any, pairs: list[tuple[tuple[Any, Any], tuple[Any, Any]]]) -> dict[str, float]:
-    """Returns the largest absolute differences by quantity between pairs of (qpos, qvel)."""
-    index = env.index
-    parts = {
-        "trunk position, m": (0, index.base_qpos[:, :3]),
-        "joint angle, rad": (0, index.joint_qpos),
-        "trunk velocity, m/s": (1, index.base_qvel[:, :3]),
-        "joint velocity, rad/s": (1, index.joint_qvel),
-    }
-    return {
-        name: float(f"{max(np.abs(np.asarray(a[k])[where] - np.asarray(b[k])[where]).max() for a, b in pairs):.2g}")
-        for name, (k, where) in parts.items()
+def differences(env: Any, rollouts: list[Rollout], found: list[Any], steps: int) -> dict[str, float]:
+    """Returns the largest differences by quantity after a number of steps."""
+    index, model = env.index, env.compiled.model
+    objects = sorted(set(range(model.nq)) - set(np.ravel(index.base_qpos)) - set(np.ravel(index.joint_qpos)))
+    parts: dict[str, tuple[str, Any]] = {
+        "trunk position, m": ("qpos", index.base_qpos[:, :3]),
+        "joint angle, rad": ("qpos", index.joint_qpos),
+        "object position, m or rad": ("qpos", np.array(objects, int)),
+        "trunk velocity, m/s": ("qvel", index.base_qvel[:, :3]),
+        "joint velocity, rad/s": ("qvel", index.joint_qvel),
     }
 
+    def apart(name: str, where: Any) -> float:
+        pairs = zip(rollouts, found, strict=True)
+        rows = [(getattr(a["states"][steps].data, name), np.array(b[name][steps - 1])) for a, b in pairs]
+        return max(float(np.abs(a[where] - b[where]).max(initial=0.0)) for a, b in rows)
 
-def measure(folder: Path, count: int, episodes: int) -> dict[str, Any]:
-    """Returns the report."""
-    policy = load_policy(play.RUN)
-    env, _ = make_env(str(policy.config.task), "c", policy.config.env, 1)
-    rollouts = record(env, policy, count, max(STEPS))
-    found = run_page(folder, rollouts, episodes)
-    xml = (folder / "scene.xml").read_text(encoding="utf-8")
-    exact = [replay(env, xml, rollout) for rollout in rollouts]
+    return {label: float(f"{apart(*part):.2g}") for label, part in parts.items() if np.size(part[1])}
+
+
+def measure(folder: Path, entry: Entry, count: int, episodes: int) -> dict[str, Any]:
+    """Returns the report of one task."""
+    rollouts = [record(entry, max(STEPS), seed) for seed in range(count)]
+    found = run_page(folder, entry.name, rollouts, episodes)
+    apart = functools.partial(differences, entry.env, rollouts, found["rollouts"])
     report: dict[str, Any] = {"browser": found["version"], "here": mujoco.__version__, "rollouts": count}
-    for name, ours in (("environment", [rollout["states"] for rollout in rollouts]), ("same_mjcf", exact)):
-        theirs = [list(zip(r["qpos"], r["qvel"], strict=True)) for r in found["rollouts"]]
-        at = {s: [(a[s - 1], b[s - 1]) for a, b in zip(ours, theirs, strict=True)] for s in STEPS}
-        report[name] = {str(s): differences(env, pairs) for s, pairs in at.items()}
+    report |= {str(steps): apart(steps) for steps in STEPS}
     if episodes:
-        report["episodes"] = dict(Counter(episode["result"] for episode in found["episodes"]))
-        report["times_real_time"] = round(found["steps_per_second"] * env.dt, 1)
+        outcomes = [episode["outcome"] for episode in found["episodes"]]
+        names = [name for name in outcomes[0] if not name.startswith("team1")]
+        report["episodes"] = episodes
+        report["outcome"] = {name: round(float(np.mean([row[name] for row in outcomes])), 4) for name in names}
+        report["times_real_time"] = round(found["steps_per_second"] * entry.env.dt, 1)
     return report
 
 
 def main() -> int:
     """Prints the report, and writes it where asked to."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="page completed by tools/play.py")
-    parser.add_argument("--rollouts", type=int, default=20)
-    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("folder", type=Path, help="site of `mqe play-site` without arguments")
+    parser.add_argument("--tasks", nargs="*", default=[], help="all by default")
+    parser.add_argument("--rollouts", type=int, default=10)
+    parser.add_argument("--episodes", type=int, default=0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    report = measure(arguments.folder, arguments.rollouts, arguments.episodes)
-    text = json.dumps(report, indent=1) + "\n"
-    print(text, end="")
+    reports = {}
+    for entry in entries(arguments.tasks):
+        reports[entry.name] = measure(arguments.folder, entry, arguments.rollouts, arguments.episodes)
+        print(entry.name, json.dumps(reports[entry.name]), flush=True)
     if arguments.json is not None:
-        arguments.json.write_text(text, encoding="utf-8")
+        arguments.json.write_text(json.dumps(reports, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs Debian packages, where permitted; never fails. `bash tools/install.sh gl|chromium|npm`:
-# GL libraries for offscreen rendering, Chromium for the browser tests, npm (and Node) for the page docs/play.
+# GL libraries for offscreen rendering, Chromium for the browser tests, npm (and Node) for the page of `mqe play-site`.
 case "$1" in
   gl) packages="libegl1 libgl1-mesa-dri" without="clips show a top view; for 3-D rendering install libegl1 libgl1-mesa-dri" ;;
   chromium) packages="chromium" without="the browser tests are skipped" ;;

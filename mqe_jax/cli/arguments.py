@@ -22,6 +22,7 @@ First steps:
   mqe eval runs/go1gate                       evaluate the trained policy
   mqe render runs/go1gate -o gate.mp4         render the trained policy
   mqe view go1gate                            live view and teleoperation in the browser
+  mqe play-site -o page                       a web page on which the shipped policies play
   mqe bench go1gate                           environment steps per second on this machine
 
 `mqe COMMAND --help` explains every argument."""
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Any] = {
     "render": render.Render,
     "view": view.View,
     "export": export.Export,
+    "play-site": export.PlaySite,
     "replay": commands.Replay,
     "bench": commands.Bench,
     "demo": commands.Demo,

@@ -1,8 +1,9 @@
-"""The command `export`."""
+"""The commands `export` and `play-site`."""
 
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,8 +31,7 @@ class Export:
         from mqe_jax.cli.setup import make_env
         from mqe_jax.policies import load_policy
 
-        if any(importlib.util.find_spec(name) is None for name in ("jax2onnx", "onnxruntime")):
-            raise InputError("export: needs jax2onnx and onnxruntime (pip install 'mqe-jax[export]')")
+        _check_installed()
         if self.onnx.suffix != ".onnx" or self.onnx.is_dir():
             raise InputError(f"onnx: {str(self.onnx)!r} is not allowed; it must be a file that ends in .onnx")
         policy = load_policy(self.run_dir)
@@ -54,3 +54,36 @@ class Export:
                 print_table({f"{kind[:-1]} {name}": " x ".join(map(str, shape)) for name, shape in values.items()})
             print_table({"largest error against JAX": f"{error:.1e}, of {STEPS} steps"})
         return result
+
+
+@record
+class PlaySite:
+    """Write a web page on which policies play in the reader's browser; it needs no server but one for files."""
+
+    runs: Annotated[tyro.conf.Positional[list[str]], tyro.conf.arg(metavar="TASK|RUN")] = field(default_factory=list)
+    """Tasks with their shipped and scripted policies, run folders or policy files. Default: all tasks."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
+    """Folder to write."""
+    libraries: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder with the files of the browser libraries (lib/ of another such page). Default: fetched with npm at pinned
+    versions."""
+    json: Json = False
+
+    def run(self) -> dict[str, Any]:
+        """Writes the page; prints how to open it, or returns the object for `--json`."""
+        _check_installed()
+        from mqe_jax.export.site import write_site
+
+        check_folder(self.output, "output")
+        found = write_site(self.runs, self.output, self.libraries)
+        size = sum(file.stat().st_size for file in self.output.rglob("*") if file.is_file())
+        echo(f"mqe: wrote {self.output}, {size / 1e6:.0f} MB: {', '.join(entry.name for entry in found)}")
+        if not self.json:
+            print(f"serve it: python -m http.server --bind 127.0.0.1 --directory {self.output} 8000")
+            print("open:     http://127.0.0.1:8000")
+        return {"folder": str(self.output), "tasks": {entry.name: list(entry.policies) for entry in found}}
+
+
+def _check_installed() -> None:
+    if any(importlib.util.find_spec(name) is None for name in ("jax2onnx", "onnxruntime")):
+        raise InputError("export: needs jax2onnx and onnxruntime (pip install 'mqe-jax[export]')")

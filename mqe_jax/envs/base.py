@@ -244,10 +244,16 @@ class QuadrupedEnv(Task[S, P]):
         robot_state = self.read(data)
         moved = {"data": data, "control": control, "actuators": actuators}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
+        state = self.judge(before, Moment(state, robot_state), bad_action)
+        state = dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
+        return self._observed(state, robot_state, noise_key)
 
-        diverged = bad_action | self._diverged(data)
+    def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
+        """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""
+        state, robot_state = after
+        diverged = bad_action | self._diverged(state.data)
         collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
-        state = dataclasses.replace(state, task=self.step_task(before, Moment(state, robot_state)))
+        state = dataclasses.replace(state, task=self.step_task(before, after))
         terms = self.rewards(before, Moment(state, robot_state), collision)
         if (floor := self.params.shaping_floor) < 1.0:
             terms = faded(terms, vars(self.Params())["rewards"], floor + (1.0 - floor) * state.assistance)
@@ -257,16 +263,13 @@ class QuadrupedEnv(Task[S, P]):
         metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
         metrics = {name: clean(value, self.metrics_if_diverged.get(name, 0.0)) for name, value in metrics.items()}
-        metrics["diverged"] = diverged.astype(jnp.float32)
-        metrics["overflow"] = overflow.astype(jnp.float32)
-        state = dataclasses.replace(
+        return dataclasses.replace(
             state,
             reward=clean(reward),
             terminated=terminated,
-            metrics=metrics,
+            metrics={**metrics, "diverged": diverged.astype(jnp.float32)},
             truncated=~terminated & (state.step >= self.max_steps),
         )
-        return self._observed(state, robot_state, noise_key)
 
     def read(self, data: mjx.Data) -> RobotState:
         """Returns the state of all robots."""

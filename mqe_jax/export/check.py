@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -11,12 +12,15 @@ import onnx
 
 from mqe_jax.errors import InputError
 from mqe_jax.export.policy import input_shapes, policy_step, to_onnx
+from mqe_jax.export.translate import Function, translate
 from mqe_jax.train.policy import TrainedPolicy
 
 STEPS = 100
 """Environment steps over which a graph is compared with JAX."""
 LARGEST_ERROR = 1e-4
 """Largest error of a graph's outputs."""
+CYCLES = {"next_walk_gait": 1.0, "obs": 2 * np.pi}
+"""Outputs with cyclic entries, gait phase and yaw, whose errors are cyclic too: ONNX has no signed zero at +-pi."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -28,13 +32,26 @@ def checked_onnx(policy: TrainedPolicy, env: Any) -> tuple[onnx.ModelProto, floa
         InputError: if it is larger than `LARGEST_ERROR`, or onnxruntime cannot run the graph.
     """
     model = to_onnx(policy, env)
-    error, output = max((error, name) for name, error in errors(model, *record(policy, env, STEPS)).items())
+    return model, _largest(errors(model, *record(policy, env, STEPS)), f"{STEPS} steps of {env.name}")
+
+
+def checked(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays) -> onnx.ModelProto:
+    """Returns the graph of a function after comparing both for inputs with leading axis N; errors as `checked_onnx`."""
+    model = translate(function, shapes, name)
+    expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
+    _largest(errors(model, inputs, expected), name)
+    return model
+
+
+def _largest(errors: Mapping[str, float], where: str) -> float:
+    """Returns the largest error; InputError if it is larger than `LARGEST_ERROR`."""
+    error, output = max((error, name) for name, error in errors.items())
     if not error <= LARGEST_ERROR:
         raise InputError(
-            f"export: nothing is written, because in {STEPS} steps of {env.name} the graph's output {output!r} differs "
-            f"from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
+            f"export: nothing is written, because in {where} the graph's output {output!r} differs from JAX by "
+            f"{error:.1e}; at most {LARGEST_ERROR:g} is allowed"
         )
-    return model, error
+    return error
 
 
 def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
@@ -71,10 +88,7 @@ def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]
 
 
 def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str, float]:
-    """Returns the largest absolute error of each output, for inputs and expected outputs (T, ...) as one batch.
-
-    The gait phase is cyclic, so its errors are too.
-    """
+    """Returns the largest absolute error of each output, for inputs and expected outputs (T, ...) as one batch."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -86,6 +100,6 @@ def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str
     except Exception as error:  # onnxruntime's errors have no common class
         raise InputError(f"export: onnxruntime cannot run the graph: {error}") from None
     differences = {name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names}
-    if (gait := differences.get("next_walk_gait")) is not None:
-        differences["next_walk_gait"] = np.minimum(gait, np.abs(1.0 - gait))
+    for name in differences.keys() & CYCLES.keys():
+        differences[name] = np.minimum(differences[name], np.abs(CYCLES[name] - differences[name]))
     return {name: float(x.max()) for name, x in differences.items()}

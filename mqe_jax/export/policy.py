@@ -50,15 +50,15 @@ def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
     if env.control == "command":
         robots |= {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
         skill = env.controller.skill
-        robots |= {name: x.shape for name, x in _named(skill.name, skill.init_memory()).items()}
+        robots |= {name: x.shape for name, x in named(skill.name, skill.init_memory()).items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
-    return shapes | {name: x.shape for name, x in _named("memory", policy.initial_memory()).items()}
+    return shapes | {name: x.shape for name, x in named("memory", policy.initial_memory()).items()}
 
 
 def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
-    action, memory = policy.act(inputs["obs"], _filled("memory", policy.initial_memory(), inputs))
-    outputs = {"action": action} | _named("next_memory", memory)
+    action, memory = policy.act(inputs["obs"], filled("memory", policy.initial_memory(), inputs))
+    outputs = {"action": action} | named("next_memory", memory)
     if env.control == "torque":
         return outputs | {"torque": action * env.robot.torque_limit}
     if env.control == "position":
@@ -67,19 +67,19 @@ def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]
     commands = controller.skill_commands(action)
     sensed = Proprioception(*(inputs[name] for name in ("gravity", "joint_position", "joint_velocity")))
     act = jax.vmap(functools.partial(skill.targets, controller.skill_params))
-    target, memory = act(_filled(skill.name, skill.init_memory(), inputs), commands, sensed)
-    return outputs | {"commands": commands, "joint_target": target} | _named(f"next_{skill.name}", memory)
+    target, memory = act(filled(skill.name, skill.init_memory(), inputs), commands, sensed)
+    return outputs | {"commands": commands, "joint_target": target} | named(f"next_{skill.name}", memory)
 
 
-def _named(prefix: str, memory: Any) -> dict[str, Any]:
+def named(prefix: str, memory: Any) -> dict[str, Any]:
     """Returns the arrays of a recurrent state by name."""
     leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
     return {"_".join([prefix, *(jax.tree_util.keystr((k,), simple=True) for k in path)]): x for path, x in leaves}
 
 
-def _filled(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
+def filled(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
     """Returns a recurrent state of the structure of `memory` with the arrays of the inputs."""
-    return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in _named(prefix, memory)])
+    return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in named(prefix, memory)])
 
 
 def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:

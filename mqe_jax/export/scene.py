@@ -1,15 +1,14 @@
-"""A task's scene for other programs: MJCF, and the numerical settings needed to reset, step and evaluate an episode."""
+"""A task's scene for other programs: MJCF, and the numbers that stepping and drawing need beside it."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from mqe_jax.robots import motors
+from mqe_jax.robots.build import COLORS
 from mqe_jax.scene import build_spec
-from mqe_jax.settings import to_mapping
 
 
 def scene_xml(env: Any) -> str:
@@ -27,43 +26,32 @@ def scene_settings(env: Any) -> dict[str, Any]:
 
     | entry | content |
     |---|---|
-    | `task`, `control`, `robot`, `mujoco` | names; version that wrote the scene |
+    | `task`, `title`, `robot`, `mujoco` | names; version that wrote the scene |
     | `dt`, `substeps`, `max_steps` | environment step, physics steps in it, environment steps until the time limit |
-    | `observation` | (name, width) of the blocks of an agent's observation, in order |
-    | `robots` | addresses in qpos, qvel, ctrl and sensordata for each of the R robots, as in `RobotIndex` |
-    | `qpos0`, `num_velocities` | qpos of the model (nq,), length of qvel |
-    | `default_joints`, `joint_lower`, `joint_upper` | joint angles (12,) |
-    | `spawn` | nominal spawn poses x, y, z, yaw (R, 4) |
-    | `anchors` | `mean` and `spread` (half-width) of the uniformly sampled anchors (G, 2) |
-    | `walls` | `anchor` and `offset` from it (3,) of each mocap body |
+    | `teams`, `commands` | agents of each team; names of the action's commands, in order |
+    | `robots` | of each of the R robots, colour and addresses in qpos, qvel and ctrl as in `RobotIndex` |
+    | `track` | `length` and `width` |
     | `motors` | of all joints, constants and inputs of `mqe_jax.robots.motors`, which MJCF cannot hold |
-    | `params` | the task's parameters |
     """
-    index, compiled, robot = env.index, env.compiled, env.robot
-    tables = ("base_qpos", "base_qvel", "joint_qpos", "joint_qvel", "actuator", "trunk_force")
+    index, scene = env.index, env.compiled.scene
+    tables = ("base_qpos", "joint_qpos", "joint_qvel", "actuator")
     rows = [{name: getattr(index, name)[i].tolist() for name in tables} for i in range(index.num_robots)]
-    height = env.params.spawn_height
-    walls = zip(compiled.mocap_anchor.tolist(), compiled.mocap_offset, strict=True)
+    colors = scene.colors or range(index.num_robots)
     return {
         "task": env.name,
-        "control": env.control,
-        "robot": robot.name,
+        "title": env.title,
+        "robot": env.robot.name,
         "mujoco": mujoco.__version__,
         "dt": env.dt,
         "substeps": env.physics.num_substeps,
         "max_steps": env.max_steps,
-        "observation": [[block.name, block.width] for block in env.observation_layout.blocks],
-        "robots": rows,
-        "qpos0": compiled.model.qpos0.tolist(),
-        "num_velocities": compiled.model.nv,
-        "default_joints": robot.default_joints.tolist(),
-        "joint_lower": robot.joint_lower.tolist(),
-        "joint_upper": robot.joint_upper.tolist(),
-        "spawn": [[float(x), float(y), height, float(yaw)] for x, y, yaw in env.spawn_poses()],
-        "anchors": {"mean": compiled.anchor_mean.tolist(), "spread": compiled.anchor_spread.tolist()},
-        "walls": [{"anchor": anchor, "offset": _plain(offset)} for anchor, offset in walls],
+        "teams": [list(team) for team in env.teams],
+        "commands": list(env.params.commands),
+        "robots": [
+            {**row, "color": list(COLORS[color % len(COLORS)][:3])} for row, color in zip(rows, colors, strict=True)
+        ],
+        "track": {"length": scene.track.length, "width": scene.track.width},
         "motors": _motors(env),
-        "params": to_mapping(env.params),
     }
 
 
@@ -83,8 +71,3 @@ def _motors(env: Any) -> dict[str, Any]:
         "gain": motors.GAIN,
         "clamped": motors.CLAMP,
     }
-
-
-def _plain(values: np.ndarray) -> list[float]:
-    """Returns float32 values as the shortest decimals that round-trip to the same float32."""
-    return [float(str(value)) for value in values]

@@ -22,11 +22,20 @@ BATCH = "N"
 
 Function = Callable[[Mapping[str, Any]], Mapping[str, jax.Array]]
 """A function of arrays by name that returns arrays by name, both of one environment."""
+
+
+def _select(which: jax.Array, *cases: jax.Array) -> jax.Array:
+    if len(cases) == 2 and cases[0].dtype == bool:
+        return (which & cases[1]) | (~which & cases[0])
+    return jax.lax.select_n(which, *cases)
+
+
 REPLACED: dict[str, Callable[..., jax.Array]] = {
     "clamp": lambda low, x, high: jax.lax.min(jax.lax.max(x, low), high),
+    "select_n": _select,
     "rem": lambda x, y: x - y * (jnp.trunc(x / y) if x.dtype == jnp.float32 else jax.lax.div(x, y)),
 }
-"""Operations that jax2onnx refuses where an axis is symbolic."""
+"""Operations that jax2onnx refuses where an axis is symbolic, or onnxruntime for some types."""
 
 
 def translate(
@@ -62,6 +71,7 @@ def translate(
     except Exception as error:  # jax2onnx has no exception of its own
         raise InputError(f"onnx: jax2onnx cannot translate {name} ({one_line(error)})") from error
     _halve(model.graph)
+    del model.graph.value_info[:]  # onnxruntime infers them
     helper.set_model_props(model, dict(properties or {}))
     onnx.checker.check_model(model, full_check=True)
     return model

@@ -99,8 +99,8 @@ def _attack(
     ahead, apart = ways @ (opponents - ball).T, jnp.abs(lefts @ (opponents - ball).T)
     free = jnp.min(jnp.where(ahead > 0, jnp.minimum(apart, 0.5), 0.5), axis=1)
     straight = ways @ (facing - offset / jnp.maximum(distance, 1.0))
-    best = jnp.argmax(2 * free + straight)
-    way, left = ways[best], lefts[best]
+    best = jax.nn.one_hot(jnp.argmax(2 * free + straight), len(aims))  # not an index, which ONNX graphs cannot batch
+    way, left = best @ ways, best @ lefts
     along, lateral = offset @ way, offset @ left
     lined_up = (along < -0.2) & (jnp.abs(lateral) < 0.1 + 0.3 * jnp.maximum(-along - 0.3, 0.0))
     between_legs = near & (jnp.abs(lateral) < 0.25) & (facing @ way > 0.5)

@@ -1,0 +1,197 @@
+"""The web page on which policies play in the reader's browser: its files, and a folder for every task.
+
+A task's folder has `scene.xml` (MJCF), `scene.json` (`mqe_jax.export.scene`, and the entries of `Entry.settings`), the
+graphs of `mqe_jax.export.task`, and `starts.bin`: `STARTS` initial states sampled by the task's own `reset`. Skills are
+shared by all tasks, as files named by their content.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import onnx
+
+from mqe_jax import zoo
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, make
+from mqe_jax.envs.randomization import Randomization
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.export.check import checked
+from mqe_jax.export.libraries import add_libraries
+from mqe_jax.export.policy import shapes
+from mqe_jax.export.scene import scene_settings, scene_xml
+from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, state_arrays
+from mqe_jax.export.translate import Function
+from mqe_jax.files import write_atomically
+from mqe_jax.policies import check_policy, load_policy
+from mqe_jax.train.policy import Policy, TrainedPolicy
+
+PAGE = Path(__file__).parent / "page"
+"""Files of the page."""
+STARTS = 200
+"""Initial states of each task."""
+
+
+@dataclasses.dataclass
+class Entry:
+    """A task with its parameters and its policies by name, the first of which plays by default."""
+
+    name: str
+    """Name of its folder."""
+    env: Any
+    """The task."""
+    policies: dict[str, Policy]
+    """Policies of a team; `idle` is always possible on the page."""
+
+    def write(self, folder: Path) -> None:
+        """Writes the task's files into its folder in a site; InputError for a graph that differs from JAX."""
+        own, env = folder / "tasks" / self.name, self.env
+        own.mkdir(parents=True, exist_ok=True)
+        functions, starts = TaskFunctions(env), start_states(env)
+        graphs = {
+            "control": _graph(functions.control, functions.control_inputs, f"{self.name}_control", starts),
+            "judge": _graph(functions.judge, functions.judge_inputs, f"{self.name}_judge", starts),
+        }
+        files = {f"{name}.onnx": graph for name, graph in graphs.items()}
+        rows = []
+        for name, policy in self.policies.items():
+            graph = _graph(*policy_function(policy, env.observation_size), f"{self.name}_policy", starts)
+            files[f"policy-{len(rows)}.onnx"] = graph
+            rows.append({"name": name, "file": f"policy-{len(rows)}.onnx", **shapes(graph)})
+        for name, graph in files.items():
+            write_atomically(own / name, graph.SerializeToString())
+        values, layout = packed(starts)
+        write_atomically(own / "starts.bin", values.tobytes())
+        write_atomically(own / "scene.xml", scene_xml(env).encode())
+        settings = {
+            **scene_settings(env),
+            "outcomes": functions.outcomes,
+            "graphs": {name: shapes(graph) for name, graph in graphs.items()},
+            "skill": write_skill(env, folder),
+            "policies": rows,
+            "starts": layout,
+        }
+        write_atomically(own / "scene.json", json.dumps(settings).encode())
+
+
+def write_site(sources: Sequence[str], folder: Path, libraries: Path | None = None) -> list[Entry]:
+    """Writes the page with its tasks and libraries into a folder; returns the tasks.
+
+    Args:
+        sources: tasks, run folders and policy files; all tasks that have a policy if empty.
+        folder: new or existing.
+        libraries: folder of the browser libraries' files; fetched with npm if None.
+
+    Raises:
+        InputError: for a source that is none of these, a task or policy that cannot be exported, or without libraries.
+    """
+    found = entries(sources)
+    add_libraries(folder / "lib", libraries)
+    for entry in found:
+        entry.write(folder)
+    for file in PAGE.iterdir():
+        write_atomically(folder / file.name, file.read_bytes())
+    tasks = [{"name": entry.name, "title": _title(entry)} for entry in found]
+    write_atomically(folder / "site.json", json.dumps({"tasks": tasks}).encode())
+    write_atomically(folder / "package.json", b'{"type": "module"}\n')  # for Node
+    return found
+
+
+def entries(sources: Sequence[str]) -> list[Entry]:
+    """Returns the tasks of a site; runs of one task with the same parameters share an entry."""
+    playable = [task for task in TASKS if task in PLANNERS or task in zoo.names()]
+    found: list[tuple[str, dict[str, Any], Entry]] = []
+    for source in sources or playable:
+        task, params, policies = _source(source, playable)
+        entry = next((entry for *key, entry in found if key == [task, params]), None)
+        if entry is None:
+            count = sum(known == task for known, *_ in found)
+            env = make(task, impl="c", num_envs=1, **{**params, "randomization": Randomization()})
+            entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
+            found.append((task, params, entry))
+        for name, policy in policies.items():
+            check_policy(policy, entry.env, source)
+            entry.policies[name] = policy
+    for task, _, entry in found:
+        if task in PLANNERS and entry.env.params.commands == type(entry.env.params).commands:
+            entry.policies.setdefault("scripted", load_policy("scripted", entry.env))
+    return [entry for *_, entry in found]
+
+
+def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
+    """Returns the task, its parameters and the trained policy by name that a source stands for."""
+    task = ALIASES.get(source, source)
+    if os.sep not in source and not Path(source).exists():
+        if task not in playable:
+            hint = nearest(task, playable)
+            raise InputError(f"run: {source!r} is not allowed{hint}; allowed: a run folder, a policy file, a task's id")
+        return task, {}, {"shipped": zoo.load(task)} if task in zoo.names() else {}
+    policy = load_policy(source)
+    if policy.task not in TASKS:
+        raise InputError(f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}")
+    return policy.task, dict(policy.config.env), {Path(source).resolve().stem: policy}
+
+
+def _title(entry: Entry) -> str:
+    number = entry.name.removeprefix(entry.env.name).lstrip("-")
+    return f"{entry.env.title} {number}".strip()
+
+
+def start_states(env: Any) -> dict[str, np.ndarray]:
+    """Returns `STARTS` initial states by name, leading axis `STARTS`: the state, `mocap_pos` and `obs`."""
+
+    def start(key: jax.Array) -> dict[str, jax.Array]:
+        state = env.reset(key)
+        return {**state_arrays(state), "mocap_pos": state.data.mocap_pos, "obs": state.obs}
+
+    states = jax.jit(jax.vmap(start))(jax.random.split(jax.random.PRNGKey(0), STARTS))
+    return {name: np.asarray(x, np.float32) for name, x in states.items()}
+
+
+def packed(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
+    """Returns the columns of states that vary (N, K), and `fields`, `constant` and `varying` to restore them.
+
+    `fields` are the name and size of each array, in the order of a row; `constant` is the first row and `varying` the
+    positions in it that the columns replace.
+    """
+    rows = np.concatenate([x.reshape(len(x), -1) for x in states.values()], axis=1)
+    varying = np.flatnonzero((rows != rows[0]).any(axis=0))
+    fields = [[name, int(np.prod(x.shape[1:]))] for name, x in states.items()]
+    constant = [float(str(x)) for x in rows[0]]
+    return rows[:, varying], {"fields": fields, "constant": constant, "varying": varying.tolist()}
+
+
+def write_skill(env: Any, folder: Path) -> dict[str, Any]:
+    """Writes the skill of a task's robots unless it is there; returns its file and the shapes of its graph."""
+    graph = _graph(*skill_function(env), env.controller.skill.name, {})
+    content = graph.SerializeToString()
+    name = f"{env.controller.skill.name}-{hashlib.sha256(content).hexdigest()[:8]}.onnx"
+    (folder / "skills").mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "skills" / name, content)
+    return {"file": f"skills/{name}", **shapes(graph)}
+
+
+def _graph(
+    function: Function, inputs: dict[str, tuple[int, ...]], name: str, states: dict[str, np.ndarray]
+) -> onnx.ModelProto:
+    """Returns the graph of a function, checked on initial states as far as they have its inputs, else random numbers.
+
+    States before a step are those of other episodes.
+    """
+    random = np.random.default_rng(0)
+    known = {**states, **{f"before_{key}": np.roll(x, 1, axis=0) for key, x in states.items()}}
+
+    def values(key: str, shape: tuple[int, ...]) -> np.ndarray:
+        if key not in known:
+            return random.normal(size=(STARTS, *shape)).astype(np.float32)
+        return known[key][:, : shape[0]] if shape else known[key]  # of `obs` the rows of one team
+
+    given = {key: values(key, shape) for key, shape in inputs.items()}
+    return checked(function, inputs, name.replace("-", "_"), given)

@@ -1,0 +1,217 @@
+"""A task as functions of arrays by name, and their ONNX graphs: all of an episode but physics and random numbers.
+
+In an environment step the graphs run in this order; the physics steps are between `skill` and `judge`.
+
+| graph | of | inputs |
+|---|---|---|
+| `policy` | a team | `obs` (A, O), `noise` (K,), recurrent states |
+| `control` | the task | state, `action` (A, D), `drive` (A, D), `driven` (A,), `noise` (K,) |
+| `skill` | a robot | `command` (C,), `gravity` (3,), `joint_position`, `joint_velocity` (12,), recurrent states |
+| `judge` | the task | state after the step, `before_qpos`, `before_qvel`, `before_sensordata` |
+
+The policy's output is `action` (A, D), the skill's `joint_target` (12,), rad; `TaskFunctions` has those of the task.
+The state is `qpos`, `qvel`, `sensordata`, `step` (environment steps since the reset), and where the task has them
+`anchors` and its own fields as `task_NAME`. Every array has a leading batch axis N. `noise` are standard
+normal numbers. The next value of an input X is the output `next_X`; recurrent states start at zero.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import onnx
+
+from mqe_jax.envs.state import Moment, State
+from mqe_jax.errors import InputError
+from mqe_jax.export.policy import filled, named
+from mqe_jax.export.translate import Function, translate
+from mqe_jax.robots.index import Proprioception
+from mqe_jax.robots.robot import NUM_JOINTS
+from mqe_jax.train.policy import Policy
+
+PHYSICS = ("qpos", "qvel", "sensordata")
+"""Arrays of the physics state that tasks read."""
+
+Shapes = dict[str, tuple[int, ...]]
+Arrays = Mapping[str, Any]
+
+
+class TaskFunctions:
+    """The functions of a task, of one environment; domain randomisation is not part of them.
+
+    Raises:
+        InputError: for another control mode than `command`, or an actuator network.
+    """
+
+    env: Any
+    """The task."""
+    outcomes: list[str]
+    """Names of the entries of the output `outcome`."""
+
+    def __init__(self, env: Any) -> None:
+        if env.control != "command":
+            raise InputError(f"control: {env.control!r} is not allowed; graphs of tasks need 'command'")
+        if env.params.actuator_network is not None:
+            raise InputError("actuator_network: not allowed; graphs of tasks need PD control")
+        self.env = env
+        self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        robots = env.read(self._start.data)
+        self.outcomes = list(env.outcome(self._start, robots, jnp.zeros((), bool)))
+        self._noise = _noise_size(lambda: env.step_npcs(self._start.data, robots, self._start.key))
+
+    @property
+    def control_inputs(self) -> Shapes:
+        """Shapes of the inputs of `control`."""
+        actions = (self.env.num_agents, self.env.action_size)
+        noise = {"noise": (self._noise,)} if self._noise else {}
+        return self._state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
+
+    @property
+    def judge_inputs(self) -> Shapes:
+        """Shapes of the inputs of `judge`."""
+        return self._state_inputs | {f"before_{name}": self._state_inputs[name] for name in PHYSICS}
+
+    def control(self, inputs: Arrays) -> dict[str, jax.Array]:
+        """Returns what the skill and the physics get in a step.
+
+        `command` (R, C), `gravity` (R, 3), `joint_position` and `joint_velocity` (R, 12) are the skill's inputs for the
+        R robots. Only tasks that have them return `next_qvel` (nv,), the velocities with those of NPCs, and
+        `xfrc_applied` (nbody, 6), external forces, N and N m. `drive` replaces the actions of the agents where `driven`
+        is 1, in the robot's own frame.
+        """
+        env, state = self.env, self.state(inputs)
+        robots = env.read(state.data)
+        action = env.unmirror_action(jnp.clip(inputs["action"], -1.0, 1.0))
+        action = jnp.where(inputs["driven"][:, None] > 0.5, inputs["drive"], action)
+        commands, npcs = env.controller.skill_commands(action), env.npc_commands(state, robots)
+        commands = commands if npcs is None else jnp.concatenate([commands, npcs])
+        outputs = {"command": commands, **_sensed(robots.proprioception)}
+        with normal_numbers(inputs.get("noise")):
+            data = env.step_npcs(state.data, robots, state.key)
+        if data is not state.data:
+            outputs["next_qvel"] = data.qvel
+        if (forces := env.external_forces(state)) is not None:
+            outputs["xfrc_applied"] = forces
+        return outputs
+
+    def judge(self, inputs: Arrays) -> dict[str, jax.Array]:
+        """Returns the observation, the result and the task's next fields after a step.
+
+        `obs` (A, O), `outcome`: the metrics `outcomes` as if the episode ended here, and as 0 or 1
+        `terminated`, `truncated`, `fell` (any robot), `collided` (where collisions end the episode), `next_task_NAME`.
+        """
+        env, after = self.env, self.state(inputs)
+        before = self.state({**inputs, **{name: inputs[f"before_{name}"] for name in PHYSICS}})
+        before = dataclasses.replace(before, step=after.step - 1)
+        robots = env.read(after.data)
+        state = env.judge(Moment(before, env.read(before.data)), Moment(after, robots))
+        obs = env.observation_layout.pack(env.observe(state, robots))
+        outputs = {
+            "obs": jnp.clip(jnp.nan_to_num(obs), -1e4, 1e4),
+            "outcome": jnp.stack([state.metrics[name] for name in self.outcomes]),
+            "terminated": state.terminated,
+            "truncated": state.truncated,
+            "fell": jnp.any(env.fallen(robots)),
+            "collided": state.metrics["collision"] * env.params.end_on_collision,
+            **named("next_task", state.task),
+        }
+        return {name: x.astype(jnp.float32) for name, x in outputs.items()}
+
+    def state(self, inputs: Arrays) -> State:
+        """Returns the environment's state with the arrays of the inputs."""
+        start, task = self._start, self._start.task
+        data = start.data.replace(**{name: inputs[name] for name in PHYSICS})
+        task = jax.tree.map(lambda x, like: x.astype(like.dtype), filled("task", task, inputs), task)
+        anchors, step = inputs.get("anchors", start.anchors), inputs["step"].astype(jnp.int32)
+        return dataclasses.replace(start, data=data, anchors=anchors, task=task, step=step)
+
+    @property
+    def _state_inputs(self) -> Shapes:
+        return {name: x.shape for name, x in state_arrays(self._start).items()}
+
+    def graphs(self) -> dict[str, onnx.ModelProto]:
+        """Returns the graphs `control` and `judge`; InputError for an operation without translation."""
+        name = self.env.name.replace("-", "_")
+        return {
+            "control": translate(self.control, self.control_inputs, f"{name}_control"),
+            "judge": translate(self.judge, self.judge_inputs, f"{name}_judge"),
+        }
+
+
+def state_arrays(state: State) -> dict[str, jax.Array]:
+    """Returns the arrays of a state by name, float32; the inverse of `TaskFunctions.state`."""
+    physics = {name: getattr(state.data, name) for name in PHYSICS}
+    arrays = {**physics, "anchors": state.anchors, "step": state.step, **named("task", state.task)}
+    return {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if x.size}
+
+
+def skill_function(env: Any) -> tuple[Function, Shapes]:
+    """Returns the skill of a task's robots as a function of one robot, and the shapes of its inputs."""
+    controller, skill = env.controller, env.controller.skill
+    memory = named(skill.name, skill.init_memory())
+    shapes = {"command": (len(skill.commands),), "gravity": (3,)}
+    shapes |= {"joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
+
+    def act(inputs: Arrays) -> dict[str, jax.Array]:
+        sensed = Proprioception(*(inputs[name] for name in ("gravity", "joint_position", "joint_velocity")))
+        state = filled(skill.name, skill.init_memory(), inputs)
+        target, state = skill.targets(controller.skill_params, state, inputs["command"], sensed)
+        return {"joint_target": target} | named(f"next_{skill.name}", state)
+
+    return act, shapes | {name: x.shape for name, x in memory.items()}
+
+
+def policy_function(policy: Policy, observation_size: int) -> tuple[Function, Shapes]:
+    """Returns a policy as a function of one team, and the shapes of its inputs; it samples where `policy` does."""
+    memory = jax.tree.map(lambda x: x[0], policy.initial_memory(1))
+    key = jax.random.PRNGKey(0)
+    shapes = {"obs": (policy.agents, observation_size)} | {n: x.shape for n, x in named("memory", memory).items()}
+
+    def act(inputs: Arrays) -> dict[str, jax.Array]:
+        state = jax.tree.map(lambda x: x[None], filled("memory", memory, inputs))
+        action, state = policy.act(inputs["obs"][None], state, key)
+        return {"action": action[0]} | {name: x[0] for name, x in named("next_memory", state).items()}
+
+    def act_with_noise(inputs: Arrays) -> dict[str, jax.Array]:
+        with normal_numbers(inputs["noise"]):
+            return act(inputs)
+
+    size = _noise_size(lambda: act({name: jnp.zeros(shape) for name, shape in shapes.items()}))
+    return (act_with_noise, shapes | {"noise": (size,)}) if size else (act, shapes)
+
+
+@contextlib.contextmanager
+def normal_numbers(noise: jax.Array | None, used: Callable[[int], None] = lambda size: None) -> Iterator[None]:
+    """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros without them.
+
+    A graph has no random keys, so its noise is an input. Nothing is compiled within, as JAX would keep it.
+    """
+    position = 0
+
+    def normal(key: jax.Array, shape: tuple[int, ...] = (), dtype: Any = jnp.float32) -> jax.Array:
+        nonlocal position
+        first, position = position, position + math.prod(shape)
+        used(position)
+        return jnp.zeros(shape, dtype) if noise is None else noise[first:position].reshape(shape)
+
+    with jax.disable_jit(), mock.patch.object(jax.random, "normal", normal):
+        yield
+
+
+def _noise_size(function: Callable[[], Any]) -> int:
+    """Returns how many normal numbers a function draws."""
+    sizes = [0]
+    with normal_numbers(None, sizes.append):
+        jax.eval_shape(function)
+    return sizes[-1]
+
+
+def _sensed(sensed: Proprioception) -> dict[str, jax.Array]:
+    return dict(zip(("gravity", "joint_position", "joint_velocity"), sensed, strict=True))
