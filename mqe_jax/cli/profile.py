@@ -46,6 +46,9 @@ class Operation(NamedTuple):
     """End, s."""
 
 
+_LEAST = "jax_persistent_cache_min_compile_time_secs"
+
+
 def scopes(text: str, rest: str) -> dict[str, tuple[str, str]]:
     """Returns the scope (`rest` outside of all) and the kind of each instruction of a compiled program's text."""
     found = {}
@@ -91,7 +94,7 @@ def shares(operations: Sequence[Operation]) -> dict[str, float]:
     times = np.array([(operation.start, operation.end) for operation in operations])
     edges, place = np.unique(times, return_inverse=True)
     running = np.zeros((len(edges), len(parts)))
-    column = [parts.index(operation.part) for operation in operations]
+    column = np.array([parts.index(operation.part) for operation in operations])
     for side, sign in ((0, 1.0), (1, -1.0)):
         np.add.at(running, (place.reshape(times.shape)[:, side], column), sign)
     running = np.round(np.cumsum(running, axis=0))[:-1]
@@ -105,7 +108,7 @@ def shares(operations: Sequence[Operation]) -> dict[str, float]:
 def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, dict[str, float]]:
     """Returns the compiled program of a function, and its seconds: traced, compiled, and read from JAX's cache."""
     seconds, program = {}, None
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
+    before = jax.config.values["jax_compilation_cache_dir"], jax.config.values[_LEAST]
     with tempfile.TemporaryDirectory() as folder:
         _cache(folder, 0.0)
         try:
@@ -122,7 +125,7 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, dict[s
 
 def _cache(folder: str | None, least: float) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+    jax.config.update(_LEAST, least)
     reset_cache()
 
 
@@ -210,22 +213,23 @@ def profile_training(task: str, impl: str, env: dict[str, Any], num_envs: int) -
     began = time.perf_counter()
     jax.block_until_ready(update(state))
     seconds = time.perf_counter() - began
-    found = shares(traced(lambda: update(state), update.as_text(), "learner"))
+    found = shares(traced(lambda: update(state), update.as_text() or "", "learner"))
     return {"update_s": seconds, "rollout_steps": config.rollout_steps, **found}
 
 
 def run(command: Any) -> dict[str, Any]:
     """Returns the object of `mqe bench --profile`: a profile for each number of environments."""
-    rows = []
+    rows, impl = [], command.impl
     for num_envs in command.sizes or (command.num_envs,):
         env, vector = setup.make_env(command.task, command.impl, command.overrides(), num_envs)
         row = profile(env, vector, jax.random.PRNGKey(command.seed), steps=command.steps, repeats=command.repeats)
         row["training"] = profile_training(command.task, command.impl, command.overrides(), num_envs)
         rows.append(row)
+        impl = env.physics.impl
         if not command.json:
             parts = {f"{kind}/{part}": share for kind in ("step", "training") for part, share in row[kind].items()}
             print_table({name: value for name, value in row.items() if name not in ("step", "training")} | parts)
-    about = {"task": command.task, "impl": env.physics.impl, "device": device_name(), "jax": jax.__version__}
+    about = {"task": command.task, "impl": impl, "device": device_name(), "jax": jax.__version__}
     if command.output is not None:
         draw(rows, command.output, ", ".join(about.values()))
     return {**about, "profiles": rows}

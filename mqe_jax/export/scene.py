@@ -6,8 +6,8 @@ from typing import Any
 
 import mujoco
 
+from mqe_jax.appearance import ROBOT_COLORS
 from mqe_jax.robots import motors
-from mqe_jax.robots.build import COLORS
 from mqe_jax.scene import build_spec
 
 
@@ -48,7 +48,8 @@ def scene_settings(env: Any) -> dict[str, Any]:
         "teams": [list(team) for team in env.teams],
         "commands": list(env.params.commands),
         "robots": [
-            {**row, "color": list(COLORS[color % len(COLORS)][:3])} for row, color in zip(rows, colors, strict=True)
+            {**row, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])}
+            for row, color in zip(rows, colors, strict=True)
         ],
         "track": {"length": scene.track.length, "width": scene.track.width},
         "motors": _motors(env),
