@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -73,3 +75,17 @@ def test_the_soak_is_asked_for_in_one_place() -> None:
     """Only tests/conftest.py reads MQE_SOAK; a test that should be longer in the soak is a parameter marked `soak`."""
     files = [path for path in Path(__file__).parent.glob("*.py") if path != Path(__file__)]
     assert [path.name for path in files if "MQE_SOAK" in path.read_text(encoding="utf-8")] == ["conftest.py"]
+
+
+def test_importing_and_listing_the_tasks_print_no_warnings() -> None:
+    """Such as MJX's note that Warp is missing; Python's own warnings are errors."""
+    code = "import mqe_jax; mqe_jax.tasks(); import sys; from mqe_jax.cli import main; sys.exit(main(['tasks']))"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stderr == "" and "Failed" not in done.stdout
+    first, *_, last = done.stdout.splitlines()
+    assert first.startswith("The tasks with their default parameters") and last.startswith("actions per agent")
+    rows = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.startswith("go1")}
+    assert rows["go1gate"][-1] == "shipped" and rows["go1plane"][-1] == "none"
+    assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"]
