@@ -33,6 +33,7 @@ from mqe_jax.export import site  # noqa: E402
 from mqe_jax.export.scene import scene_xml  # noqa: E402
 from mqe_jax.export.site import STARTS, entries, start_states  # noqa: E402
 from mqe_jax.export.task import PHYSICS, TaskFunctions, state_arrays  # noqa: E402
+from mqe_jax.train.policy import save_policy  # noqa: E402
 
 TASK = "go1sheep-easy"
 """Task of the tests outside the soak: its NPCs have noise, its gate moves."""
@@ -170,8 +171,15 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     shutil.copy(zoo.file_of("go1wrestling"), run)
     (entry,) = entries(["go1wrestling", str(run)])
     assert (entry.name, list(entry.policies)) == ("go1wrestling", ["shipped", "mine", "scripted"])
-    (football,) = entries(["go1football-1vs1"])
-    assert "scripted" in football.policies
+    policy = zoo.load("go1wrestling")
+    env = {"ring_radius": 1.5, "randomization.push": 1.0, "randomization.friction": [0.5, 1.0]}
+    config = dataclasses.replace(policy.config, env=env)
+    (tmp_path / "small").mkdir()
+    save_policy(tmp_path / "small", dataclasses.replace(policy, config=config))
+    first, second = entries(["go1wrestling", str(tmp_path / "small")])
+    assert (second.name, list(second.policies)) == ("go1wrestling-2", ["small", "scripted"])
+    assert first.env.params.ring_radius == 1.7 and second.env.params.ring_radius == 1.5
+    assert second.env.params.randomization.push == 0  # the page has none
     with pytest.raises(InputError, match="did you mean 'go1gate'"):
         entries(["go1gaet"])
     with pytest.raises(InputError, match="position"):

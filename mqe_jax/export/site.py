@@ -113,7 +113,8 @@ def entries(sources: Sequence[str]) -> list[Entry]:
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
             count = sum(known == task for known, *_ in found)
-            env = make(task, impl="c", num_envs=1, **{**params, "randomization": Randomization()})
+            own = {name: value for name, value in params.items() if not name.startswith("randomization")}
+            env = make(task, impl="c", num_envs=1, randomization=Randomization(), **own)
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
@@ -128,7 +129,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
 def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
     """Returns the task, its parameters and the trained policy by name that a source stands for."""
     task = ALIASES.get(source, source)
-    if os.sep not in source and not Path(source).exists():
+    if os.sep not in source and (task in playable or not Path(source).exists()):
         if task not in playable:
             hint = nearest(task, playable)
             raise InputError(f"run: {source!r} is not allowed{hint}; allowed: a run folder, a policy file, a task's id")

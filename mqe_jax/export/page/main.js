@@ -4,8 +4,8 @@ import { Drawing, drawsInSoftware } from './drawing.js';
 import { Site } from './episode.js';
 
 const PAUSE_AFTER = 2.5; // s of page time between two episodes
-const LONGEST_WORK = 60; // ms of simulation at most before a frame, so that a slow browser stays responsive
-const LONGEST_SKIP = 90; // ms without a new picture at most, where the simulation is behind
+const LONGEST_WORK = 40; // ms of simulation at most before a frame, so that a slow browser stays responsive
+const LONGEST_SKIP = 70; // ms without a new picture at most, where the simulation is behind
 const SLOW = 20; // frames per second below which the page changes to low detail
 const REASONS = { fall: 'a robot fell', collision: 'a collision', rule: '', time: 'time is up' };
 
