@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +46,9 @@ def readme_commands(text: str) -> list[list[str]]:
     Raises:
         KeyError: for a command that is neither in `SHORTER` nor in `WITHOUT`.
     """
-    found = [shlex.split(line)[1:] for line in re.findall(r"^\| .*", text, re.MULTILINE) for line in _spans(line)]
+    blocks = re.findall(r"^```bash\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
+    found = [words[1:] for words in lines if words[:1] == ["mqe"]]
     commands = []
     for words in found:
         if words[0] in WITHOUT:
@@ -55,11 +57,6 @@ def readme_commands(text: str) -> list[list[str]]:
             commands.append([*words, *SHORTER[words[0]].split()])
     names = {"runs/a": "idle", "runs/b": "random"}
     return [[names.get(word) or word for word in words] for words in commands]
-
-
-def _spans(row: str) -> Iterator[str]:
-    """Yields the commands of a table's row: code that begins with `mqe` in its first cell."""
-    yield from (code for code in re.findall(r"`(mqe [a-z][^`]*)`", row.split(" | ")[0]))
 
 
 def readme_programs(text: str) -> list[str]:
