@@ -8,6 +8,8 @@ xla/ffi/api/c_api.h, version 0.3).
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import weakref
 from collections.abc import Callable, Sequence
@@ -173,3 +175,11 @@ def _handler(pointer: Any) -> int | None:
 
 
 jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
+
+
+@atexit.register
+def _finish() -> None:
+    """Waits for programs whose results exist: their threads cannot call Python while the interpreter ends."""
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
+            array.block_until_ready()
