@@ -322,3 +322,22 @@ def test_reset_and_step_are_lowered_for_a_tpu(task: str) -> None:
         jax.export.export(step, platforms=["tpu"])(jax.eval_shape(reset, key), action),
     ):
         assert exported.platforms == ("tpu",) and "custom_call @mqe" not in exported.mlir_module()
+
+
+def test_a_program_that_still_runs_at_the_end_of_the_interpreter_is_awaited() -> None:
+    """Otherwise XLA's thread would call Python while it is finalised, which ends the process with SIGSEGV."""
+    code = """
+import time
+import jax, numpy as np
+from mqe_jax.engines.host_call import host_call
+class Owner: pass
+owner = Owner()
+def slow(owner, x):
+    time.sleep(0.02)
+    return x + 1
+shape = jax.ShapeDtypeStruct((300, 300), np.float32)
+f = jax.jit(lambda x: jax.lax.fori_loop(0, 40, lambda i, x: host_call(1, owner, slow, shape, [x @ x]), x))
+running = f(np.zeros((300, 300), np.float32))
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 0, ended.stderr
