@@ -224,6 +224,7 @@ def newest(run_dir: Path) -> dict[str, np.ndarray]:
     return load_file(max(list_checkpoints(run_dir)))
 
 
+@pytest.mark.soak
 def test_sigkill_and_resume_changes_nothing(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start_training(whole).wait(300) == 0

@@ -247,6 +247,7 @@ def contents(run: Path) -> dict[str, np.ndarray]:
     return load_file(max(list_checkpoints(run)))
 
 
+@pytest.mark.soak
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     """The opponents are recorded, evaluations meet them, and seeds are trained together."""
     whole, halves = tmp_path / "whole", tmp_path / "halves"

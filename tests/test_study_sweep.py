@@ -74,6 +74,7 @@ def run_until(folder: Path, sweep: Sweep, updates: int) -> bool:
     return True
 
 
+@pytest.mark.soak
 def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) -> None:
     sweep, folder = load(tmp_path), tmp_path / "study"
     sweeps.prepare(sweep, folder)
@@ -150,7 +151,7 @@ def test_a_sweep_that_is_stopped_and_packed_resumes_elsewhere(
     assert kept == {name for name in whole if not name.startswith("rollout/")} < whole
     left = sweeps.plan(sweep, there / "study", config_of)
     assert [job.steps_left for job in left] == [32] and (there / "study" / "sweep.yaml").is_file()
-    assert sweeps.run(there / "study", left, lambda config, seeds: (PROBE, PROBE)) == []
+    assert sweeps.run(there / "study", left, lambda config, seeds: (PROBE, PROBE)) == ([], [])
     for run in read_runs(there / "study"):
         assert list(run.curve["env_steps"]) == [16, 32, 48] and len(run.evaluations) == 2
     assert cli.main(["pack", str(folder), "-o", str(tmp_path / "out"), "--megabytes", "0.001"]) == 2
@@ -274,7 +275,7 @@ def test_a_cell_that_fails_is_named_and_the_others_are_trained(
     load(tmp_path)
     trained: list[str] = []
 
-    def train(env: Probe, configs: list[TrainConfig], *_: object) -> None:
+    def train(env: Probe, configs: list[TrainConfig], *_: object, **named: object) -> None:
         if configs[0].ppo.ratio == "dimension":
             raise InputError("opponents: this one cannot be read")
         trained.append(configs[0].ppo.ratio)

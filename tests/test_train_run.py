@@ -318,7 +318,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
 
 def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     run_dir, trained = straight
-    state = train(PROBE, settings(start=str(run_dir), optimizer__learning_rate=1e-12, total_steps=16), tmp_path / "a")
+    state = train(PROBE, settings(start=str(run_dir), optimizer__learning_rate=1e-9, total_steps=16), tmp_path / "a")
     for name in ("actor", "log_std"):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.params[name], trained.params[name])
     assert float(state.obs_normalizer.obs.samples) > float(trained.obs_normalizer.obs.samples)

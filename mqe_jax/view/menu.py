@@ -16,7 +16,7 @@ from mqe_jax.view.session import Session
 
 DEFAULT = "default"
 """The policy that `mqe view TASK` shows."""
-_LONGEST = 64  # of an option, characters; messages are no longer
+_LONGEST = 256  # of an option, characters; messages are no longer
 
 
 @dataclass(frozen=True)

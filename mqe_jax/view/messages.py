@@ -26,7 +26,7 @@ MAX_FRAME = 2**16
 
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]  # refuses NaN
 Pixels = Annotated[int, Meta(ge=0, le=2**16)]
-Name = Annotated[str, Meta(max_length=64)]
+Name = Annotated[str, Meta(max_length=256)]
 Vector = tuple[Number, Number, Number]
 
 

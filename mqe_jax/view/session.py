@@ -118,7 +118,7 @@ class Session:
         self.episodes = np.zeros(self.num_envs, int)
         self.outcomes, self.last = ("success",), [""] * self.num_envs
         self.reset()
-        if f"team0/{OUTCOMES[0]}" in self.state.metrics:
+        if all(f"team0/{name}" in self.state.metrics for name in OUTCOMES):
             self.outcomes = OUTCOMES
         self.counts = np.zeros(len(self.outcomes), int)
         rewards = [name for name in self.state.metrics if name.startswith("reward/")]
