@@ -91,6 +91,7 @@ def touching(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> list[int]
     ]
 
 
+@pytest.mark.soak
 def test_a_robot_meets_everything_alike_on_two_engines() -> None:
     """The same forces on the trunk at first, and the same movement of all after one environment step."""
     track = Track((SpawnArea(2.0), Gate(length=2.0, width=0.6)), walled=False)
@@ -200,7 +201,10 @@ def on_both_engines(task: str) -> tuple[list[QuadrupedEnv], list[State]]:
 
 @pytest.mark.parametrize(
     ("impl", "limit"),
-    [("jax", {"contacts_per_robot": 2}), pytest.param("warp", {"constraints_per_robot": 8}, marks=pytest.mark.gpu)],
+    [
+        pytest.param("jax", {"contacts_per_robot": 2}, marks=pytest.mark.soak),
+        pytest.param("warp", {"constraints_per_robot": 8}, marks=pytest.mark.gpu),
+    ],
 )
 def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
     """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""

@@ -305,6 +305,7 @@ def test_a_layout_slices_packs_and_splits() -> None:
 # -- recordings -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 def test_a_divergence_is_recorded_and_replayed(tmp_path: Any) -> None:
     """A robot with a huge velocity diverges, and again from the file, which holds the last episode only."""
     env = made("go1plane")

@@ -250,7 +250,9 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
     assert np.all(np.abs(np.asarray(states.anchors)[:, 0] - [8.5, 0.0]) <= [0.0, 1.0])
 
 
-@pytest.mark.parametrize(("task", "share"), [("go1gate", 0.9), ("go1sheep-hard", 0.6)])
+@pytest.mark.parametrize(
+    ("task", "share"), [("go1gate", 0.9), pytest.param("go1sheep-hard", 0.6, marks=pytest.mark.soak)]
+)
 def test_the_planner_wins(task: str, share: float) -> None:
     """Through the walk policy, over a few episodes; `mqe eval TASK --policy scripted` measures many."""
     from mqe_jax.train.evaluate import evaluate

@@ -57,6 +57,7 @@ def stop_after(updates: int) -> Any:
     return on_update
 
 
+@pytest.mark.soak
 def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path) -> None:
     configs = [settings(seed) for seed in (0, 1, 2)]
     folders = [tmp_path / f"seed{config.seed}" for config in configs]
