@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
-from mqe_jax.envs.autoreset import KEPT, autoreset, in_parts
+from mqe_jax.envs.autoreset import KEPT, autoreset
 from mqe_jax.train.policy import Policy
 from mqe_jax.train.types import PyTree
 
@@ -79,7 +79,7 @@ class Demonstrated(VectorEnv):
             return autoreset(self.env, self.env.step(state, action), start)
 
         plain = State(**{field.name: getattr(state, field.name) for field in dataclasses.fields(State)})
-        after = in_parts(jax.vmap(one), self.env.physics.parts(self.num_envs))(plain, action)
+        after = jax.vmap(one)(plain, action)
         return DemonstratedState(**vars(after), demonstrations=demonstrations)
 
     def _record(self) -> PyTree:

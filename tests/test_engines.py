@@ -22,7 +22,6 @@ import pytest
 
 from mqe_jax import engines
 from mqe_jax.engines import Engine
-from mqe_jax.engines.c import CEngine
 from mqe_jax.engines.host_call import host_call
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
@@ -291,26 +290,6 @@ def test_a_second_process_compiles_no_step_of_the_c_engine(tmp_path: Path) -> No
     )
     assert int(first[1]) >= 2 and int(second[1]) == 0 and int(second[0]) == int(first[0]) + int(first[1])
     assert first[2] == second[2]
-
-
-def test_a_divided_batch_is_stepped_as_a_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With resets; XLA without optimisation rounds observations differently, by 4e-9."""
-    count = CEngine.DIVIDED
-    env = VectorEnv(make("go1plane", impl="c", num_envs=count, episode_length=0.06), count)
-    assert env.env.physics.parts(count) == 2 and env.env.physics.parts(count + 1) == 1
-    actions = jax.random.uniform(jax.random.PRNGKey(1), (4, count, env.num_agents, env.action_size), minval=-1.0)
-    start = jax.jit(env.reset)(jax.random.PRNGKey(0))
-
-    def states() -> Any:
-        step = jax.jit(lambda state: jax.lax.scan(lambda s, a: (env.step(s, a), s.reward), state, actions))
-        return step.lower(start).compile(QUICK)(start)
-
-    divided = states()
-    monkeypatch.setattr(CEngine, "DIVIDED", count + 1)
-    whole = states()
-    assert whole[0].step.tolist() == [1] * count  # every episode ended
-    for a, b in zip(*map(jax.tree.leaves, (divided, whole)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,6 @@ class CEngine(Engine):
     """MuJoCo's C engine as a pure JAX function; no contact is ever dropped."""
 
     impl = "c"
-    DIVIDED = 64
-    """Number of environments from which a batch is divided."""
 
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
@@ -55,10 +53,6 @@ class CEngine(Engine):
         if platform == "cpu":
             return None
         return f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
-
-    def parts(self, num_envs: int) -> int:
-        """Returns 2 for large batches: XLA computes one half while MuJoCo's threads step the other."""
-        return 2 if num_envs >= self.DIVIDED and num_envs % 2 == 0 else 1
 
     def blank(self) -> mjx.Data:
         return private.without_pointers(private.load_mjx().make_data(self.model, impl="cpp"))

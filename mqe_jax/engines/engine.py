@@ -88,10 +88,6 @@ class Engine(abc.ABC):
         """Returns whether the engine can step `num_envs` environments at once."""
         return True
 
-    def parts(self, num_envs: int) -> int:
-        """Returns into how many equal parts a batch is divided, which are stepped independently of each other."""
-        return 1
-
     @abc.abstractmethod
     def blank(self) -> mjx.Data:
         """Returns data of one environment with all arrays of the engine; `init` sets the state."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,19 +46,6 @@ def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> St
     }
     data = env.physics.merge(done, fresh.data, state.data)
     return dataclasses.replace(state, data=data, key=key, **merged)
-
-
-def in_parts(step: Callable[..., State], parts: int) -> Callable[..., State]:
-    """Returns a batched function that computes equal parts of its batch, each independently of the others."""
-    if parts == 1:
-        return step
-
-    def whole(*arguments: Any) -> State:
-        divided = jax.tree.map(lambda x: jnp.split(x, parts), arguments)
-        divided = jax.tree.transpose(jax.tree.structure(arguments), jax.tree.structure([0] * parts), divided)
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *(step(*part) for part in divided))
-
-    return whole
 
 
 class VectorEnv:
@@ -108,7 +94,7 @@ class VectorEnv:
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action))
 
-        return in_parts(jax.vmap(one), self.env.physics.parts(self.num_envs))(state, action)
+        return jax.vmap(one)(state, action)
 
     def check_action(self, action: jax.Array) -> None:
         """Raises an InputError for actions of another shape than (N, A, action_size)."""
