@@ -149,9 +149,7 @@ def test_mjx_agrees_with_the_c_engine_where_the_solver_converges(task: str) -> N
 
 
 # Compiling a scene for MJX-JAX takes half a minute. Other objects: on one scene, above.
-@pytest.mark.parametrize(
-    "task", [task if task == "go1gate" else pytest.param(task, marks=pytest.mark.soak) for task in TASKS]
-)
+@pytest.mark.parametrize("task", [pytest.param(task, marks=pytest.mark.soak) for task in TASKS])
 def test_two_engines_step_alike(task: str) -> None:
     """MuJoCo's C engine and MJX-JAX step from the same states to the same observations and rewards.
 

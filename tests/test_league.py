@@ -187,6 +187,7 @@ def assert_same_end(expected: Path, resumed: Path) -> None:
             np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
+@pytest.mark.soak
 def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     """Two seeds in one program."""
     arguments = training(96, "--checkpoint.every", "2", "--num-seeds", "2")

@@ -186,6 +186,7 @@ def test_a_mirrored_match_shows_both_teams() -> None:
     np.testing.assert_allclose(state.reward[:3], -state.reward[3:], atol=1e-6)
 
 
+@pytest.mark.soak
 def test_the_command_line_plays_two_runs_against_each_other(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     task = ["go1revolvingdoor", "--impl", "c", "--control", "position", "--set", "episode_length=0.2"]
     small = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "32", "--ppo.minibatches", "1"]
