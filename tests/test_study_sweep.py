@@ -269,6 +269,14 @@ def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, 
         sweeps.plan(sweep, tmp_path, config_of, check=setup.check_start)
 
 
+def test_the_shipped_policies_can_be_planned_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    for part in ("published", "matches"):
+        sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
+        config_of = lambda task, _: setup.for_task(setup.base_config(task, None), task)  # noqa: E731
+        assert sweeps.plan(sweep, CONFIGS, config_of, seeds=[10], check=setup.check_start)
+
+
 def test_a_cell_that_fails_is_named_and_the_others_are_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

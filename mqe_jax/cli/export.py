@@ -42,7 +42,7 @@ class Export:
         from mqe_jax.export.check import STEPS, checked_onnx
         from mqe_jax.export.policy import shapes
 
-        env, _ = make_env(task, "c", policy.config.env, 1)
+        env, _ = make_env(task, "auto", policy.config.env, 1)
         model, error = checked_onnx(policy, env)
         check_folder(self.onnx.parent, "onnx")
         write_atomically(self.onnx, model.SerializeToString())

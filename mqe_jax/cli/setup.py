@@ -109,11 +109,11 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
 def check_start(config: TrainConfig) -> None:
     """Raises an InputError where a training could not start: for parameters, rewards or policies of its task.
 
-    It makes the task with the parameters of training and of evaluation, for one environment on the C engine.
+    It makes the task with the parameters of training and of evaluation, for one environment.
     """
-    env, _ = make_env(config.task or "", "c", config.training_env, 1)
+    env, _ = make_env(config.task or "", "auto", config.training_env, 1)
     if config.train_env:
-        make_env(config.task or "", "c", config.env, 1)
+        make_env(config.task or "", "auto", config.env, 1)
     if len(env.teams) < 2 and config.opponents:
         fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
     for name in {*config.opponents, config.curriculum.demonstrator} - {*MOVING, None}:

@@ -114,7 +114,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
         if entry is None:
             count = sum(known == task for known, *_ in found)
             own = {name: value for name, value in params.items() if not name.startswith("randomization")}
-            env = make(task, impl="c", num_envs=1, randomization=Randomization(), **own)
+            env = make(task, num_envs=1, randomization=Randomization(), **own)
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
