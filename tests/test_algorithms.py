@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,17 +12,18 @@ import probes
 import pytest
 from probes import Probe
 
-from mqe_jax.cli.setup import base_config
+from mqe_jax.cli.setup import base_config, preset
+from mqe_jax.cli.train import parse_train
 from mqe_jax.errors import InputError
 from mqe_jax.settings import override
 from mqe_jax.train.actor_critic import ActorCritic
-from mqe_jax.train.algorithms import ALGORITHMS, preset
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.types import NetworkMemory, Params, VectorEnv
 
+ALGORITHMS = ("mappo", "jrpo", "mat", "ippo", "dual-clip")
 SMALL = {
     "num_envs": 32,
     "total_steps": 100_000,
@@ -93,6 +93,8 @@ def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
 def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
     assert base_config("go1gate", None) == base_config("go1gate", "tuned/go1gate")
     assert base_config("go1plane", None) == base_config("go1plane", "paper/mappo")
+    assert base_config("go1bridgewrestling", None) == base_config("go1wrestling", None)
+    assert parse_train(["go1bridgewrestling"]).settings == base_config("go1wrestling", None)
 
 
 def test_unknown_names_get_the_nearest() -> None:
@@ -100,11 +102,6 @@ def test_unknown_names_get_the_nearest() -> None:
         base_config("go1gate", "demo", "mapo")
     with pytest.raises(InputError, match=r"config: unknown name 'deno' \(did you mean 'demo'"):
         base_config("go1gate", "deno")
-
-
-def test_every_algorithm_has_the_papers_settings() -> None:
-    folder = Path(__file__).parent.parent / "configs"
-    assert {path.stem for path in (folder / "paper").glob("*.yaml")} == set(ALGORITHMS)
 
 
 # -- the multi-agent transformer: sequential acting, parallel evaluation, deviation ----------------------------------

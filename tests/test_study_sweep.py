@@ -16,6 +16,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax import cli, zoo
 from mqe_jax.cli import setup
+from mqe_jax.cli.setup import preset
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import locked
 from mqe_jax.settings import build, override, to_mapping
@@ -23,7 +24,6 @@ from mqe_jax.study import pack as packing
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
 from mqe_jax.study.sweep import Sweep
-from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig
 
 CONFIGS = Path(__file__).parents[1] / "configs"

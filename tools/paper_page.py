@@ -23,7 +23,7 @@ from mqe_jax.study.report import markdown
 from mqe_jax.study.runs import Cell, Reference, Run, load_reference
 
 PAPER, SCRATCH, TUNED = "hierarchical", "scratch", "tuned"
-"""Variants: the paper's settings with the walk policy, the same from scratch, and those of configs/tuned."""
+"""Variants: the paper's settings with the walk policy, the same from scratch, and those of configs/tuned.yaml."""
 SHAPED = (TUNED, "no-curriculum", "plain-network", "plain-curriculum", "shaped", "shaped-tuned", "unshaped")
 """The tuned settings and changes of them; their training rewards may include shaping."""
 GATE_TERMS = {"reward/approach": "Distance to Target Reward", "reward/success": "Success Reward"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import jax
 
 from mqe_jax.cli.output import echo
 from mqe_jax.demonstrations import Demonstrated
-from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.league.league import MOVING, League
@@ -19,7 +20,6 @@ from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.settings import fail, load_yaml, override
 from mqe_jax.train import runner
-from mqe_jax.train.algorithms import preset
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.yaml_text import parse_yaml
 
@@ -93,12 +93,9 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     eval_env = None
     if config.evaluation.every is not None:
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
+    _check_teams(both, config)
     if len(both.teams) < 2:
-        if opponents:
-            fail("opponents", list(opponents), f"empty: {both.name} is not a match; it has one team")
         return batch(config.num_envs), eval_env
-    if config.num_envs % 2 and not opponents:
-        fail("num_envs", config.num_envs, "even: both teams of a match are environments")
     learning = League(batch(config.num_envs), opponents, config) if opponents else Mirror(batch(config.num_envs // 2))
     if eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
@@ -114,10 +111,14 @@ def check_start(config: TrainConfig) -> None:
     env, _ = make_env(config.task or "", "auto", config.training_env, 1)
     if config.train_env:
         make_env(config.task or "", "auto", config.env, 1)
-    if len(env.teams) < 2 and config.opponents:
-        fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+    _check_teams(env, config)
     for name in {*config.opponents, config.curriculum.demonstrator} - {*MOVING, None}:
         load_policy(str(name), env)
+
+
+def _check_teams(env: Any, config: TrainConfig) -> None:
+    if len(env.teams) < 2 and config.opponents:
+        fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 
@@ -137,44 +138,58 @@ def platform() -> str:
         raise InputError(f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu") from None
 
 
-def find_config(name: str) -> Path:
-    """Returns the settings file of a path or a shipped name; the InputError lists the shipped ones."""
-    path = Path(name)
-    files = [file.relative_to(CONFIG_FOLDER) for file in sorted(CONFIG_FOLDER.rglob("*.yaml"))]
-    whole = [file for file in files if file.parts[0] not in ("league", "zoo.yaml")]
-    shipped = {file.with_suffix("").as_posix(): CONFIG_FOLDER / file for file in whole}
-    allowed = f"a YAML file, or one of {', '.join(shipped)}"
-    if name in shipped:
-        return shipped[name]
-    if path.suffix in (".yaml", ".yml") or path.parent != Path("."):
-        if path.is_file():
-            return path
+@functools.cache
+def _parts(file: str) -> dict[str, Any]:
+    """Returns the parts of a shipped file of settings: those `common` to all, and changes of them by name."""
+    return load_yaml(CONFIG_FOLDER / f"{file}.yaml")
+
+
+def preset(algorithm: str) -> dict[str, Any]:
+    """Returns the settings that define an algorithm, those of configs/paper.yaml, for `mqe_jax.settings.override`.
+
+    Raises:
+        InputError: for an unknown name, with the nearest known one.
+    """
+    algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
+    if algorithm not in algorithms:
+        fail("algorithm", algorithm, f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}")
+    return algorithms[algorithm]
+
+
+def named_config(name: str, task: str) -> TrainConfig:
+    """Returns the settings of a file, or of a shipped name; `league` has changes of some tasks."""
+    shipped = ["demo", "league"]
+    shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
+    path, allowed = Path(name), f"a YAML file, or one of {', '.join(shipped)}"
+    if name == "demo":
+        path = CONFIG_FOLDER / "demo.yaml"
+    elif name in shipped:
+        file, _, part = name.partition("/")
+        common = override(TrainConfig(), _parts(file)["common"])
+        return override(common, _parts(file).get(part or task, {}))
+    elif path.suffix not in (".yaml", ".yml") and path.parent == Path("."):
+        raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
+    if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
-    raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
+    return load_config(path)
 
 
 def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
     """Returns the settings of a file or a shipped name, with the algorithm's preset.
 
     The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks. league is changed by league/TASK where there is such a file.
+    paper/mappo for other tasks.
 
     Raises:
         InputError: for a file or an algorithm that is not allowed.
     """
-    changes = {} if algorithm is None else preset(algorithm)
+    task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:
-        return load_config(find_config(f"paper/{algorithm}"))
-    match = TASKS.get(task)
-    is_match = match is not None and issubclass(match, Match)
-    if name is None:
-        tuned = (CONFIG_FOLDER / "tuned" / f"{task}.yaml").is_file()
-        name = f"tuned/{task}" if tuned else "league" if is_match else "paper/mappo"
-    config = load_config(find_config(name), changes)
-    own = CONFIG_FOLDER / "league" / f"{task}.yaml"
-    if name == "league" and own.is_file():
-        config = override(config, load_yaml(own))
-    return config
+        name = f"paper/{algorithm}"
+    elif name is None:
+        match = task in TASKS and issubclass(TASKS[task], Match)
+        name = f"tuned/{task}" if task in _parts("tuned") else "league" if match else "paper/mappo"
+    return override(named_config(name, task), changes)
 
 
 def for_task(config: TrainConfig, task: str, env: Mapping[str, Any] | None = None) -> TrainConfig:

@@ -14,7 +14,7 @@ from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions
 from mqe_jax.cli.output import echo
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import base_config, environments, for_task
-from mqe_jax.envs import tasks
+from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.limits import Seeds
 from mqe_jax.settings import override, record
 from mqe_jax.train import runner
@@ -129,7 +129,7 @@ def parse_train(arguments: Sequence[str]) -> Train:
     """
     source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
     network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
-    task = next((word for word in others if word in tasks()), "")
+    task = next((word for word in others if word in (*TASKS, *ALIASES)), "")
     settings = base_config(task, source.config, source.algorithm)
     if network.name is not None and network.name != settings.network.name:
         settings = override(settings, {"network": {"name": network.name}})
