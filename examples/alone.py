@@ -10,8 +10,8 @@ import jax.numpy as jnp
 
 import mqe_jax
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
+from mqe_jax.planners import Observation, go_to
 from mqe_jax.planners.cooperative import plan_seesaw, plan_seesaw_alone
-from mqe_jax.planners.steering import Observation, go_to
 from mqe_jax.train.evaluate import evaluate
 
 NUM_ENVS, SECONDS = 32, 3.0

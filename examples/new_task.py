@@ -16,8 +16,7 @@ from mqe_jax.collision import OBJECT_BIT, WALL_BIT
 from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.objects import Object, add_body, add_slides, add_solid
-from mqe_jax.planners import scripted_policy
-from mqe_jax.planners.steering import Observation, go_to, pose
+from mqe_jax.planners import Observation, go_to, pose, scripted_policy
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record

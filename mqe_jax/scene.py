@@ -11,11 +11,12 @@ import mujoco
 import numpy as np
 
 from mqe_jax import robots
-from mqe_jax.appearance.light import add_light
+from mqe_jax.appearance.grounds import add_light
 from mqe_jax.collision import MAX_ROBOTS
 from mqe_jax.errors import InputError
 from mqe_jax.objects import Object
-from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.build import build_robot
+from mqe_jax.robots.index import RobotIndex, add_sensors, index_robots, prefix
 from mqe_jax.robots.motors import Motors
 from mqe_jax.robots.robot import Robot
 from mqe_jax.terrain import Layout, Track, build_terrain
@@ -32,7 +33,7 @@ class Scene:
     robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
     """Robot type shared by all R robots."""
     contacts: str = "full"
-    """Set of the robots' collision geoms, one of `mqe_jax.robots.CONTACTS`."""
+    """Set of the robots' collision geoms, one of `mqe_jax.robots.robot.CONTACTS`."""
     objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
     """Movable and fixed objects by name, added after the robots as bodies `object/<name>`."""
     colors: tuple[int, ...] = ()
@@ -137,7 +138,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     spec.add_numeric(name="max_contact_points", size=1, data=[scene.max_contacts])
     layout = build_terrain(spec, scene.track, visual=visual)
     for number in range(scene.num_robots):
-        body = robots.build_robot(
+        body = build_robot(
             scene.robot,
             number,
             contacts=scene.contacts,
@@ -147,10 +148,10 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
             joint_mechanics=scene.joint_mechanics,
             color=scene.colors[number] if scene.colors else number,
         )
-        spec.attach(body, prefix=robots.prefix(number), frame=spec.worldbody.add_frame())
+        spec.attach(body, prefix=prefix(number), frame=spec.worldbody.add_frame())
     for name, item in scene.objects.items():
         item.add(spec, f"object/{name}", visual)
-    robots.add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
+    add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
     if visual:
         add_light(spec, (scene.track.length / 2, 0, 8))
     return spec, layout
@@ -160,7 +161,7 @@ def compile_scene(scene: Scene) -> CompiledScene:
     """Compiles a scene for the physics and indexes it by name."""
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
-    index = robots.index_robots(model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors)
+    index = index_robots(model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors)
     return CompiledScene(
         scene=scene,
         model=model,

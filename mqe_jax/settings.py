@@ -36,8 +36,8 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from mqe_jax import limits
 from mqe_jax.errors import InputError, nearest, shown
+from mqe_jax.files import read_yaml
 from mqe_jax.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for those who declare records)
-from mqe_jax.yaml_text import read_yaml
 
 T = TypeVar("T")
 P = ParamSpec("P")

@@ -21,7 +21,7 @@ from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.policy import read_policy
 from mqe_jax.viz.recording import Episode, record
 from mqe_jax.viz.render import render_episode
-from mqe_jax.walk.convert import read_torchscript
+from mqe_jax.walk.torchscript import read_torchscript
 from tests import fake_env, inputs
 
 Strategy = st.SearchStrategy[Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from mqe_jax import robots
+from mqe_jax.robots.index import prefix
 from mqe_jax.robots.robot import LEGS
 
 
@@ -13,10 +13,10 @@ def limb_axes(model: mujoco.MjModel, count: int, qpos: np.ndarray) -> np.ndarray
     """Returns the ends of all limb axes, thighs then calves (F, R, 8, 2, 3), m, world frame."""
     points = np.zeros((len(qpos), count, 3, 4, 3))
     joints = [
-        [[model.body(f"{robots.prefix(r)}{leg}_{joint}").id for leg in LEGS] for joint in ("thigh", "calf")]
+        [[model.body(f"{prefix(r)}{leg}_{joint}").id for leg in LEGS] for joint in ("thigh", "calf")]
         for r in range(count)
     ]
-    feet = [[model.geom(f"{robots.prefix(r)}full/foot/{leg}").id for leg in LEGS] for r in range(count)]
+    feet = [[model.geom(f"{prefix(r)}full/foot/{leg}").id for leg in LEGS] for r in range(count)]
     data = mujoco.MjData(model)
     for frame, pose in enumerate(qpos):
         data.qpos[:] = pose

@@ -25,11 +25,12 @@ import jax
 import mujoco
 import numpy as np
 
-from mqe_jax import robots
 from mqe_jax.collision import robot_bits
 from mqe_jax.envs import PLANNERS, TASKS, make
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.robots.build import build_robot
+from mqe_jax.robots.index import prefix
 from mqe_jax.robots.robot import JOINTS, LEGS
 from mqe_jax.scene import Scene
 from mqe_jax.terrain import build_terrain
@@ -72,11 +73,11 @@ def full_model(scene: Scene) -> mujoco.MjModel:
     spec.compiler.degree = False
     build_terrain(spec, scene.track, visual=False)
     for robot in range(scene.num_robots):
-        body = robots.build_robot(scene.robot, robot, visual=False)
+        body = build_robot(scene.robot, robot, visual=False)
         for geom in body.geoms:
             geom.contype = geom.conaffinity = 0
         _add_full_shapes(body, robot)
-        spec.attach(body, prefix=robots.prefix(robot), frame=spec.worldbody.add_frame())
+        spec.attach(body, prefix=prefix(robot), frame=spec.worldbody.add_frame())
     for name, item in scene.objects.items():
         item.add(spec, f"object/{name}", False)
     return spec.compile()

@@ -25,8 +25,8 @@ from mqe_jax.engines import Engine
 from mqe_jax.engines.host_call import host_call
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
-from mqe_jax.robots import read_robots
 from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.index import read_robots
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, SpawnArea, Track
 from tests import engines as comparison

@@ -30,7 +30,7 @@ from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.policy import read_policy
 from mqe_jax.view.messages import Camera, RefusedError, UnparsableError, check
-from mqe_jax.walk.convert import read_torchscript
+from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 from tests.test_walk_policy import write_torchscript
 

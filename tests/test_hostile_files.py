@@ -21,15 +21,14 @@ from mqe_jax import limits
 from mqe_jax.cli.setup import parse_overrides
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
-from mqe_jax.files import parse_json, read_rows, read_tensors
+from mqe_jax.files import parse_json, parse_yaml, read_rows, read_tensors
 from mqe_jax.settings import build
 from mqe_jax.study.runs import read_curve
 from mqe_jax.train import checkpoint
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import read_policy
-from mqe_jax.walk.convert import read_torchscript
-from mqe_jax.yaml_text import parse_yaml
+from mqe_jax.walk.torchscript import read_torchscript
 
 
 def peak() -> int:

@@ -13,9 +13,9 @@ import pytest
 
 from mqe_jax import make, robots
 from mqe_jax.errors import InputError
-from mqe_jax.robots import CollisionShape, Robot
 from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.robot import LEGS, Link, box, capsule, sphere
+from mqe_jax.robots.kinematics import foot_positions, knee_positions
+from mqe_jax.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 
@@ -82,9 +82,9 @@ def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
     data.qpos[scene.index.joint_qpos[0]] = joints
     mujoco.mj_kinematics(scene.model, data)
     feet = data.geom_xpos[scene.index.foot_geom[0]] - [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(robots.foot_positions(robot, jnp.asarray(joints)), feet, atol=1e-5)
+    np.testing.assert_allclose(foot_positions(robot, jnp.asarray(joints)), feet, atol=1e-5)
     knees = data.xpos[scene.index.bodies[0, 3::3]] - [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(robots.knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)
+    np.testing.assert_allclose(knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))

@@ -22,7 +22,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.scene import Scene
-from mqe_jax.walk import convert
+from mqe_jax.walk import torchscript
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.task import WalkTask
@@ -134,7 +134,7 @@ def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.P
     adaptation, body = random_layers(ADAPTATION_SIZES, 0), random_layers(BODY_SIZES, 1)
     write_torchscript(tmp_path / "a.jit", adaptation)
     write_torchscript(tmp_path / "b.jit", body)
-    params = convert.convert(tmp_path / "a.jit", tmp_path / "b.jit")
+    params = torchscript.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
     latent = apply(adaptation, history)
     np.testing.assert_allclose(walk_policy.infer_latent(params, jnp.asarray(history)), latent, atol=2e-5)
@@ -170,7 +170,7 @@ def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:
             layers += [torch.nn.Linear(n_in, n_out), torch.nn.ELU()]
         nets[name] = torch.nn.Sequential(*layers[:-1])
         torch.jit.script(nets[name]).save(str(tmp_path / f"{name}.jit"))
-    params = convert.convert(tmp_path / "a.jit", tmp_path / "b.jit")
+    params = torchscript.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     history = torch.randn(2, 2100)
     latent = nets["a"](history)
     action = nets["b"](torch.cat([history, latent], -1)).detach().numpy()
@@ -183,10 +183,10 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     text = tmp_path / "text.jit"
     text.write_text("hello")
     with pytest.raises(ValueError, match=r"text\.jit: damaged, or not a TorchScript Sequential"):
-        convert.read_torchscript(text)
+        torchscript.read_torchscript(text)
     write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
     with pytest.raises(ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"):
-        convert.convert(tmp_path / "small.jit", tmp_path / "small.jit")
+        torchscript.convert(tmp_path / "small.jit", tmp_path / "small.jit")
 
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:

@@ -11,8 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions
-from mqe_jax.cli.output import echo, print_table
+from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions, echo, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Episodes, Horizon
 from mqe_jax.settings import record

@@ -12,7 +12,7 @@ import jax
 
 from mqe_jax import interrupts
 from mqe_jax.cli.commands import Demo
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import echo
 from mqe_jax.cli.render import draw
 from mqe_jax.cli.setup import base_config, environments, for_task, make_env
 from mqe_jax.envs import VectorEnv

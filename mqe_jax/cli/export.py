@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Json
-from mqe_jax.cli.output import echo, print_table
+from mqe_jax.cli.options import Json, echo, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.settings import record

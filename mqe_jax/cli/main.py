@@ -87,7 +87,7 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
 
 
 def _run(command: Any) -> None:
-    from mqe_jax.cli.output import standard_output
+    from mqe_jax.cli.options import standard_output
 
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:

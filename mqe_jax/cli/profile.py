@@ -23,7 +23,7 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from mqe_jax.cli import setup
 from mqe_jax.cli.bench import device_name
-from mqe_jax.cli.output import print_table
+from mqe_jax.cli.options import print_table
 from mqe_jax.files import replacing
 from mqe_jax.settings import override
 from mqe_jax.train.learner import make_learner

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import echo
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.files import check_folder
 from mqe_jax.opponents import TeamState

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from mqe_jax.cli.options import Json, PolicyOptions
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import Json, PolicyOptions, echo
 from mqe_jax.limits import Candidates, ClipLength, FrameRate, Pixels, Speed, Time
 from mqe_jax.settings import record
 

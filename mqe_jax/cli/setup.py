@@ -10,18 +10,18 @@ from typing import Any
 
 import jax
 
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.errors import InputError, nearest, shown
+from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import MOVING, League
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.settings import fail, load_yaml, override
 from mqe_jax.train import runner
 from mqe_jax.train.config import TrainConfig, load_config
-from mqe_jax.yaml_text import parse_yaml
 
 CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
 

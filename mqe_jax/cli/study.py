@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from mqe_jax import interrupts
-from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions, echo
 from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
 from mqe_jax.limits import Candidates, Positive, PositiveInt
 from mqe_jax.settings import fail, record

@@ -10,8 +10,7 @@ import pydantic
 import tyro
 
 from mqe_jax import interrupts, robots, walk_policy
-from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
 from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS

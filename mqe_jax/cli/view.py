@@ -11,8 +11,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from mqe_jax.cli.options import PolicyOptions
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import PolicyOptions, echo
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Port
 from mqe_jax.settings import fail, record

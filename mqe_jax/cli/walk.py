@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed
-from mqe_jax.cli.output import echo, print_table
+from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed, echo, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments
 from mqe_jax.settings import record
@@ -73,14 +72,14 @@ class WalkConvert:
         """Converts official checkpoints."""
 
         from mqe_jax import robots, walk_policy
-        from mqe_jax.walk import convert
+        from mqe_jax.walk.torchscript import convert
 
         if self.output.suffix != ".safetensors":
             raise InputError(f"output: {str(self.output)!r} is not allowed; it must end in .safetensors")
         for path in (self.adaptation, self.body):
             if not path.is_file():
                 raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
-        params = convert.convert(self.adaptation, self.body)
+        params = convert(self.adaptation, self.body)
         about = {"robot": robots.get(self.robot).name}
         walk_policy.save_params(params, self.output, about, half=self.float16)
         echo(f"mqe: wrote {self.output}")

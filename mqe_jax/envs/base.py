@@ -30,7 +30,7 @@ from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments
-from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.index import RobotState, read_robots
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
 from mqe_jax.settings import check, checked, fail
@@ -273,7 +273,7 @@ class QuadrupedEnv(Task[S, P]):
 
     def read(self, data: mjx.Data) -> RobotState:
         """Returns the state of all robots."""
-        return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
+        return read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
         """Returns the generalised coordinates of an object, as its class documents them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.planners.steering import Observation, go_to, pose
+from mqe_jax.planners import Observation, go_to, pose
 
 
 # Narrow Gate: the first robot passes the gate while the second waits until the gate is clear.

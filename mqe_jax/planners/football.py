@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.planners.steering import Observation, go_to
+from mqe_jax.planners import Observation, go_to
 
 _GOAL_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, points in the goal
 _GOAL = jnp.array([12.0, 0.0])  # m

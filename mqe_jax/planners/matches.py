@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.planners.steering import GAIN, Observation, go_to, pose
+from mqe_jax.planners import GAIN, Observation, go_to, pose
 
 # Push Cylinder: align with the cylinder's axis, then push slightly faster than it moves.
 _AXIS_X = 1.6  # m, of the line on which the cylinder slides

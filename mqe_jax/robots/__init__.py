@@ -1,29 +1,34 @@
-"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics."""
+"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of robots by name."""
 
-from mqe_jax.robots.build import build_robot
-from mqe_jax.robots.index import RobotIndex, RobotState, add_sensors, index_robots, prefix, read_robots
-from mqe_jax.robots.kinematics import foot_positions, knee_positions
-from mqe_jax.robots.registry import ROBOTS, get, register
-from mqe_jax.robots.robot import CONTACTS, NUM_JOINTS, CollisionShape, Link, Robot, VisualShape, WalkSettings
+from __future__ import annotations
 
-__all__ = [
-    "CONTACTS",
-    "NUM_JOINTS",
-    "ROBOTS",
-    "CollisionShape",
-    "Link",
-    "Robot",
-    "RobotIndex",
-    "RobotState",
-    "VisualShape",
-    "WalkSettings",
-    "add_sensors",
-    "build_robot",
-    "foot_positions",
-    "get",
-    "index_robots",
-    "knee_positions",
-    "prefix",
-    "read_robots",
-    "register",
-]
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.robots.go2 import GO2
+from mqe_jax.robots.robot import Robot
+from mqe_jax.settings import checked
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
+
+
+@checked(name=str)
+def get(name: str) -> Robot:
+    """Returns a robot by name.
+
+    Raises:
+        InputError: for an unknown name, with the nearest known one.
+    """
+    if name not in ROBOTS:
+        raise InputError(f"robot: unknown name {name!r}{nearest(name, ROBOTS)}; allowed: {', '.join(ROBOTS)}")
+    return ROBOTS[name]
+
+
+def register(robot: Robot) -> Robot:
+    """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it.
+
+    Raises:
+        InputError: if another robot has that name.
+    """
+    if ROBOTS.setdefault(robot.name, robot) is not robot:
+        raise InputError(f"robot: the name {robot.name!r} is already registered")
+    return robot

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from mqe_jax.limits import Horizon, Positive, Width, Widths
 from mqe_jax.settings import fail
 from mqe_jax.train import nn
-from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
+from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}

@@ -19,9 +19,8 @@ import numpy as np
 from mqe_jax.limits import Depth, Positive, Width
 from mqe_jax.settings import fail
 from mqe_jax.train import nn
-from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
+from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 

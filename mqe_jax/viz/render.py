@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.appearance import GROUND_GROUP
-from mqe_jax.appearance.light import GROUND_MATERIAL
+from mqe_jax.appearance.grounds import GROUND_MATERIAL
 from mqe_jax.errors import InputError
 from mqe_jax.interrupts import child
 from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time

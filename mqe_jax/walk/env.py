@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import engines, robots, walk_policy
+from mqe_jax import engines, walk_policy
 from mqe_jax.actuators import Actuators
 from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
-from mqe_jax.robots.index import Proprioception, RobotState
+from mqe_jax.robots.index import Proprioception, RobotState, read_robots
+from mqe_jax.robots.kinematics import foot_positions
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
@@ -230,7 +231,7 @@ class WalkEnv:
 
     def read(self, data: mjx.Data) -> RobotState:
         """Returns the robot's state."""
-        return robots.read_robots(self.index, data.qpos, data.qvel, data.sensordata)
+        return read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def foot_force(self, data: mjx.Data) -> jax.Array:
         """Returns the strongest contact force on each foot (4,), N."""
@@ -260,7 +261,7 @@ class WalkEnv:
             obs = walk_policy.observe(self.robot, state.memory, state.spec.commands, noisy)
         velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
-        feet = robots.foot_positions(self.robot, sensed.joint_position)
+        feet = foot_positions(self.robot, sensed.joint_position)
         foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
         phases = walk_policy.foot_phases(state.memory.gait, state.spec.commands)
         random = state.random

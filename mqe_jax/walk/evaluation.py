@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import walk_policy
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.index import Proprioception
+from mqe_jax.robots.kinematics import foot_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
 from mqe_jax.walk.env import WalkEnv, heading_velocity
@@ -110,7 +111,7 @@ def measure(
             state = env.step(state, memory.action[None])
             robot_state = env.read(state.data)
             quaternion = robot_state.quaternion[0]
-            feet = robots.foot_positions(env.robot, robot_state.joint_position[0])
+            feet = foot_positions(env.robot, robot_state.joint_position[0])
             height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
             velocity, yaw_rate = heading_velocity(robot_state)
             errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]

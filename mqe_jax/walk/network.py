@@ -16,9 +16,8 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.limits import Horizon, NonNegative
 from mqe_jax.settings import FileName, fail
 from mqe_jax.train import nn
-from mqe_jax.train.gaussian import GaussianSettings
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Network, register_network
+from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 from mqe_jax.walk.symmetry import symmetry_loss
 from mqe_jax.walk.task import LATENT_TARGET

@@ -12,8 +12,9 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import walk_policy
 from mqe_jax.robots.index import RobotState
+from mqe_jax.robots.kinematics import foot_positions, knee_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.settings import record
@@ -89,7 +90,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
 
-    locate_feet = functools.partial(robots.foot_positions, robot)
+    locate_feet = functools.partial(foot_positions, robot)
     feet, feet_velocity = jax.jvp(locate_feet, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
     turn = jnp.broadcast_to(quaternion, (4, 4))
@@ -117,7 +118,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     margin = 0.05 * (robot.joint_upper - robot.joint_lower)
     beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
     beyond += jnp.maximum(robot.joint_lower + margin - joint_position, 0)
-    knees = rotate(turn, robots.knee_positions(robot, joint_position))[:, 2] + height
+    knees = rotate(turn, knee_positions(robot, joint_position))[:, 2] + height
     on_ground = inputs.foot_force > 1.0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {

@@ -1,4 +1,4 @@
-"""Reads the weights of a TorchScript archive without torch and without executing code from it.
+"""Official TorchScript checkpoints of walk-these-ways, read without torch and without executing code from them.
 
 The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw storages in
 `<name>/data/<key>`. The unpickler below supports only tensors and containers; every module class becomes a plain
@@ -19,6 +19,8 @@ import numpy as np
 
 from mqe_jax import limits
 from mqe_jax.files import archive
+from mqe_jax.settings import PathText, checked
+from mqe_jax.walk_policy import Params, nested_params
 
 _DTYPES = {
     "FloatStorage": "<f4",
@@ -85,8 +87,9 @@ class _Unpickler(_PurePython):
         return tensor
 
 
-def read_state(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Returns the tensors of a TorchScript file by dotted name, float32.
+@checked(path=PathText)
+def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """Returns the tensors of a TorchScript file by dotted name, float32, such as 0.weight of a `Sequential`.
 
     Raises:
         InputError: if the file is not such an archive, or exceeds the limits.
@@ -110,3 +113,10 @@ def _collect(module: Any, prefix: str, state: dict[str, np.ndarray], seen: set[i
             state[f"{prefix}{name}"] = value
         elif isinstance(value, _Module):
             _collect(value, f"{prefix}{name}.", state, seen)
+
+
+def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:
+    """Reads the official pair of TorchScript checkpoints into this package's weights."""
+    flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
+    flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}
+    return nested_params(flat, f"{adaptation}, {body}")
