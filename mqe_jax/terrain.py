@@ -20,9 +20,6 @@ from mqe_jax.appearance.walls import WALL_COLOR, WALL_GROUP, Style, gate_wall, s
 from mqe_jax.collision import GROUND_BIT, WALL_BIT
 from mqe_jax.errors import InputError
 
-# A block parameter that may be a pair (easy, hard), interpolated by the track's difficulty in [0, 1].
-Ranged = float | tuple[float, float]
-
 
 @dataclasses.dataclass(frozen=True)
 class Wall:
@@ -82,36 +79,19 @@ class Layout:
 class TerrainBlock:
     """Base of all blocks."""
 
-    length: Ranged = 1.0
+    length: float = 1.0
     """Extent along x, m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         """Returns the walls and poses of the block from x = `start`, m; `number` is its index in the track."""
         raise NotImplementedError(f"terrain block {type(self).__name__}: layout() is not defined")
 
-    def at(self, difficulty: float) -> TerrainBlock:
-        """Returns the block with every (easy, hard) parameter interpolated at a difficulty in [0, 1]."""
-        ranged = [field.name for field in dataclasses.fields(self) if "Ranged" in str(field.type)]
-        return dataclasses.replace(self, **{name: _at(getattr(self, name), difficulty) for name in ranged})
-
-
-def _at(value: Ranged, difficulty: float) -> float:
-    if isinstance(value, tuple | list):
-        return value[0] + difficulty * (value[1] - value[0])
-    return value
-
-
-def _number(value: Ranged) -> float:
-    if isinstance(value, tuple | list):
-        raise InputError(f"terrain block: the range {value} is not resolved; call `at` first")
-    return float(value)
-
 
 @dataclasses.dataclass(frozen=True)
 class SpawnArea(TerrainBlock):
     """Spawn poses side by side across the track, with a wall behind them."""
 
-    length: Ranged = 2.0
+    length: float = 2.0
     spawn_x: float | None = None
     """X of the spawn poses from the block's start, m; half its length if None."""
     spacing: float | None = None
@@ -120,7 +100,7 @@ class SpawnArea(TerrainBlock):
     """Whether there is a wall behind the robots."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        x = start + (_number(self.length) / 2 if self.spawn_x is None else self.spawn_x)
+        x = start + (self.length / 2 if self.spawn_x is None else self.spawn_x)
         spacing = track.width / track.num_robots if self.spacing is None else self.spacing
         middle = (track.num_robots - 1) / 2
         spawn = tuple((x, (robot - middle) * spacing, 0.0) for robot in range(track.num_robots))
@@ -140,7 +120,7 @@ class Plane(TerrainBlock):
 class EndWall(TerrainBlock):
     """The wall at the end of the track."""
 
-    length: Ranged = 0.0
+    length: float = 0.0
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         return Layout(barriers=(Barrier(f"end{number}", (start, 0.0), (-1.0, 0.0), track.width),))
@@ -150,10 +130,10 @@ class EndWall(TerrainBlock):
 class Gate(TerrainBlock):
     """A wall across the middle of the block with a gap."""
 
-    length: Ranged = 3.0
-    width: Ranged = 0.6
+    length: float = 3.0
+    width: float = 0.6
     """Width of the gap, m."""
-    depth: Ranged = 0.1
+    depth: float = 0.1
     """Thickness of the wall along x, m."""
     offset: tuple[float, float] = (0.0, 0.0)
     """Offset of the gap's mean centre from the block's centre (x, y), m."""
@@ -161,10 +141,10 @@ class Gate(TerrainBlock):
     """Half-widths of the range of the gap's centre, sampled at reset (x, y), m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        gap, depth, height = _number(self.width), _number(self.depth), track.wall_height
+        gap, depth, height = self.width, self.depth, track.wall_height
         if not 0 < gap < track.width:
             raise InputError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")
-        center = (start + _number(self.length) / 2 + self.offset[0], self.offset[1])
+        center = (start + self.length / 2 + self.offset[0], self.offset[1])
         # Long enough to reach the side wall for every sampled gap position; the overhang is hidden when rendering.
         reach = (track.width - gap) / 2 + abs(self.offset[1]) + self.random[1]
         walls = tuple(
@@ -182,7 +162,7 @@ class RoughGround:
     whatever the number of solver iterations.
     """
 
-    amplitude: Ranged = 0.03
+    amplitude: float = 0.03
     """Maximum height above the flat ground, m."""
     wavelength: float = 1.0
     """Period of the coarsest octave, m."""
@@ -193,9 +173,8 @@ class RoughGround:
     seed: int = 0
     """Seed of the noise."""
 
-    def heights(self, length: float, width: float, difficulty: float = 1.0) -> np.ndarray:
-        """Returns heights in [0, amplitude] (rows along y, columns along x), m; `difficulty` as in `Track`."""
-        amplitude = _at(self.amplitude, difficulty)
+    def heights(self, length: float, width: float) -> np.ndarray:
+        """Returns heights in [0, amplitude] (rows along y, columns along x), m."""
         rows, columns = (round(extent / self.resolution) + 1 for extent in (width, length))
         total = np.zeros((rows, columns))
         for octave in range(self.octaves):
@@ -203,7 +182,7 @@ class RoughGround:
             y, x = np.arange(rows) * self.resolution / cell, np.arange(columns) * self.resolution / cell
             total += _perlin(y, x, np.random.default_rng((self.seed, octave))) / 2**octave
         low, high = total.min(), total.max()
-        return amplitude * (total - low) / max(high - low, 1e-9)
+        return self.amplitude * (total - low) / max(high - low, 1e-9)
 
 
 def _perlin(y: np.ndarray, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -235,8 +214,6 @@ class Track:
     """Height of every wall, m."""
     wall_thickness: float = 0.04
     """Thickness of the side walls, m."""
-    difficulty: float = 1.0
-    """Difficulty in [0, 1]; interpolates block parameters given as pairs (easy, hard)."""
     rough: RoughGround | None = None
     """Perlin-noise ground, or None for a flat floor."""
     walled: bool = True
@@ -247,30 +224,27 @@ class Track:
     """Look of the ground."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.difficulty <= 1.0:
-            raise InputError(f"Track.difficulty: {self.difficulty} is not in [0, 1]")
         if self.width <= 0:
             raise InputError(f"Track.width: {self.width} must be positive")
 
     @property
     def length(self) -> float:
         """Sum of the blocks' lengths, m."""
-        return sum(_number(block.at(self.difficulty).length) for block in self.blocks)
+        return sum(block.length for block in self.blocks)
 
     def layout(self) -> Layout:
         """Returns the layout of all blocks; anchors are numbered over the whole track."""
         walls, barriers, anchors, spawn = [], [], [], []
         start = 0.0
-        for number, piece in enumerate(self.blocks):
-            fixed = piece.at(self.difficulty)
-            part = fixed.layout(start, self, number)
+        for number, block in enumerate(self.blocks):
+            part = block.layout(start, self, number)
             for wall in part.walls:
                 anchor = None if wall.anchor is None else wall.anchor + len(anchors)
                 walls.append(dataclasses.replace(wall, anchor=anchor))
             barriers += part.barriers
             anchors += part.anchors
             spawn += part.spawn
-            start += _number(fixed.length)
+            start += block.length
         if self.walled:
             middle, half = start / 2, self.width / 2
             barriers.append(Barrier("side_right", (middle, -half), (0.0, 1.0), start))
@@ -336,7 +310,7 @@ def _add_ground(spec: mujoco.MjSpec, track: Track) -> None:
         spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
         return
     length, width = track.length, track.width
-    heights = track.rough.heights(length, width, track.difficulty)
+    heights = track.rough.heights(length, width)
     top = max(float(heights.max()), 1e-6)
     (rows, columns), size = heights.shape, (length / 2, width / 2, top, 0.1)
     spec.add_hfield(name="ground", nrow=rows, ncol=columns, size=size, userdata=(heights / top).ravel())

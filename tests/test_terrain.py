@@ -1,6 +1,8 @@
-"""Terrain: difficulty, rough ground, and robots that stand on it on the engines."""
+"""Terrain: walls, rough ground, and robots that stand on it on the engines."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -14,21 +16,16 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import EndWall, Gate, Plane, RoughGround, SpawnArea, Track
 
-ROUGH = RoughGround(amplitude=(0.0, 0.08), wavelength=1.0, octaves=3, seed=1)
+ROUGH = RoughGround(amplitude=0.08, wavelength=1.0, octaves=3, seed=1)
 
 
-def test_difficulty_interpolates_the_ranges_of_blocks() -> None:
-    blocks = (SpawnArea(2.0), Gate(length=(4.0, 2.0), width=(1.0, 0.6)), Plane(1.0), EndWall())
-    for difficulty, gap, length in ((0.0, 1.0, 7.0), (0.5, 0.8, 6.0), (1.0, 0.6, 5.0)):
-        track = Track(blocks, width=3.0, difficulty=difficulty)
-        assert track.length == pytest.approx(length)
-        layout = track.layout()
-        right, left = layout.walls
-        edges = [wall.center[1] + sign * wall.size[1] / 2 for wall, sign in ((right, 1), (left, -1))]
-        assert edges[1] - edges[0] == pytest.approx(gap)
-        assert layout.anchors[0].position[0] == pytest.approx(2.0 + (length - 3.0) / 2)
-    with pytest.raises(InputError, match=r"Track.difficulty: 1.5 is not in \[0, 1\]"):
-        Track(blocks, difficulty=1.5)
+def test_a_gate_is_as_wide_as_its_gap() -> None:
+    track = Track((SpawnArea(2.0), Gate(length=4.0, width=0.8), Plane(1.0), EndWall()), width=3.0)
+    layout = track.layout()
+    right, left = layout.walls
+    edges = [wall.center[1] + sign * wall.size[1] / 2 for wall, sign in ((right, 1), (left, -1))]
+    assert track.length == pytest.approx(7.0) and edges[1] - edges[0] == pytest.approx(0.8)
+    assert layout.anchors[0].position[0] == pytest.approx(4.0)
     with pytest.raises(InputError, match=r"gate: width 3.5 must be between 0 and the track's width 3.0"):
         Track((Gate(width=3.5),)).layout()
 
@@ -44,14 +41,12 @@ def test_walls_around_a_track_face_inward_at_its_edges() -> None:
     }
 
 
-def test_rough_ground_is_smooth_bounded_and_grows_with_difficulty() -> None:
-    easy, half, hard = (ROUGH.heights(4.0, 3.0, difficulty) for difficulty in (0.0, 0.5, 1.0))
-    assert hard.shape == (31, 41)
-    assert np.ptp(easy) == 0 and np.ptp(half) == pytest.approx(0.04) and np.ptp(hard) == pytest.approx(0.08)
-    assert hard.min() == 0
-    np.testing.assert_array_equal(hard, ROUGH.heights(4.0, 3.0, 1.0))
-    assert np.abs(hard - RoughGround(amplitude=0.08, octaves=3, seed=2).heights(4.0, 3.0)).max() > 0.02
-    assert np.abs(np.diff(hard, axis=1)).max() < 0.04  # 0.1 m apart
+def test_rough_ground_is_smooth_and_bounded() -> None:
+    heights = ROUGH.heights(4.0, 3.0)
+    assert heights.shape == (31, 41) and heights.min() == 0 and np.ptp(heights) == pytest.approx(0.08)
+    np.testing.assert_array_equal(heights, ROUGH.heights(4.0, 3.0))
+    assert np.abs(heights - dataclasses.replace(ROUGH, seed=2).heights(4.0, 3.0)).max() > 0.02
+    assert np.abs(np.diff(heights, axis=1)).max() < 0.04  # 0.1 m apart
 
 
 def rough_scene() -> CompiledScene:

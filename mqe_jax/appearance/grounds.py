@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.appearance import CLAY, GRASS, INK, ROBOT_COLORS, STONE, WHITE, WOOD, YELLOW, Color, mixed
-from mqe_jax.appearance.shapes import Ground, Mark, Point, Rod, Shape, Slab, Tuft, circle, line, outline, rectangle
+from mqe_jax.appearance.shapes import Ground, Point, Shape, circle, line, mark, outline, rectangle, rod, slab, tuft
 
 GROUND_MATERIAL = "ground"
 _HORIZON, _ZENITH = (0.86, 0.91, 0.96), (0.36, 0.58, 0.85)
@@ -19,19 +19,19 @@ COURT: Color = (0.83, 0.68, 0.48, 1.0)  # parquet
 _POST = 0.035  # radius of goal posts, m
 
 
-def pads(poses: Sequence[Sequence[float]], colors: Sequence[int], z: float = 0.0) -> tuple[Mark, ...]:
+def pads(poses: Sequence[Sequence[float]], colors: Sequence[int]) -> tuple[Shape, ...]:
     """Returns a frame in each robot's colour about its place at the start; poses x, y, yaw."""
     size, marks = (0.9, 0.6), []
     for (x, y, yaw, *_), color in zip(poses, colors, strict=False):
         paint = mixed(ROBOT_COLORS[color % len(ROBOT_COLORS)], WHITE, 0.25)
         marks += [
-            Mark((x, y, z), size, WHITE, 3, yaw),
-            Mark((x, y, z), (size[0] - 0.08, size[1] - 0.08), paint, 4, yaw),
+            mark((x, y, 0.0), size, WHITE, 3, yaw),
+            mark((x, y, 0.0), (size[0] - 0.08, size[1] - 0.08), paint, 4, yaw),
         ]
     return tuple(marks)
 
 
-def finish(x: float, y: Point, squares: int = 14, z: float = 0.0) -> tuple[Mark, ...]:
+def finish(x: float, y: Point, squares: int = 14, z: float = 0.0) -> tuple[Shape, ...]:
     """Returns a chequered line across the track at x, between two y, m."""
     side = (y[1] - y[0]) / squares
     dark = [
@@ -79,19 +79,19 @@ def meadow(length: float, width: float, goal_x: float) -> Ground:
         rectangle((goal_x, length), (-width / 2, width / 2), pen),
     ]
     tones = ((0.44, 0.60, 0.33, 1.0), (0.50, 0.66, 0.38, 1.0))
-    patches: list[Mark] = []
+    patches: list[tuple[float, float, float]] = []
     for number in range(round(6 * goal_x)):
         radius = random.uniform(0.1, 0.35)
         x, y = random.uniform(0.4, goal_x - 0.5), random.uniform(-0.44, 0.44) * width
-        if all(np.hypot(x - other.center[0], y - other.center[1]) > radius + other.size[0] for other in patches):
-            patches.append(Mark((x, y, 0.0), (radius,), tones[number % 2], 2))
-    shapes += patches
+        if all(np.hypot(x - other_x, y - other_y) > radius + other for other_x, other_y, other in patches):
+            patches.append((x, y, radius))
+            shapes.append(mark((x, y, 0.0), (radius,), tones[number % 2], 2))
     for number in range(round(3.0 * length)):
         x, y = random.uniform(0.2, length - 0.2), random.choice([-1, 1]) * random.uniform(0.52, 0.85) * width
         flower = number % 3 == 0
         half = (0.045, 0.045, 0.04) if flower else (0.16, 0.12, 0.10)
         color = ((0.98, 0.93, 0.55, 1.0), WHITE)[number % 2] if flower else tones[0]
-        shapes.append(Tuft((x, y, 0.06 if flower else 0.0), half, color))
+        shapes.append(tuft((x, y, 0.06 if flower else 0.0), half, color))
     return Ground(shapes=tuple(shapes))
 
 
@@ -108,7 +108,7 @@ def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
         rectangle((a, b), (-half, half), tones[i % 2]) for i, (a, b) in enumerate(itertools.pairwise(edges))
     ]
     shapes += outline(x, (0.1 - half, half - 0.1), width=0.07)
-    shapes += [line((middle, 0.1 - half), (middle, half - 0.1), width=0.07), Mark((middle, 0.0, 0.0), (0.12,), level=3)]
+    shapes += [line((middle, 0.1 - half), (middle, half - 0.1), width=0.07), mark((middle, 0.0, 0.0), (0.12,), level=3)]
     shapes += circle((middle, 0.0), 1.3, width=0.07)
     points = []
     for goal_x, away, color in ((x[0], -1, ROBOT_COLORS[0]), (x[1], 1, ROBOT_COLORS[2])):
@@ -122,18 +122,18 @@ def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
 def _goal(x: float, depth: float, half: float, height: float, color: Color) -> list[Shape]:
     """Returns the frame and the net of a goal, whose back is at `x + depth`."""
     inner, back = half - _POST, x + 0.96 * depth
-    posts = [Rod((x, side * inner, 0.0), (x, side * inner, height), _POST, color) for side in (-1, 1)]
-    frame: list[Shape] = [*posts, Rod((x, -inner, height), (x, inner, height), _POST, color)]
+    posts = [rod((x, side * inner, 0.0), (x, side * inner, height), _POST, color) for side in (-1, 1)]
+    frame: list[Shape] = [*posts, rod((x, -inner, height), (x, inner, height), _POST, color)]
     thread, net = 0.008, (0.93, 0.93, 0.93, 1.0)
     for y in np.linspace(-inner, inner, 10).tolist():
         frame += [
-            Rod((back, y, 0.0), (back, y, height), thread, net),
-            Rod((x, y, height), (back, y, height), thread, net),
+            rod((back, y, 0.0), (back, y, height), thread, net),
+            rod((x, y, height), (back, y, height), thread, net),
         ]
     for part in (0.25, 0.5, 0.75, 1.0):
         z, along = part * height, x + part * (back - x)
-        frame += [Rod((back, -inner, z), (back, inner, z), thread, net)]
-        frame += [Rod((along, -inner, height), (along, inner, height), thread, net)]
+        frame += [rod((back, -inner, z), (back, inner, z), thread, net)]
+        frame += [rod((along, -inner, height), (along, inner, height), thread, net)]
     return frame
 
 
@@ -152,11 +152,11 @@ def dohyo(top: tuple[float, float, float], size: tuple[float, float, float], rad
     sand, edge = (0.90, 0.77, 0.55, 1.0), (0.72, 0.55, 0.36, 1.0)
     shapes: list[Shape] = [
         rectangle((x - length / 2, x + length / 2), (y - width / 2, y + width / 2), edge, 1, z),
-        Mark((x, y, z), (radius,), sand, 2),
+        mark((x, y, z), (radius,), sand, 2),
     ]
     sides = [(x - length / 2, y, 0.02, width + 0.04), (x + length / 2, y, 0.02, width + 0.04)]
     sides += [(x, y - width / 2, length + 0.04, 0.02), (x, y + width / 2, length + 0.04, 0.02)]
-    shapes += [Slab((a, b, z / 2), (along, across, z), edge) for a, b, along, across in sides]
+    shapes += [slab((a, b, z / 2), (along, across, z), edge) for a, b, along, across in sides]
     for side, color in ((-1, ROBOT_COLORS[0]), (1, ROBOT_COLORS[2])):
         shapes += [line((x - 0.4, y + side * 0.45), (x + 0.4, y + side * 0.45), width=0.07, z=z)]
         at = y + side * (width / 2 - 0.2)
@@ -177,7 +177,7 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
     shapes: list[Shape] = [rectangle((ends[0] - 1.0, ends[1] + 1.0), (-40.0, 40.0), blue)]
     for _ in range(70):
         x, y = random.uniform(ends[0] - 0.8, ends[1] + 0.8), random.uniform(-6.0, 6.0)
-        shapes.append(Mark((x, y, 0.0), (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8)), foam, 2))
+        shapes.append(mark((x, y, 0.0), (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8)), foam, 2))
     length, width, bridge = widths
     planks = np.linspace(*ends, 24).tolist()
     for i, (a, b) in enumerate(itertools.pairwise(planks)):

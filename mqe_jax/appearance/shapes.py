@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,6 +16,7 @@ from mqe_jax.appearance import GOAL_SITE, GROUND_GROUP, MEADOW, SITE_GROUP, VISU
 Kind = mujoco.mjtGeom
 LAYER = 0.002  # height of a mark's top above that of the mark below it, m
 Point = tuple[float, float]
+Place = tuple[float, float, float]
 
 
 def add_visual(body: Any, kind: Any, color: Color, group: int = VISUAL_GROUP, **options: Any) -> None:
@@ -38,82 +39,45 @@ def about_z(yaw: float) -> tuple[float, float, float, float]:
     return float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))
 
 
-@dataclasses.dataclass(frozen=True)
-class Mark:
-    """A flat box, or a disc where `size` has one entry."""
+class Shape(NamedTuple):
+    """A visual geom that is still to be added to a body."""
 
-    center: tuple[float, float, float]
-    """Centre of its top, with the height of what it is painted on, m."""
-    size: tuple[float, ...]
-    """Extents along x and y (2,), or a disc's radius (1,), m."""
-    color: Color = WHITE
-    """Colour."""
-    level: int = 1
-    """Marks of a higher level cover those of lower ones."""
-    yaw: float = 0.0
-    """Rotation about z, rad."""
-
-    def add(self, body: Any) -> None:
-        """Adds the mark's geom to a body, usually the world."""
-        x, y, z = self.center
-        half, disc = LAYER * self.level / 2, len(self.size) == 1
-        size = (self.size[0], half, 0) if disc else (self.size[0] / 2, self.size[1] / 2, half)
-        kind = Kind.mjGEOM_CYLINDER if disc else Kind.mjGEOM_BOX
-        place = {"pos": (x, y, z + half), "quat": about_z(self.yaw)}
-        add_visual(body, kind, self.color, GROUND_GROUP, size=size, **place)
-
-
-@dataclasses.dataclass(frozen=True)
-class Rod:
-    """A cylinder, such as a goal post."""
-
-    start: tuple[float, float, float]
-    """First end of its axis, m."""
-    end: tuple[float, float, float]
-    """Second end, m."""
-    radius: float
-    """Radius, m."""
-    color: Color = WHITE
-    """Colour."""
-
-    def add(self, body: Any) -> None:
-        """Adds the rod's geom to a body, usually the world."""
-        add_rod(body, self.color, self.radius, self.start, self.end)
-
-
-@dataclasses.dataclass(frozen=True)
-class Tuft:
-    """An ellipsoid on the ground, such as grass."""
-
-    center: tuple[float, float, float]
-    """Centre, m."""
-    half: tuple[float, float, float]
-    """Half extents, m."""
+    kind: Any
     color: Color
-    """Colour."""
+    group: int
+    options: Mapping[str, Any]
+    """Options of `add_geom`."""
 
     def add(self, body: Any) -> None:
-        """Adds the tuft's geom to a body, usually the world."""
-        add_visual(body, Kind.mjGEOM_ELLIPSOID, self.color, GROUND_GROUP, size=self.half, pos=self.center)
+        """Adds the geom to a body, usually the world."""
+        add_visual(body, self.kind, self.color, self.group, **self.options)
 
 
-@dataclasses.dataclass(frozen=True)
-class Slab:
-    """An upright box, such as the side of a stage."""
+def mark(center: Place, size: tuple[float, ...], color: Color = WHITE, level: int = 1, yaw: float = 0.0) -> Shape:
+    """Returns a flat box of extents `size` (2,), or a disc of radius `size` (1,), m, turned by `yaw` about z.
 
-    center: tuple[float, float, float]
-    """Centre, m."""
-    size: tuple[float, float, float]
-    """Extents, m."""
-    color: Color
-    """Colour."""
-
-    def add(self, body: Any) -> None:
-        """Adds the slab's geom to a body, usually the world."""
-        add_box(body, self.color, [extent / 2 for extent in self.size], self.center)
+    `center` is that of its top, with the height of what it is painted on; higher levels cover lower ones.
+    """
+    x, y, z = center
+    half, disc = LAYER * level / 2, len(size) == 1
+    extents = (size[0], half, 0) if disc else (size[0] / 2, size[1] / 2, half)
+    options = {"size": extents, "pos": (x, y, z + half), "quat": about_z(yaw)}
+    return Shape(Kind.mjGEOM_CYLINDER if disc else Kind.mjGEOM_BOX, color, GROUND_GROUP, options)
 
 
-Shape = Mark | Rod | Tuft | Slab
+def rod(start: Place, end: Place, radius: float, color: Color) -> Shape:
+    """Returns a cylinder between two points, m, such as a goal post."""
+    return Shape(Kind.mjGEOM_CYLINDER, color, VISUAL_GROUP, {"size": (radius, 0, 0), "fromto": (*start, *end)})
+
+
+def tuft(center: Place, half: Place, color: Color) -> Shape:
+    """Returns an ellipsoid of half extents (3,) on the ground, m, such as grass."""
+    return Shape(Kind.mjGEOM_ELLIPSOID, color, GROUND_GROUP, {"size": half, "pos": center})
+
+
+def slab(center: Place, size: Place, color: Color) -> Shape:
+    """Returns an upright box of extents (3,), m, such as the side of a stage."""
+    return Shape(Kind.mjGEOM_BOX, color, VISUAL_GROUP, {"size": [extent / 2 for extent in size], "pos": center})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +88,7 @@ class Ground:
     """Colour of the plane."""
     shapes: tuple[Shape, ...] = ()
     """What is painted on it or stands on it."""
-    goals: tuple[tuple[float, float, float], ...] = ()
+    goals: tuple[Place, ...] = ()
     """Points that a camera keeps in view, such as goal posts, m."""
 
     def add(self, world: Any) -> None:
@@ -135,27 +99,27 @@ class Ground:
             world.add_site(name=f"{GOAL_SITE}/{number}", pos=point, group=SITE_GROUP)
 
 
-def rectangle(x: Point, y: Point, color: Color, level: int = 1, z: float = 0.0) -> Mark:
+def rectangle(x: Point, y: Point, color: Color, level: int = 1, z: float = 0.0) -> Shape:
     """Returns a filled rectangle between two x and two y, m."""
-    return Mark((sum(x) / 2, sum(y) / 2, z), (x[1] - x[0], y[1] - y[0]), color, level)
+    return mark((sum(x) / 2, sum(y) / 2, z), (x[1] - x[0], y[1] - y[0]), color, level)
 
 
-def line(start: Point, end: Point, color: Color = WHITE, width: float = 0.05, level: int = 3, z: float = 0.0) -> Mark:
+def line(start: Point, end: Point, color: Color = WHITE, width: float = 0.05, level: int = 3, z: float = 0.0) -> Shape:
     """Returns a straight line between two points (2,), m."""
     (x0, y0), (x1, y1) = start, end
     yaw = float(np.arctan2(y1 - y0, x1 - x0))
-    return Mark(((x0 + x1) / 2, (y0 + y1) / 2, z), (float(np.hypot(x1 - x0, y1 - y0)), width), color, level, yaw)
+    return mark(((x0 + x1) / 2, (y0 + y1) / 2, z), (float(np.hypot(x1 - x0, y1 - y0)), width), color, level, yaw)
 
 
-def outline(x: Point, y: Point, color: Color = WHITE, width: float = 0.05, z: float = 0.0) -> tuple[Mark, ...]:
+def outline(x: Point, y: Point, color: Color = WHITE, width: float = 0.05, z: float = 0.0) -> tuple[Shape, ...]:
     """Returns the four edges of a rectangle."""
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     return tuple(line(a, b, color, width, z=z) for a, b in zip(corners, corners[1:] + corners[:1], strict=True))
 
 
-def circle(center: Point, radius: float, color: Color = WHITE, width: float = 0.05, z: float = 0.0) -> tuple[Mark, ...]:
-    """Returns a circle as short lines."""
+def circle(center: Point, radius: float, width: float) -> tuple[Shape, ...]:
+    """Returns a white circle as short lines."""
     angles = np.linspace(0, 2 * np.pi, 37)
     reach = (radius + width / 2) / np.cos(np.pi / 36) - width / 2  # the lines' outer edges meet
     points = [(float(center[0] + reach * np.cos(a)), float(center[1] + reach * np.sin(a))) for a in angles]
-    return tuple(line(a, b, color, width, z=z) for a, b in itertools.pairwise(points))
+    return tuple(line(a, b, width=width) for a, b in itertools.pairwise(points))

@@ -1,4 +1,4 @@
-"""Scripted policies (`--policy scripted`), one per task, with observations and actions of learned policies; steering."""
+"""Scripted policies (`--policy scripted`), one per task, acting like learned ones, and their steering."""
 
 from __future__ import annotations
 
