@@ -17,7 +17,7 @@ from mqe_jax.train.runner import train
 
 
 class State(NamedTuple):
-    """N environments of two agents; see `mqe_jax.train.types.EnvState`."""
+    """N environments of two agents; see `mqe_jax.train.types.VectorEnv`."""
 
     position: jax.Array
     """Positions of both agents (N, 2, 2), m."""

@@ -305,20 +305,29 @@ def test_a_layout_slices_packs_and_splits() -> None:
 # -- recordings -------------------------------------------------------------------------------------------------------
 
 
+def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:
+    """The states (T, ...) of one environment before each action (T, A, D), with automatic reset."""
+
+    def advance(state: State, action: jax.Array) -> tuple[State, State]:
+        return autoreset(env, env.step(state, action)), state
+
+    return jax.jit(lambda start, actions: jax.lax.scan(advance, start, actions)[1])(start, actions)
+
+
 @pytest.mark.soak
 def test_a_divergence_is_recorded_and_replayed(tmp_path: Any) -> None:
     """A robot with a huge velocity diverges, and again from the file, which holds the last episode only."""
     env = made("go1plane")
     actions = jax.random.uniform(jax.random.PRNGKey(0), (60, 2, 12), minval=-1.0)
     late = dataclasses.replace(jax.jit(env.reset)(jax.random.PRNGKey(1)), step=jnp.int32(env.max_steps - 2))
-    before = replay.trajectory(env, late, actions)
+    before = trajectory(env, late, actions)
     assert np.asarray(before.step[:4]).tolist() == [498, 499, 0, 1]
     index, data = env.index, before.data
     data = data.replace(
         qpos=data.qpos.at[2, index.base_qpos[0, 2]].set(50.0), qvel=data.qvel.at[2, index.base_qvel[0, 0]].set(990.0)
     )
     thrown = jax.tree.map(lambda leaf: leaf[2], dataclasses.replace(before, data=data))
-    after = replay.trajectory(env, thrown, actions[2:])
+    after = trajectory(env, thrown, actions[2:])
     end = int(np.flatnonzero(np.asarray(after.metrics["diverged"]))[0])  # metrics belong to the step before
     assert end > 10
     states = jax.tree.map(lambda first, rest: jnp.concatenate([first[:2], rest[:end]]), before, after)
@@ -339,7 +348,7 @@ def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: An
     (tmp_path / "text.npz").write_text("nothing")
     with pytest.raises(InputError, match=r"text.npz: damaged, or not a recording"):
         replay.load_recording(tmp_path / "text.npz")
-    states = replay.trajectory(gate, fresh, jnp.zeros((2, 2, 12)))
+    states = trajectory(gate, fresh, jnp.zeros((2, 2, 12)))
     replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
     recording = replay.load_recording(tmp_path / "gate.npz")
     with pytest.raises(InputError, match=r"recording of go1gate: anchors has shape \(1, 2\); expected shape \(0, 2\)"):

@@ -48,6 +48,29 @@ def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, f
     return first, median(seconds), state
 
 
+def programs(
+    env: Any, vector: Any, steps: int, seen: Callable[[Any], Any]
+) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """Returns what is timed, neither jitted: whole environment steps, and physics alone.
+
+    The first maps a state and a random key to `steps` later ones under random actions, and to what is `seen` of each
+    state; the second maps a physics state to a later one under its constant control.
+    """
+    shape = (vector.num_envs, env.num_agents, env.action_size)
+
+    def step(carry: Any, _: None) -> Any:
+        state, key = carry
+        key, action_key = jax.random.split(key)
+        state = vector.step(state, jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0))
+        return (state, key), seen(state)
+
+    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
+    return (
+        lambda carry: jax.lax.scan(step, carry, None, steps),
+        lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0],
+    )
+
+
 def bench(
     env: Any, vector_env: Any, key: jax.Array, *, steps: int = 50, repeats: int = 5
 ) -> dict[str, str | int | float]:
@@ -59,30 +82,11 @@ def bench(
     and resets. `compile_s` is the first call minus the median call. `overflow` counts the environment steps of one call
     in which the engine may have dropped contacts or constraints.
     """
-    count, agents, width = vector_env.num_envs, env.num_agents, env.action_size
-
-    @jax.jit
-    def full(carry: tuple[Any, jax.Array, jax.Array]) -> tuple[Any, jax.Array, jax.Array]:
-        def one(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], jax.Array]:
-            state, key = carry
-            key, action_key = jax.random.split(key)
-            action = jax.random.uniform(action_key, (count, agents, width), minval=-1.0, maxval=1.0)
-            state = vector_env.step(state, action)
-            return (state, key), jnp.sum(state.metrics["overflow"])
-
-        (state, key), overflow = jax.lax.scan(one, carry[:2], None, steps)
-        return state, key, jnp.sum(overflow)
-
-    state = jax.block_until_ready(jax.jit(vector_env.reset)(key))
-    first, full_s, (_, _, overflow) = timed(full, (state, key, jnp.zeros(())), repeats)
-
-    @jax.jit
-    def bare(data: Any) -> Any:
-        step = jax.vmap(lambda d: env.physics.step(d, d.ctrl)[0])
-        return jax.lax.scan(lambda d, _: (step(d), None), data, None, steps)[0]
-
-    # Starts at the reset state, under its constant control.
-    _, bare_s, _ = timed(bare, jax.tree.map(jnp.copy, state.data), repeats)
+    whole, bare = programs(env, vector_env, steps, lambda state: jnp.sum(state.metrics["overflow"]))
+    count, state = vector_env.num_envs, jax.block_until_ready(jax.jit(vector_env.reset)(key))
+    walk = jax.jit(lambda carry: whole(carry[0]))
+    first, full_s, (_, overflow) = timed(walk, ((state, key), jnp.zeros(())), repeats)
+    _, bare_s, _ = timed(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
     full_rate, bare_rate = count * steps / full_s, count * steps / bare_s
     return {
         "task": vector_env.name,
@@ -92,7 +96,7 @@ def bench(
         "bare_env_steps_per_s": round(bare_rate, 1),
         "ratio": round(full_rate / bare_rate, 4),
         "compile_s": round(max(first - full_s, 0.0), 2),
-        "overflow": round(float(overflow)),
+        "overflow": round(float(jnp.sum(overflow))),
         "device": device_name(),
         "jax": jax.__version__,
     }

@@ -22,7 +22,7 @@ import numpy as np
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from mqe_jax.cli import setup
-from mqe_jax.cli.bench import device_name
+from mqe_jax.cli.bench import device_name, programs
 from mqe_jax.cli.options import print_table
 from mqe_jax.files import replacing
 from mqe_jax.settings import override
@@ -156,22 +156,13 @@ def contacts(model: mujoco.MjModel, states: dict[str, np.ndarray]) -> dict[str, 
 
 def profile(env: Any, vector: Any, key: jax.Array, *, steps: int, repeats: int) -> dict[str, Any]:
     """Measures the environment step of a batch: rates in turn with the bare engine, shares, compilation, memory."""
-    count, shape = vector.num_envs, (vector.num_envs, env.num_agents, env.action_size)
-
-    def step(carry: Any, _: None) -> Any:
-        state, key = carry
-        key, action_key = jax.random.split(key)
-        state = vector.step(state, jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0))
-        return (state, key), sampled(state.data)
-
-    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
-    start = (jax.jit(vector.reset)(key), key)
-    whole, seconds = compiled(lambda carry: jax.lax.scan(step, carry, None, steps), start)
-    bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
+    count, start = vector.num_envs, (jax.jit(vector.reset)(key), key)
+    run, bare = programs(env, vector, steps, lambda state: sampled(state.data))
+    whole, seconds = compiled(run, start)
     walking, states = whole(start)
     runs: dict[str, tuple[Callable[..., Any], Any]] = {
         "env_steps_per_s": (whole, walking),
-        "bare_env_steps_per_s": (bare, jax.tree.map(jnp.copy, start[0].data)),
+        "bare_env_steps_per_s": (jax.jit(bare), jax.tree.map(jnp.copy, start[0].data)),
     }
     rates = _in_turn(runs, count * steps, repeats)
     operations = traced(lambda: whole(walking), whole.as_text(), "other")

@@ -7,6 +7,7 @@ environments (friction, masses, motor strength) are passed to `Engine.step` as a
 from __future__ import annotations
 
 import abc
+import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
@@ -34,6 +35,7 @@ STATE_FIELDS = (
 )
 
 
+@dataclasses.dataclass(eq=False)
 class Engine(abc.ABC):
     """Steps one environment of a compiled model; batch with `jax.vmap`.
 
@@ -44,33 +46,17 @@ class Engine(abc.ABC):
     """Name of the engine in the registry."""
     model: mujoco.MjModel
     """Compiled model."""
-    motors: Motors | None
+    _: dataclasses.KW_ONLY
+    motors: Motors | None = None
     """Motors that drive its actuators; without them the actuators have no speed limit."""
-    num_substeps: int
+    num_substeps: int = 4
     """Physics steps per call of `step`."""
-    num_envs: int
+    num_envs: int = 4096
     """Environments for which buffers are sized that environments share."""
-    contacts_per_env: int
+    contacts_per_env: int = 32
     """Contacts per environment for which such buffers are sized, on average over environments."""
-    max_constraints_per_env: int
+    max_constraints_per_env: int = 160
     """Maximum constraints of each environment, for engines with such a limit (Warp's njmax)."""
-
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        *,
-        motors: Motors | None = None,
-        num_substeps: int = 4,
-        num_envs: int = 4096,
-        contacts_per_env: int = 32,
-        max_constraints_per_env: int = 160,
-    ) -> None:
-        self.model = model
-        self.motors = motors
-        self.num_substeps = num_substeps
-        self.num_envs = num_envs
-        self.contacts_per_env = contacts_per_env
-        self.max_constraints_per_env = max_constraints_per_env
 
     # -- defined by each engine ---------------------------------------------------------------------------------
 

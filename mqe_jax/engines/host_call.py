@@ -32,11 +32,34 @@ class _Extension(Structure):
     pass
 
 
+class _Scalar(Structure):
+    _fields_ = [("dtype", c_int), ("value", POINTER(c_int64))]
+
+
+def _structure(name: str, *fields: tuple[str, Any]) -> Any:
+    """Returns a structure whose first fields are its size and a pointer to its extensions."""
+    head = ("struct_size", c_size_t), ("extension", POINTER(_Extension))
+    return type(name, (Structure,), {"_fields_": [*head, *fields]})
+
+
 _Extension._fields_ = [("struct_size", c_size_t), ("type", c_int), ("next", POINTER(_Extension))]
-
-
-class _Version(Structure):
-    _fields_ = [("struct_size", c_size_t), ("extension", c_void_p), ("major", c_int), ("minor", c_int)]
+_Version = _structure("_Version", ("major", c_int), ("minor", c_int))
+_Buffer = _structure("_Buffer", ("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64)))
+_Items = ("size", c_int64), ("types", c_void_p)
+_List = _structure("_List", *_Items, ("items", POINTER(POINTER(_Buffer))))  # XLA_FFI_Args and XLA_FFI_Rets
+_Attributes = _structure("_Attributes", *_Items, ("names", c_void_p), ("items", POINTER(POINTER(_Scalar))))
+_Error = _structure("_Error", ("message", c_char_p), ("code", c_int))
+_Create = ctypes.CFUNCTYPE(c_void_p, POINTER(_Error))
+_Api = _structure("_Api", ("version", _Version), ("internal", c_void_p), ("create_error", _Create))  # its beginning
+_Frame = _structure(
+    "_Frame",
+    ("api", POINTER(_Api)),
+    ("context", c_void_p),
+    ("stage", c_int),
+    ("arguments", _List),
+    ("results", _List),
+    ("attributes", _Attributes),
+)
 
 
 class _Metadata(Structure):
@@ -45,73 +68,6 @@ class _Metadata(Structure):
 
 class _MetadataExtension(Structure):
     _fields_ = [("base", _Extension), ("metadata", POINTER(_Metadata))]
-
-
-class _Buffer(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t),
-        ("extension", c_void_p),
-        ("dtype", c_int),
-        ("data", c_void_p),
-        ("rank", c_int64),
-        ("dims", POINTER(c_int64)),
-    ]
-
-
-class _Scalar(Structure):
-    _fields_ = [("dtype", c_int), ("value", POINTER(c_int64))]
-
-
-class _List(Structure):
-    """XLA_FFI_Args and XLA_FFI_Rets."""
-
-    _fields_ = [
-        ("struct_size", c_size_t),
-        ("extension", c_void_p),
-        ("size", c_int64),
-        ("types", c_void_p),
-        ("items", POINTER(POINTER(_Buffer))),
-    ]
-
-
-class _Attributes(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t),
-        ("extension", c_void_p),
-        ("size", c_int64),
-        ("types", c_void_p),
-        ("names", c_void_p),
-        ("items", POINTER(POINTER(_Scalar))),
-    ]
-
-
-class _ErrorArguments(Structure):
-    _fields_ = [("struct_size", c_size_t), ("extension", c_void_p), ("message", c_char_p), ("code", c_int)]
-
-
-class _Api(Structure):
-    """The beginning of XLA_FFI_Api."""
-
-    _fields_ = [
-        ("struct_size", c_size_t),
-        ("extension", c_void_p),
-        ("version", _Version),
-        ("internal", c_void_p),
-        ("create_error", ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
-    ]
-
-
-class _Frame(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t),
-        ("extension", POINTER(_Extension)),
-        ("api", POINTER(_Api)),
-        ("context", c_void_p),
-        ("stage", c_int),
-        ("arguments", _List),
-        ("results", _List),
-        ("attributes", _Attributes),
-    ]
 
 
 _owners: dict[int, weakref.WeakKeyDictionary[Any, HostFunction]] = {}
@@ -137,7 +93,7 @@ def host_call(
     return out
 
 
-def _array(buffer: _Buffer, *, writable: bool = False) -> np.ndarray:
+def _array(buffer: Any, *, writable: bool = False) -> np.ndarray:
     shape = tuple(buffer.dims[i] for i in range(buffer.rank))
     dtype = np.dtype(_DTYPES[buffer.dtype])
     size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
@@ -147,7 +103,7 @@ def _array(buffer: _Buffer, *, writable: bool = False) -> np.ndarray:
     return array
 
 
-def _execute(frame: _Frame) -> None:
+def _execute(frame: Any) -> None:
     number = frame.attributes.items[0].contents.value[0]
     owner, function = next(iter(_owners.get(number, {}).items()), (None, None))
     if function is None:
@@ -169,7 +125,7 @@ def _handler(pointer: Any) -> int | None:
         _execute(frame)
     except BaseException as error:  # an exception does not cross the C function
         message = f"{type(error).__name__}: {error}".encode()
-        arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
+        arguments = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
         return frame.api.contents.create_error(ctypes.byref(arguments))
     return None
 

@@ -186,12 +186,10 @@ class Football1vs1Params(FootballParams):
 
 
 @record
-class Football2vs2Params(FootballParams):
+class Football2vs2Params(Football1vs1Params):
     """Parameters of Football (2 vs 2)."""
 
     num_agents: Few = 4
-    rewards: FootballMatchRewards = FootballMatchRewards()
-    """Weights of the reward terms."""
 
 
 class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F]):

@@ -27,8 +27,8 @@ _SHIPPED: tuple[tuple[str, str | None], ...] = (
     ("door:Go1RevolvingDoor", "matches:plan_revolving_door"),
     ("wrestling:Go1Wrestling", "matches:plan_wrestling"),
     ("bridge:Go1Bridge", "matches:plan_bridge"),
-    ("football:Go1Football1vs1", "football:plan_1vs1"),
-    ("football:Go1Football2vs2", "football:plan_2vs2"),
+    ("football:Go1Football1vs1", "football:plan_match"),
+    ("football:Go1Football2vs2", "football:plan_match"),
 )
 
 # Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.planners.

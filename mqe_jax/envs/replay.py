@@ -14,7 +14,6 @@ import numpy as np
 
 from mqe_jax import limits
 from mqe_jax.engines import STATE_FIELDS
-from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
@@ -49,22 +48,13 @@ class Recording:
         return make(self.task, impl=impl or self.impl, control=self.control, num_envs=1, **self.params)
 
 
-def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:
-    """Returns the states (T, ...) of one environment before each action (T, A, D), with automatic reset."""
-
-    def advance(state: State, action: jax.Array) -> tuple[State, State]:
-        return autoreset(env, env.step(state, action)), state
-
-    return jax.jit(lambda start, actions: jax.lax.scan(advance, start, actions)[1])(start, actions)
-
-
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of a sequence of states to an .npz file, atomically.
 
     Args:
         file: to write.
         env: the environment.
-        states: of one environment before each action (T, ...), as from `trajectory`.
+        states: of one environment before each action (T, ...).
         actions: (T, A, D).
     """
     starts = np.flatnonzero(np.asarray(states.step) == 0)

@@ -21,7 +21,7 @@ S = TypeVar("S")
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentState:
-    """Fields of every environment's state (`mqe_jax.train.types.EnvState`); a batch has leading axes."""
+    """Fields of every environment's state (`mqe_jax.train.types.VectorEnv`); a batch has leading axes."""
 
     obs: jax.Array
     """The agents' observations (A, O); after an auto-reset, those of the new episode."""

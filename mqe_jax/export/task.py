@@ -26,12 +26,11 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import onnx
 
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.errors import InputError
 from mqe_jax.export.policy import filled, named
-from mqe_jax.export.translate import Function, translate
+from mqe_jax.export.translate import Function
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import Policy
@@ -135,14 +134,6 @@ class TaskFunctions:
     @property
     def _state_inputs(self) -> Shapes:
         return {name: x.shape for name, x in state_arrays(self._start).items()}
-
-    def graphs(self) -> dict[str, onnx.ModelProto]:
-        """Returns the graphs `control` and `judge`; InputError for an operation without translation."""
-        name = self.env.name.replace("-", "_")
-        return {
-            "control": translate(self.control, self.control_inputs, f"{name}_control"),
-            "judge": translate(self.judge, self.judge_inputs, f"{name}_judge"),
-        }
 
 
 def state_arrays(state: State) -> dict[str, jax.Array]:

@@ -42,17 +42,11 @@ def plan_defender(obs: Observation) -> jax.Array:
     return jax.vmap(play)(obs["base"], obs["teammate"])
 
 
-def plan_1vs1(obs: Observation) -> jax.Array:
-    """Returns the robot's action (1, 3) in its own frame."""
-    far_teammate = jnp.full_like(obs["base"], 1e3)
-    opponents = obs["opponents"][:, None, :2]
-    return jax.vmap(_play)(obs["base"], far_teammate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
-
-
-def plan_2vs2(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3) in their team's frame."""
-    opponents = obs["opponents"].reshape(-1, 2, 6)[..., :2]
-    return jax.vmap(_play)(obs["base"], obs["teammate"], opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
+def plan_match(obs: Observation) -> jax.Array:
+    """Returns the actions (T, 3) of a team of one or two robots in their team's frame."""
+    opponents = obs["opponents"].reshape(len(obs["base"]), -1, 6)[..., :2]
+    teammate = obs.get("teammate", jnp.full_like(obs["base"], 1e3))  # far away where there is none
+    return jax.vmap(_play)(obs["base"], teammate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
 def _play(own: jax.Array, teammate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:

@@ -49,38 +49,15 @@ Teams = tuple[tuple[int, ...], ...]
 """Agents of each team; every agent belongs to exactly one."""
 
 
-class EnvState(Protocol):
-    """The fields of a batched environment state that the learner reads; N environments of A agents.
-
-    obs (N, A, O) is the input of the next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the
-    state reached by the step, before any reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool;
-    metrics maps names to (N,), and every name is present from the reset on. Metrics are averaged over steps, except
-    for outcomes of episodes (see `is_outcome`) and the counts `diverged` and `overflow`.
-    """
-
-    @property
-    def obs(self) -> jax.Array: ...
-    @property
-    def privileged_obs(self) -> jax.Array: ...
-    @property
-    def final_obs(self) -> jax.Array: ...
-    @property
-    def final_privileged_obs(self) -> jax.Array: ...
-    @property
-    def reward(self) -> jax.Array: ...
-    @property
-    def terminated(self) -> jax.Array: ...
-    @property
-    def truncated(self) -> jax.Array: ...
-    @property
-    def metrics(self) -> dict[str, jax.Array]: ...
-
-
 class VectorEnv(Protocol):
-    """N environments with automatic reset; `reset` and `step` are pure and may be jitted.
+    """N environments of A agents with automatic reset; `reset` and `step` are pure and may be jitted.
 
-    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the state is any pytree with the fields
-    of `EnvState`. Actions are unbounded samples of the policy; the environment clips them to its range.
+    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the environment clips actions, unbounded
+    samples of the policy, to its range. The state is any pytree with these fields: obs (N, A, O) is the input of the
+    next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the state reached by the step, before any
+    reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool; metrics maps names to (N,), and every
+    name is present from the reset on. Metrics are averaged over steps, except for outcomes of episodes (see
+    `is_outcome`) and the counts `diverged` and `overflow`.
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),

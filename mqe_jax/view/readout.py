@@ -9,30 +9,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mqe_jax.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
 from mqe_jax.viz.geometry import robot_bases, robot_color
-
-COLOURS = {
-    "red": (0.84, 0.27, 0.27),
-    "orange": (0.9, 0.5, 0.15),
-    "yellow": (0.95, 0.85, 0.25),
-    "green": (0.25, 0.68, 0.3),
-    "blue": (0.18, 0.45, 0.84),
-    "purple": (0.5, 0.35, 0.75),
-    "white": (0.95, 0.95, 0.95),
-    "grey": (0.5, 0.5, 0.5),
-    "black": (0.05, 0.05, 0.05),
-}
-
-
-def colour_name(rgb: Sequence[float]) -> str:
-    """Returns the name of the nearest of `COLOURS` to red, green and blue in [0, 1]."""
-    return min(COLOURS, key=lambda name: float(np.sum((np.asarray(COLOURS[name]) - np.asarray(rgb[:3])) ** 2)))
 
 
 def robot_labels(model: mujoco.MjModel) -> list[str]:
-    """Returns `robot 1 (blue)`, ... for all robots of a rendering model."""
-    trunks = robot_bases(model)
-    return [f"robot {i + 1} ({colour_name(robot_color(model, trunk))})" for i, trunk in enumerate(trunks)]
+    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, by the nearest of the agents' colours."""
+    shown = np.array([robot_color(model, trunk) for trunk in robot_bases(model)])
+    apart = np.linalg.norm(shown[:, None] - np.array(ROBOT_COLORS), axis=-1)
+    return [f"robot {i + 1} ({ROBOT_COLOR_NAMES[nearest]})" for i, nearest in enumerate(apart.argmin(axis=1))]
 
 
 def bars(names: Sequence[str], values: Sequence[float]) -> str:

@@ -1,4 +1,4 @@
-"""Free cameras: projection of points, and the camera of a given direction whose image contains them."""
+"""Free cameras, and the one of a given direction whose image contains some points."""
 
 from __future__ import annotations
 
@@ -39,20 +39,12 @@ class Camera:
         return np.array(self.lookat) - self.distance * self.axes[0]
 
 
-def projected(model: mujoco.MjModel, camera: Camera, points: np.ndarray, aspect: float) -> np.ndarray:
-    """Returns the places (P, 2) of points (P, 3), m, in the image, whose edges are at -1 and 1."""
-    forward, right, up = camera.axes
-    offset = points - np.array(camera.lookat)
-    depth = np.maximum(camera.distance + offset @ forward, 1e-6) * _tangent(model)
-    return np.stack([offset @ right / depth / aspect, offset @ up / depth], axis=-1)
-
-
 def fitted(
     model: mujoco.MjModel, corners: np.ndarray, camera: Camera, aspect: float, distances: tuple[float, float]
 ) -> Camera:
     """Returns a camera of the same direction whose image contains and centres the points `corners` (P, 3)."""
     forward, right, up = camera.axes
-    tangent = _tangent(model)
+    tangent = float(np.tan(np.radians(model.vis.global_.fovy) / 2))  # of half the vertical field of view
     lookat, distance = (corners.min(axis=0) + corners.max(axis=0)) / 2, 1.0
     for _ in range(25):  # centre the projection, then adjust the distance
         offset = corners - lookat
@@ -74,8 +66,3 @@ def smoothed(views: Sequence[Camera], width: int) -> list[Camera]:
     means = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
     rows = zip(views, means.tolist(), strict=True)
     return [replace(camera, lookat=(x, y, z), distance=distance) for camera, (x, y, z, distance) in rows]
-
-
-def _tangent(model: mujoco.MjModel) -> float:
-    """Returns the tangent of half the vertical field of view."""
-    return float(np.tan(np.radians(model.vis.global_.fovy) / 2))

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.appearance import GOAL_SITE, HIDDEN_GROUP
-from mqe_jax.viz.framing import Camera, projected
+from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, posed, robot_bases
 from mqe_jax.viz.recording import Episode
 
@@ -34,18 +34,6 @@ def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
     place = data.xpos[objects].mean(axis=0)
     closest = points[np.linalg.norm(points - place, axis=1).argmin()]
     return points[np.linalg.norm(points - closest, axis=1) < _NEAR_GOAL]
-
-
-def in_frame(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera], aspect: float) -> np.ndarray:
-    """Returns which targets' centres, then which goal points, are in the image of each frame (T, targets + P) bool."""
-    data, bodies, goals = mujoco.MjData(model), targets(model, episode), goal_points(model, episode)
-    boxes = body_boxes(model, bodies)
-    rows = []
-    for index, camera in enumerate(views):
-        pose(model, data, episode, index)
-        places = projected(model, camera, np.concatenate([posed(data, bodies, boxes).mean(axis=1), goals]), aspect)
-        rows.append(np.abs(places).max(axis=1) <= 1.0)
-    return np.array(rows)
 
 
 def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> np.ndarray:
@@ -82,12 +70,3 @@ def _struck(
     units = (ways / lengths[:, None]).ravel()
     mujoco.mj_multiRay(model, data, eye, units, groups, 1, -1, geoms, distances, None, len(points), mujoco.mjMAXVAL)
     return np.where(distances < lengths, geoms, -1)
-
-
-def longest(flags: np.ndarray) -> int:
-    """Returns the length of the longest run of true values in any column of `flags` (T, N)."""
-    run, top = np.zeros(flags.shape[1], int), 0
-    for row in flags:
-        run = (run + 1) * row
-        top = max(top, int(run.max(initial=0)))
-    return top
