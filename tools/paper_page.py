@@ -83,11 +83,7 @@ def reduced(png: bytes) -> bytes:
 
 
 def filled(text: str, contents: Mapping[str, str]) -> str:
-    """Returns the text of a page with its sections filled.
-
-    Raises:
-        InputError: if the page lacks a section.
-    """
+    """Returns the text of a page with its sections filled; InputError if the page lacks a section."""
     for name, body in contents.items():
         pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
         text, count = pattern.subn(lambda match, body=body: f"{match[1]}\n{body}\n\n{match[2]}", text)

@@ -127,10 +127,8 @@ def _numbers(point: Mapping[str, Any], names: Sequence[str] | None = None) -> di
 def publish(sweeps: Sequence[Path], target: Path, policies: Sequence[str]) -> list[str]:
     """Adds finished runs to the tables below `target`, and the best policies of their cells that match `policies`.
 
-    Returns the best runs whose policies are in none of the sweeps.
-
-    Raises:
-        InputError: for a sweep without finished runs, or with other results of a run that is published.
+    Returns the best runs whose policies are in none of the sweeps. InputError for a sweep without finished runs, or
+    with other results of a run that is published.
     """
     runs = {(run.cell, run.seed): run for run in read_tables(target)} if (target / CURVES).is_file() else {}
     folders: dict[Key, Path] = {}

@@ -16,47 +16,26 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
-EXTRAS = "render,view,export"
+EXTRAS = "render"
 """Extras that the README's commands need."""
-SHORTER: dict[str, str] = {
-    "tasks": "",
+SHORTER = {
     "train": "--num-envs 8 --rollout-steps 8 --ppo.minibatches 1 --total-steps 128 --impl c",
     "eval": "--episodes 2",
-    "zoo": "",
     "render": "--seconds 1",
-    "tournament": "--episodes 2 -o cup",
-    "view": "--port 8765",
-    "export": "",
-    "bench": "--steps 2 --repeats 1",
 }
 """Flags added to the README's command of each name, so that it takes seconds."""
-WITHOUT = {"sweep", "report", "walk"}
-"""Commands whose line in the README is a pattern: their help is printed."""
 SECONDS = 600
 
 
 def readme_commands(text: str) -> list[list[str]]:
-    """Returns the words of the README's `mqe` commands, shortened; `runs/a` and `runs/b` are named policies.
-
-    Raises:
-        KeyError: for a command that is neither in `SHORTER` nor in `WITHOUT`.
-    """
+    """Returns the words of the README's `mqe` commands, shortened; KeyError for one that is not in `SHORTER`."""
     blocks = re.findall(r"^```bash\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
-    found = [words[1:] for words in lines if words[:1] == ["mqe"]]
-    commands = []
-    for words in found:
-        if words[0] in WITHOUT:
-            commands.append([*words[: 2 if words[0] == "walk" else 1], "--help"])
-        else:
-            commands.append([*words, *SHORTER[words[0]].split()])
-    names = {"runs/a": "idle", "runs/b": "random"}
-    return [[names.get(word) or word for word in words] for words in commands]
+    return [[*words[1:], *SHORTER[words[1]].split()] for words in lines if words[:1] == ["mqe"]]
 
 
 def readme_programs(text: str) -> list[str]:
@@ -123,22 +102,7 @@ def try_readme(programs: Path, folder: Path) -> None:
     for program in readme_programs(text):
         run(programs / "python", "-c", program, folder=folder)
     for words in readme_commands(text):
-        if words[0] == "view":
-            view(programs, words, folder)
-        else:
-            run(programs / "mqe", *words, folder=folder)
-
-
-def view(programs: Path, words: Sequence[str], folder: Path) -> None:
-    """Starts the viewer and ends it as soon as it names its address."""
-    print("$", "mqe", *words, flush=True)
-    command = [str(programs / "mqe"), *words]
-    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
-        assert process.stderr is not None
-        said = next((line for line in process.stderr if "http://" in line), "")
-        process.terminate()
-        if not said or process.wait(30) != 143:
-            raise RuntimeError(f"mqe view said {said!r} and ended with {process.returncode}")
+        run(programs / "mqe", *words, folder=folder)
 
 
 def main() -> int:

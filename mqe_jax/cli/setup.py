@@ -38,11 +38,7 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 
 
 def run_config(target: str) -> Any:
-    """Returns the settings in a run folder or a policy file.
-
-    Raises:
-        InputError: where there are none, or they name no task.
-    """
+    """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
     if target.endswith(".safetensors"):
         return load_policy(target).config
     if not Path(target).is_dir():
@@ -75,9 +71,7 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
 
     In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
     environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
-
-    Raises:
-        InputError: for a task, an opponent or a demonstrator that is not allowed.
+    InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = config.task or "", config.evaluation.episodes, config.opponents
     both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
@@ -178,10 +172,7 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
     """Returns the settings of a file or a shipped name, with the algorithm's preset.
 
     The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks.
-
-    Raises:
-        InputError: for a file or an algorithm that is not allowed.
+    paper/mappo for other tasks. InputError for a file or an algorithm that is not allowed.
     """
     task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:

@@ -46,11 +46,7 @@ def resolve(impl: str = "auto") -> str:
 
 
 def make(model: mujoco.MjModel, *, impl: str = "auto", **options: Any) -> Engine:
-    """Creates an engine by name for a compiled model; the options are those of `Engine`.
-
-    Raises:
-        InputError: as `resolve`.
-    """
+    """Creates an engine by name for a compiled model; the options are those of `Engine`; InputError as `resolve`."""
     return _load(resolve(impl))(model, **options)
 
 

@@ -100,15 +100,19 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
         target = np.array([[params.target_x, params.target_y], [params.target_x, -params.target_y]], np.float32)
         return jnp.linalg.norm(robot_state.position_w[:, :2] - target, axis=-1)
 
+    def through(self, state: State, robot_state: RobotState) -> jax.Array:
+        """Returns which robots are past the gate (2,) bool."""
+        return robot_state.position_w[:, 0] > state.anchors[0, 0] + self.params.past_gate
+
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         return {
-            "success": reward.past(after.robots.position_w[:, 0], after.state.anchors[0, 0], self.params.past_gate),
-            "approach": reward.decrease(self.target_distance(before.robots), self.target_distance(after.robots)),
+            "success": jnp.sum(self.through(after.state, after.robots)).astype(jnp.float32),
+            "approach": jnp.sum(self.target_distance(before.robots) - self.target_distance(after.robots)),
             "crowding": reward.crowding(after.robots.position_w[:, :2]),
             "collision": collision.astype(jnp.float32),
         }
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: both robots are through; `success/one`: at least one is, however the episode ended."""
-        through = robot_state.position_w[:, 0] > state.anchors[0, 0] + self.params.past_gate
+        through = self.through(state, robot_state)
         return {"success": jnp.all(through) & ~failed, "success/one": jnp.any(through)}

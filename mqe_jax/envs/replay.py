@@ -69,11 +69,7 @@ def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, a
 
 @checked(file=PathText)
 def load_recording(file: str | pathlib.Path) -> Recording:
-    """Reads a recording.
-
-    Raises:
-        InputError: if the file is missing, damaged or not a recording.
-    """
+    """Reads a recording; InputError if the file is missing, damaged or not a recording."""
     path = pathlib.Path(file)
     with archive(path, limits.RECORDING_BYTES, "a recording"), np.load(path, allow_pickle=False) as arrays:
         about = parse_json(str(arrays["about"]), "about")

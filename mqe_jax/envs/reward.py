@@ -41,16 +41,6 @@ def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | floa
     return {name: term if getattr(weights, name) else factor * term for name, term in terms.items()}
 
 
-def past(position_x: jax.Array, line_x: jax.Array | float, margin: float = 0.0) -> jax.Array:
-    """Number of entities more than `margin` metres past the line x = `line_x`: (N,) -> ()."""
-    return jnp.sum(position_x > line_x + margin).astype(jnp.float32)
-
-
-def decrease(before: jax.Array, after: jax.Array) -> jax.Array:
-    """Summed decrease of distances over a step: (N,), (N,) -> (), m."""
-    return jnp.sum(before - after)
-
-
 def crowding(position: jax.Array, within: float = 0.5) -> jax.Array:
     """Sum of 1 / d^2 over all ordered pairs of robots at a distance d below `within` m: (A, D) -> ()."""
     count = position.shape[0]

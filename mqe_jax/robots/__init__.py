@@ -13,11 +13,7 @@ ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 
 @checked(name=str)
 def get(name: str) -> Robot:
-    """Returns a robot by name.
-
-    Raises:
-        InputError: for an unknown name, with the nearest known one.
-    """
+    """Returns a robot by name; InputError for an unknown name, with the nearest known one."""
     if name not in ROBOTS:
         raise InputError(f"robot: unknown name {name!r}{nearest(name, ROBOTS)}; allowed: {', '.join(ROBOTS)}")
     return ROBOTS[name]

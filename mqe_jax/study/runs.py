@@ -101,11 +101,7 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def read_curve(path: Path) -> Curve:
-    """Reads the columns of a metrics.csv.
-
-    Raises:
-        InputError: naming the file, if it is missing or malformed.
-    """
+    """Reads the columns of a metrics.csv; InputError naming the file, if it is missing or malformed."""
     if not path.exists():
         raise InputError(f"{path}: no such file; a run folder has one after its first update")
     rows = read_rows(path)
@@ -159,11 +155,7 @@ class Reference:
 
 
 def load_reference(path: Path) -> Reference:
-    """Reads a YAML file with the fields of `Reference`.
-
-    Raises:
-        InputError: naming the file, for invalid content.
-    """
+    """Reads a YAML file with the fields of `Reference`; InputError naming the file, for invalid content."""
     try:
         return build(Reference, load_yaml(path))
     except InputError as error:

@@ -129,12 +129,9 @@ def plan(
 
     Of the sweep's seeds those in `seeds` are trained, or all if it is empty. `config_of(task, algorithm)` gives the
     settings that those of the sweep override, and `check` raises an InputError for settings with which a run could not
-    start: here, before the first cell is trained. Finished runs are left out.
-    The others are trained in separate jobs with and without checkpoints, so that all seeds of a job start from
-    the same step.
-
-    Raises:
-        InputError: for a task, an algorithm, a setting, a pattern or a seed that is not allowed.
+    start: here, before the first cell is trained. Finished runs are left out. The others are trained in separate jobs
+    with and without checkpoints, so that all seeds of a job start from the same step. InputError for a task, an
+    algorithm, a setting, a pattern or a seed that is not allowed.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")

@@ -112,11 +112,9 @@ def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
 def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False) -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
-    With `half`, float16 leaves are allowed where the template has float32, and are converted to it.
-
-    Raises:
-        InputError: in one line naming the file, for a missing, damaged or truncated file, another format or format
-            version, and leaves that are missing, unknown or of another shape or dtype.
+    With `half`, float16 leaves are allowed where the template has float32, and are converted to it. InputError in one
+    line naming the file, for a missing, damaged or truncated file, another format or format version, and leaves that
+    are missing, unknown or of another shape or dtype.
     """
     path = Path(path)
     arrays, metadata = _read(path, kind)

@@ -160,11 +160,7 @@ class EvaluationLog:
 
 
 def read_evaluations(run_dir: Path) -> dict[str, Any]:
-    """Reads a run's evaluations; without the file there are none.
-
-    Raises:
-        InputError: if the file is damaged.
-    """
+    """Reads a run's evaluations; without the file there are none; InputError if the file is damaged."""
     path = run_dir / EVALUATIONS_FILE
     if not path.is_file():
         return {"evaluations": [], "absolute": None}

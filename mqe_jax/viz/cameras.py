@@ -34,11 +34,7 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
 
 
 def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 16 / 9) -> list[Camera]:
-    """Returns the camera of every frame of an episode, for a view of `VIEWS`.
-
-    Raises:
-        InputError: for an unknown view.
-    """
+    """Returns the camera of every frame of an episode, for a view of `VIEWS`; InputError for an unknown view."""
     if view not in VIEWS:
         raise InputError(f"view: unknown name {view!r}{nearest(view, VIEWS)}; allowed: {', '.join(VIEWS)}")
     if view == "scene":
