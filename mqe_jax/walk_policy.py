@@ -42,6 +42,12 @@ OBSERVATION_SIZE = 70
 LATENT_SIZE = 2
 ADAPTATION_SIZES = (HISTORY * OBSERVATION_SIZE, 256, 128, LATENT_SIZE)
 BODY_SIZES = (HISTORY * OBSERVATION_SIZE + LATENT_SIZE, 512, 256, 128, NUM_JOINTS)
+_LAYERS = {
+    f"{part}.{2 * index}": sizes
+    for part, widths in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES))
+    for index, sizes in enumerate(itertools.pairwise(widths))
+}
+"""Inputs and outputs of each linear layer, by name."""
 STEP = 0.02  # s, one policy step
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
@@ -173,27 +179,16 @@ class WalkPolicy(Skill):
 
 def init_params(key: jax.Array) -> Params:
     """Samples initial weights: uniform as in torch's linear layers, the body's last layer scaled by 0.1."""
-    params: Params = {}
-    for part, sizes in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES)):
-        layers = {}
-        for index, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
-            key, w_key, b_key = jax.random.split(key, 3)
-            bound = n_in**-0.5
-            last = part == "body" and index == len(sizes) - 2
-            weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (0.1 if last else 1.0)
-            bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (0.0 if last else 1.0)
-            layers[str(2 * index)] = {"weight": weight, "bias": bias}
-        params[part] = layers
+    params: Params = {"adaptation": {}, "body": {}}
+    for name, (n_in, n_out) in _LAYERS.items():
+        part, layer = name.split(".")
+        key, w_key, b_key = jax.random.split(key, 3)
+        bound = n_in**-0.5
+        last = name == list(_LAYERS)[-1]
+        weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (0.1 if last else 1.0)
+        bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (0.0 if last else 1.0)
+        params[part][layer] = {"weight": weight, "bias": bias}
     return params
-
-
-def _expected_shapes() -> dict[str, tuple[int, ...]]:
-    shapes: dict[str, tuple[int, ...]] = {}
-    for part, sizes in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES)):
-        for index, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
-            shapes[f"{part}.{2 * index}.weight"] = (n_out, n_in)
-            shapes[f"{part}.{2 * index}.bias"] = (n_out,)
-    return shapes
 
 
 def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
@@ -203,9 +198,12 @@ def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
         InputError: for missing names or other shapes; the message starts with `source`.
     """
     params: Params = {"adaptation": {}, "body": {}}
-    for name, shape in _expected_shapes().items():
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layer, (n_in, n_out) in _LAYERS.items():
+        shapes |= {f"{layer}.weight": (n_out, n_in), f"{layer}.bias": (n_out,)}
+    for name, shape in shapes.items():
         if name not in flat:
-            raise InputError(f"walk policy {source}: {name} is missing; expected {', '.join(_expected_shapes())}")
+            raise InputError(f"walk policy {source}: {name} is missing; expected {', '.join(shapes)}")
         if tuple(flat[name].shape) != shape:
             raise InputError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
         part, layer, kind = name.split(".")

@@ -14,7 +14,7 @@ import pytest
 from mqe_jax import make, robots
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.kinematics import foot_positions, knee_positions
+from mqe_jax.robots.index import foot_positions, knee_positions
 from mqe_jax.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track

@@ -20,8 +20,7 @@ from mqe_jax.settings import override
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.types import NetworkMemory
-from mqe_jax.walk.network import WalkNetwork, windows
-from mqe_jax.walk.symmetry import mirror_action, mirror_history, symmetry_loss
+from mqe_jax.walk.network import WalkNetwork, mirror_action, mirror_history, symmetry_loss, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
 from tests.probes import Probe

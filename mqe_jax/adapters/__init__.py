@@ -59,29 +59,22 @@ def task_env(
         overrides: arguments of `mqe_jax.make`.
 
     Returns:
-        A `QuadrupedEnv`, or with an opponent a `TeamEnv`.
-
-    Raises:
-        InputError: from `mqe_jax.make` and `TeamEnv`; for overrides of a given environment; for a time limit below one
-            step.
+        A `QuadrupedEnv`, or with an opponent a `TeamEnv`; InputError as theirs, for overrides of a given environment,
+        and for a time limit below one step.
     """
-    env = _made(task, max_steps, limit, overrides)
-    return env if opponent is None else TeamEnv(env, opponent)
-
-
-def _made(task: str | QuadrupedEnv, max_steps: int | None, limit: str, overrides: dict[str, Any]) -> QuadrupedEnv:
     if isinstance(task, QuadrupedEnv):
         if overrides or max_steps is not None:
             names = ", ".join([*overrides, *([limit] if max_steps is not None else [])])
             raise InputError(f"task: overrides ({names}) need the id of a task, not an environment")
-        return task
-    if max_steps is None:
-        return envs.make(task, **overrides)
-    steps: int = check(limit, max_steps, PositiveInt)
-    if "episode_length" in overrides:
-        raise InputError(f"episode_length: give either this or {limit}, not both")
-    dt = envs.make(task, **overrides).dt
-    return envs.make(task, **overrides, episode_length=steps * dt)
+        env = task
+    else:
+        if max_steps is not None:
+            steps: int = check(limit, max_steps, PositiveInt)
+            if "episode_length" in overrides:
+                raise InputError(f"episode_length: give either this or {limit}, not both")
+            overrides["episode_length"] = steps * envs.make(task, **overrides).dt
+        env = envs.make(task, **overrides)
+    return env if opponent is None else TeamEnv(env, opponent)
 
 
 def agent_names(env: TaskEnv) -> list[str]:

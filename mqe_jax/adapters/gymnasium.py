@@ -55,13 +55,10 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Creates the environment.
+        """Creates the environment of a task's id, or adapts a given one.
 
-        Args:
-            task: id, or an environment.
-            render_mode: None or 'rgb_array'.
-            render_size: width and height, pixels.
-            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
+        `render_mode` is None or 'rgb_array', `render_size` width and height, pixels; `overrides` are `opponent` of
+        `task_env`, and arguments of `mqe_jax.make`.
         """
         self.render_mode = render_mode
         self.env = task_env(task, **overrides)
@@ -106,7 +103,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Creates the environments.
+        """Creates the environments; other arguments as those of `SingleEnv`.
 
         Args:
             task: id, or an environment.
@@ -114,9 +111,6 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             autoreset_mode: Gymnasium's convention for environments whose episodes have ended: NEXT_STEP (Gymnasium's
                 default), SAME_STEP, which stores the last observation in `infos["final_obs"]`, or DISABLED.
             max_episode_steps: time limit, instead of the task's.
-            render_mode: None or 'rgb_array'.
-            render_size: width and height, pixels.
-            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
         """
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)

@@ -89,13 +89,8 @@ class HostEnvs:
     ) -> np.ndarray:
         """Resets the environments of the mask (N,) bool, all by default; returns observations (N, A, O).
 
-        Args:
-            seeds: one per environment; None continues the PRNG stream of the state.
-            generator: samples the seeds that are None at the first reset.
-            mask: environments to reset.
-
-        Raises:
-            InputError: for a seed outside [0, 2^32).
+        A seed of None continues the PRNG stream of the environment's state; at the first reset it is sampled by the
+        generator. InputError for a seed outside [0, 2^32).
         """
         if self.state is None:
             seeds = [int(generator.integers(2**31)) if seed is None else seed for seed in seeds]
@@ -110,13 +105,9 @@ class HostEnvs:
     def step(self, action: np.ndarray, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
         """Steps all environments with actions (N, A, action_size) in [-1, 1], clipped to it.
 
-        Args:
-            action: finite.
-            reset: whether an environment is reset in the call that ends its episode (SAME_STEP), in the next call,
-                which ignores its action and returns a zero reward (NEXT_STEP), or not at all (DISABLED).
-
-        Raises:
-            InputError: for actions of another shape or not finite; before the first reset.
+        An environment is reset in the call that ends its episode (SAME_STEP), in the next call, which ignores its
+        action and returns a zero reward (NEXT_STEP), or not at all (DISABLED). InputError for actions of another shape
+        or not finite, and before the first reset.
         """
         if self.state is None:
             raise InputError("step: reset the environment first")

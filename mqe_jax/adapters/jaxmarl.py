@@ -64,13 +64,10 @@ class Env(MultiAgentEnv):
     """The action of each integer (1 + 2 action_size, action_size); None without discrete actions."""
 
     def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
-        """Creates the environment.
+        """Creates the environment of a task's id, or adapts a given one; `overrides` are those of `task_env`.
 
-        Args:
-            task: id, or an environment.
-            discrete: whether actions are integers, as JaxMARL's MAPPO and Q-learning need: 0 is the zero action,
-                2 i + 1 and 2 i + 2 are +1 and -1 in dimension i, zero in the others.
-            overrides: `opponent` of `task_env`, and arguments of `mqe_jax.make`.
+        With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need: 0 is the zero action, 2 i + 1 and
+        2 i + 2 are +1 and -1 in dimension i, zero in the others.
         """
         self.env = task_env(task, **overrides)
         super().__init__(self.env.num_agents)

@@ -45,14 +45,10 @@ class TeamEnv:
     """Number of agents of a team T."""
 
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
-        """Creates the environment.
+        """Creates the environment; `opponent` is what `mqe_jax.load_policy` accepts, or a policy.
 
-        Args:
-            match: a task with two teams.
-            opponent: what `mqe_jax.load_policy` accepts, or a policy; one that samples its actions does so here.
-
-        Raises:
-            InputError: for a task that is not a match, an opponent that cannot be read, or one of another task.
+        A policy that samples its actions does so here. InputError for a task that is not a match, an opponent that
+        cannot be read, or one of another task.
         """
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
@@ -115,8 +111,7 @@ class TeamEnv:
     def step(self, state: State, action: jax.Array) -> TeamState:
         """Advances by one environment step with the actions of team 0 (T, action_size); the opponent acts for team 1.
 
-        Raises:
-            InputError: for actions of another shape, and as `QuadrupedEnv.step`.
+        InputError for actions of another shape, and as `QuadrupedEnv.step`.
         """
         shape = (self.num_agents, self.match.action_size)
         if jnp.shape(action) != shape:

@@ -32,13 +32,8 @@ class PrivilegedObservation:
 
     Physics parameters are included even if they are not randomised, so that the layout does not depend on the ranges.
 
-    Args:
-        robot: robot type shared by all robots.
-        model: compiled model.
-        index: index tables of the robots.
-        num_anchors: G.
-        clock_size: length of the clock of a robot's skill; 0 without a skill.
-        contact_forces: whether to include contact forces on trunks and feet; requires the scene's foot sensors.
+    `clock_size` is the length of the clock of a robot's skill, 0 without one; `contact_forces` adds those on trunks and
+    feet, which requires the scene's foot sensors.
     """
 
     layout: ObservationLayout

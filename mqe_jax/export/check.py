@@ -11,7 +11,7 @@ import numpy as np
 import onnx
 
 from mqe_jax.errors import InputError
-from mqe_jax.export.policy import input_shapes, policy_step, to_onnx
+from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -63,9 +63,7 @@ def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]
 
     @jax.jit
     def advance(state: Any, memory: dict[str, Any]) -> tuple[Any, Any, Any]:
-        now = env.read(state.data)
-        sensed = {"gravity": now.projected_gravity, "joint_position": now.joint_position}
-        sensed |= {"joint_velocity": now.joint_velocity, "obs": state.obs}
+        sensed = {"obs": state.obs, **dict(zip(SENSED, env.read(state.data).proprioception, strict=True))}
         inputs = {name: x[: policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
         action = jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"])
@@ -73,8 +71,7 @@ def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]
 
     @jax.jit
     def start(key: jax.Array) -> tuple[Any, Any]:
-        sensed = ("obs", "gravity", "joint_position", "joint_velocity")
-        return env.reset(key), {name: jnp.zeros(s) for name, s in shapes.items() if name not in sensed}
+        return env.reset(key), {name: jnp.zeros(s) for name, s in shapes.items() if name not in ("obs", *SENSED)}
 
     rows: list[tuple[Any, Any]] = []
     state, memory = start(jax.random.PRNGKey(0))

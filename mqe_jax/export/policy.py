@@ -32,6 +32,9 @@ from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import TrainedPolicy
 
+SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
+"""Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
+
 
 def to_onnx(policy: TrainedPolicy, env: Any) -> onnx.ModelProto:
     """Returns the graph of a policy on its task, which defines control mode, robot and walk policy.
@@ -48,9 +51,8 @@ def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
-        robots |= {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
         skill = env.controller.skill
-        robots |= {name: x.shape for name, x in named(skill.name, skill.init_memory()).items()}
+        robots |= SENSED | {name: x.shape for name, x in named(skill.name, skill.init_memory()).items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
     return shapes | {name: x.shape for name, x in named("memory", policy.initial_memory()).items()}
 
@@ -65,7 +67,7 @@ def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]
         return outputs | {"joint_target": env.robot.joint_targets(action, env.params.position_scale)}
     controller, skill = env.controller, env.controller.skill
     commands = controller.skill_commands(action)
-    sensed = Proprioception(*(inputs[name] for name in ("gravity", "joint_position", "joint_velocity")))
+    sensed = Proprioception(*(inputs[name] for name in SENSED))
     act = jax.vmap(functools.partial(skill.targets, controller.skill_params))
     target, memory = act(filled(skill.name, skill.init_memory(), inputs), commands, sensed)
     return outputs | {"commands": commands, "joint_target": target} | named(f"next_{skill.name}", memory)

@@ -29,10 +29,9 @@ import jax.numpy as jnp
 
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.errors import InputError
-from mqe_jax.export.policy import filled, named
+from mqe_jax.export.policy import SENSED, filled, named
 from mqe_jax.export.translate import Function
 from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.robot import NUM_JOINTS
 from mqe_jax.train.policy import Policy
 
 PHYSICS = ("qpos", "qvel", "sensordata")
@@ -91,7 +90,7 @@ class TaskFunctions:
         action = jnp.where(inputs["driven"][:, None] > 0.5, inputs["drive"], action)
         commands, npcs = env.controller.skill_commands(action), env.npc_commands(state, robots)
         commands = commands if npcs is None else jnp.concatenate([commands, npcs])
-        outputs = {"command": commands, **_sensed(robots.proprioception)}
+        outputs = {"command": commands, **dict(zip(SENSED, robots.proprioception, strict=True))}
         with normal_numbers(inputs.get("noise")):
             data = env.step_npcs(state.data, robots, state.key)
         if data is not state.data:
@@ -147,16 +146,15 @@ def skill_function(env: Any) -> tuple[Function, Shapes]:
     """Returns the skill of a task's robots as a function of one robot, and the shapes of its inputs."""
     controller, skill = env.controller, env.controller.skill
     memory = named(skill.name, skill.init_memory())
-    shapes = {"command": (len(skill.commands),), "gravity": (3,)}
-    shapes |= {"joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
+    shapes = {"command": (len(skill.commands),), **SENSED, **{name: x.shape for name, x in memory.items()}}
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
-        sensed = Proprioception(*(inputs[name] for name in ("gravity", "joint_position", "joint_velocity")))
+        sensed = Proprioception(*(inputs[name] for name in SENSED))
         state = filled(skill.name, skill.init_memory(), inputs)
         target, state = skill.targets(controller.skill_params, state, inputs["command"], sensed)
         return {"joint_target": target} | named(f"next_{skill.name}", state)
 
-    return act, shapes | {name: x.shape for name, x in memory.items()}
+    return act, shapes
 
 
 def policy_function(policy: Policy, observation_size: int) -> tuple[Function, Shapes]:
@@ -202,7 +200,3 @@ def _noise_size(function: Callable[[], Any]) -> int:
     with normal_numbers(None, sizes.append):
         jax.eval_shape(function)
     return sizes[-1]
-
-
-def _sensed(sensed: Proprioception) -> dict[str, jax.Array]:
-    return dict(zip(("gravity", "joint_position", "joint_velocity"), sensed, strict=True))

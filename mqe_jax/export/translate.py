@@ -43,14 +43,8 @@ def translate(
 ) -> onnx.ModelProto:
     """Returns the graph of a function of float32 arrays, mapped over a leading axis N.
 
-    Args:
-        function: traceable by JAX; arrays that it closes over become constants.
-        inputs: shapes of its inputs by name, without N.
-        name: of the graph.
-        properties: metadata of the model.
-
-    Raises:
-        InputError: for an operation that jax2onnx cannot translate.
+    Arrays that the function closes over become constants; `inputs` are the shapes of its inputs by name, without N, and
+    `properties` the metadata of the model. InputError for an operation that jax2onnx cannot translate.
     """
     # Traced here, as jax2onnx replaces functions of jax.numpy while it traces, some of which fail under `vmap`.
     specs = {key: jax.ShapeDtypeStruct(tuple(shape), np.float32) for key, shape in inputs.items()}

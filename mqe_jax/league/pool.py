@@ -64,12 +64,8 @@ def chances(pool: Pool, uniform: bool) -> jax.Array:
 def add(pool: Pool, arrays: PyTree, update: jax.Array, rating: jax.Array, busy: jax.Array) -> Pool:
     """Returns the pool with a new member in a free place, or in that of the member beaten most.
 
-    Args:
-        pool: the pool.
-        arrays: of the new member.
-        update: after which it becomes one ().
-        rating: its rating ().
-        busy: members that are being played, who stay (M,) bool; at least one is not.
+    It has these arrays and this rating () after an update (). Members that are `busy` (M,) bool are being played and
+    stay; at least one is not.
     """
     worth = jnp.where(busy, -1.0, jnp.where(pool.born < 0, 2.0, win_rate(pool)))
     place = jnp.argmax(worth)

@@ -37,11 +37,7 @@ class Ratings(NamedTuple):
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `OUTCOMES`.
 
-    Args:
-        matches: N environments, in K equal blocks with one opponent each.
-        policy: of team 0.
-        opponents: the K opponents, as team 1.
-        key: random key.
+    The environments are in K equal blocks, with one of the K opponents as team 1 each.
     """
     env = Versus(matches, opponents)
 

@@ -52,12 +52,7 @@ def plan_match(obs: Observation) -> jax.Array:
 def _play(own: jax.Array, teammate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
     """Returns one robot's action (3,): the nearer of two attacks the ball, the other supports from behind it.
 
-    Args:
-        own: base information (6,).
-        teammate: base information (6,), of the teammate.
-        opponents: positions (K, 2), m.
-        ball: position (2,), m.
-        velocity: of the ball (2,), m/s.
+    `own` and `teammate` are base information (6,), the others as for `_attack`.
     """
     attack, way = _attack(own, opponents, ball, velocity, _GOAL_AIMS)
     ball = ball + _LEAD * velocity

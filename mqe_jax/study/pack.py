@@ -31,16 +31,8 @@ _TRIES = 3  # to read the newest checkpoint, which a training may replace meanwh
 def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) -> list[Path]:
     """Packs sweeps into files `part0.tar.gz`, `part1.tar.gz`, ... of the folder `output`; returns the files.
 
-    Runs may be in training meanwhile. In the files a sweep has the name of its folder.
-
-    Args:
-        folders: of the sweeps; their names differ.
-        output: folder of the files.
-        parts: number of files, at most.
-        megabytes: size of a file, MiB, at most.
-
-    Raises:
-        InputError: for a folder without a run, or where the runs do not fit.
+    Runs may be in training meanwhile. In the files a sweep has the name of its folder; these names differ. There are at
+    most `parts` files, of at most so many MiB each. InputError for a folder without a run, or where runs do not fit.
     """
     if len({folder.resolve().name for folder in folders}) < len(folders):
         fail("folder", [str(folder) for folder in folders], "folders of different names")

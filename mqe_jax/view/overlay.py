@@ -88,14 +88,8 @@ def contact_arrows(
 ) -> np.ndarray:
     """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point, and its force as MuJoCo computes it.
 
-    250 N are one metre; arrows are not longer.
-
-    Args:
-        model: with the actuators of the physics.
-        data: workspace.
-        frame: one pose.
-        qvel: velocities (nv,) in this pose.
-        ctrl: actuator targets (nu,).
+    250 N are one metre; arrows are not longer. The model has the physics' actuators; `data` is a workspace, `frame` one
+    pose, with velocities (nv,) and actuator targets (nu,).
     """
     pose(model, data, frame, 0)
     data.qvel[:], data.ctrl[:] = qvel, ctrl

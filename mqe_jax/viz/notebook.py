@@ -32,16 +32,6 @@ def clip(env: Any, episode: Episode, size: tuple[int, int] = (480, 270), fps: fl
 def play(
     env: Any, act: Act, memory: Any = (), *, episodes: int = 1, seconds: float = 20.0, seed: int = 0, **options: Any
 ) -> Any:
-    """Runs episodes under a batched policy and returns the best one as an inline clip.
-
-    Args:
-        env: the task.
-        act: the policy, batched over the episodes.
-        memory: initial recurrent state of the policy, batched likewise.
-        episodes: number of environments.
-        seconds: time limit of an episode.
-        seed: random seed.
-        options: `size` and `fps` of `clip`.
-    """
+    """Runs episodes under a batched policy, as `record`, and returns the best one as `clip`, with its options."""
     recorded = record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
     return clip(env, best(recorded), **options)

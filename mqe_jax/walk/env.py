@@ -20,8 +20,7 @@ import numpy as np
 from mqe_jax import engines, walk_policy
 from mqe_jax.actuators import Actuators
 from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
-from mqe_jax.robots.index import Proprioception, RobotState, read_robots
-from mqe_jax.robots.kinematics import foot_positions
+from mqe_jax.robots.index import Proprioception, RobotState, foot_positions, read_robots
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
@@ -86,7 +85,7 @@ class WalkEnv:
 
     def with_num_envs(self, num_envs: int) -> WalkEnv:
         """Returns an environment whose Warp buffers are sized for `num_envs` environments."""
-        if self.physics.impl != "warp" or self.physics.num_envs >= num_envs:
+        if self.physics.holds(num_envs):
             return self
         return WalkEnv(self.robot, self.task, impl=self.physics.impl, num_envs=num_envs)
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from mqe_jax import walk_policy
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.kinematics import foot_positions
+from mqe_jax.robots.index import Proprioception, foot_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
 from mqe_jax.walk.env import WalkEnv, heading_velocity

@@ -4,6 +4,10 @@ The memory is the last 29 observations (29 x 70 numbers). The trainer stores it 
 and `evaluate` builds the windows of the chunk's steps. The body receives the adaptation network's output without
 gradient; that network is trained by regression on `LATENT_TARGET`.
 
+The left-right symmetry of a quadruped is a loss: a mirrored observation deserves the mirrored action. Mirroring
+exchanges left and right legs and reverses y, roll, yaw and the hip joints. The parameters of the four gaits stay:
+exchanging a gait's left and right feet shifts its phase, which the clock shows.
+
 Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
 """
 
@@ -11,15 +15,16 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax import robots, walk_policy
 from mqe_jax.limits import Horizon, NonNegative
+from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 from mqe_jax.settings import FileName, fail
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
-from mqe_jax.walk.symmetry import symmetry_loss
 from mqe_jax.walk.task import LATENT_TARGET
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
@@ -64,6 +69,49 @@ def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array) -> jax.Array
     alive = of_row[rows] == episode[:, None]
     window = jnp.concatenate([before, obs])[rows] * alive[..., None]
     return jnp.swapaxes(window, 1, 2).reshape(steps, count, -1)
+
+
+_FEET = np.array([1, 0, 3, 2])
+
+
+def _observation() -> tuple[np.ndarray, np.ndarray]:
+    """Returns source (70,) and sign (70,) of each number of a mirrored observation."""
+    signs = np.array([command.mirror for command in walk_policy.COMMANDS], np.float32)
+    blocks: list[tuple[np.ndarray, np.ndarray]] = [
+        (np.arange(3), np.array([1.0, -1.0, 1.0], np.float32)),  # gravity
+        (np.arange(len(signs)), signs),
+        *[(MIRRORED_JOINTS, MIRRORED_SIGNS)] * 4,  # position, velocity, last action, the one before
+        (_FEET, np.ones(4, np.float32)),  # clock
+    ]
+    starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
+    source = np.concatenate([source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)])
+    return source, np.concatenate([sign for _, sign in blocks])
+
+
+_SOURCE, _SIGN = _observation()
+
+
+def mirror_history(flat: jax.Array) -> jax.Array:
+    """Mirrors flattened histories (..., T x 70)."""
+    return (flat.reshape(*flat.shape[:-1], -1, OBSERVATION_SIZE)[..., _SOURCE] * _SIGN).reshape(flat.shape)
+
+
+def mirror_action(action: jax.Array) -> jax.Array:
+    """Mirrors actions (..., 12)."""
+    return action[..., MIRRORED_JOINTS] * MIRRORED_SIGNS
+
+
+def symmetry_loss(
+    params: walk_policy.Params, flat: jax.Array, mean: jax.Array, *, precision: str = "highest"
+) -> jax.Array:
+    """Returns the mean square difference () between actions of mirrored histories and mirrored actions.
+
+    `flat` are histories (B, 2100) and `mean` their actions (B, 12); `precision` is that of matrix products.
+    """
+    mirrored = mirror_history(flat)
+    latent = jax.lax.stop_gradient(walk_policy.infer_latent(params, mirrored, precision=precision))
+    other = walk_policy.infer_action(params, mirrored, latent, precision=precision)
+    return jnp.mean(jnp.square(other - mirror_action(mean)))
 
 
 def _build(settings: WalkNetwork, dims: EnvDims) -> Network:

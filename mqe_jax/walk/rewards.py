@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import walk_policy
-from mqe_jax.robots.index import RobotState
-from mqe_jax.robots.kinematics import foot_positions, knee_positions
+from mqe_jax.robots.index import RobotState, foot_positions, knee_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.settings import record

@@ -41,17 +41,7 @@ def train_walk(
 ) -> TrainState:
     """Trains walk weights and writes them to walk.safetensors (float16) in the run folder, at every checkpoint.
 
-    Args:
-        robot: the robot.
-        run_dir: run folder, as that of `mqe_jax.train.runner.train`.
-        config: settings, such as `WALK`.
-        task: parameters of the walking task; default: `WalkTask()`.
-        impl: engine.
-        resume: continue from the newest checkpoint.
-
-    Raises:
-        InputError: as `train`.
-        NonFiniteError: as `train`.
+    `config` are settings such as `WALK`; run folder, resuming and errors are those of `mqe_jax.train.runner.train`.
     """
     if config.opponents:
         fail("opponents", list(config.opponents), "empty: walking is not a match")
