@@ -63,10 +63,8 @@ def register_planner(task: str, name: str, planner: Planner | str) -> None:
 def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
-    Usable as a class decorator for a task without a scripted policy.
-
-    Raises:
-        InputError: if the class has no name, or another class is registered under it.
+    Usable as a class decorator for a task without a scripted policy. InputError if the class has no name, or another
+    class is registered under it.
     """
     if not task.name:
         raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")

@@ -295,11 +295,7 @@ class Robot:
         return jnp.asarray(self.default_joints) + scale * self.action_scale * action
 
     def shapes(self, contacts: str = "full") -> tuple[CollisionShape, ...]:
-        """Returns the collision shapes of a set, one of `CONTACTS`.
-
-        Raises:
-            InputError: for an unknown set.
-        """
+        """Returns the collision shapes of a set, one of `CONTACTS`; InputError for an unknown set."""
         if contacts not in CONTACTS:
             raise InputError(f"contacts: unknown set {contacts!r}; allowed: {', '.join(CONTACTS)}")
         return tuple(shape for shape in self.collision if shape.part in CONTACTS[contacts])

@@ -39,26 +39,20 @@ class Scenario:
     """Sustained force along and to the left of the heading, N."""
     push: float = 0.0
     """Instantaneous change of velocity every 5 s, m/s."""
-    meaning: str = ""
-    """Description in one line."""
 
 
 SCENARIOS = {
-    "flat": Scenario(meaning="random commands on flat ground"),
-    "pushes": Scenario(push=0.5, meaning="the same with pushes of 0.5 m/s every 5 s"),
-    "slope_up": Scenario(velocity=(1.0, 0.0, 0.0), slope=0.25, meaning="vx 1.0 up a slope of 0.25 rad"),
-    "slope_down": Scenario(velocity=(1.0, 0.0, 0.0), slope=-0.25, meaning="vx 1.0 down a slope of 0.25 rad"),
-    "stand": Scenario(duration=11.0, velocity=(0.0, 0.0, 0.0), meaning="zero command"),
-    "force_against": Scenario(
-        velocity=(0.5, 0.0, 0.0), force=(-30.0, 0.0), meaning="vx 0.5 under an opposing force of 30 N"
-    ),
-    "force_across": Scenario(
-        velocity=(0.5, 0.0, 0.0), force=(0.0, 30.0), meaning="vx 0.5 under a lateral force of 30 N"
-    ),
-    "trot": Scenario(velocity=(0.5, 0.0, 0.0), meaning="vx 0.5, trot at 3 Hz"),
-    "pace": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", meaning="vx 0.5, pace at 3 Hz"),
-    "trot_slow": Scenario(velocity=(0.5, 0.0, 0.0), frequency=2.0, meaning="vx 0.5, trot at 2 Hz"),
-    "pace_fast": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", frequency=4.0, meaning="vx 0.5, pace at 4 Hz"),
+    "flat": Scenario(),
+    "pushes": Scenario(push=0.5),
+    "slope_up": Scenario(velocity=(1.0, 0.0, 0.0), slope=0.25),
+    "slope_down": Scenario(velocity=(1.0, 0.0, 0.0), slope=-0.25),
+    "stand": Scenario(duration=11.0, velocity=(0.0, 0.0, 0.0)),
+    "force_against": Scenario(velocity=(0.5, 0.0, 0.0), force=(-30.0, 0.0)),
+    "force_across": Scenario(velocity=(0.5, 0.0, 0.0), force=(0.0, 30.0)),
+    "trot": Scenario(velocity=(0.5, 0.0, 0.0)),
+    "pace": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace"),
+    "trot_slow": Scenario(velocity=(0.5, 0.0, 0.0), frequency=2.0),
+    "pace_fast": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", frequency=4.0),
 }
 
 
