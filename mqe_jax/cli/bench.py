@@ -85,7 +85,7 @@ def bench(
     whole, bare = programs(env, vector_env, steps, lambda state: jnp.sum(state.metrics["overflow"]))
     count, state = vector_env.num_envs, jax.block_until_ready(jax.jit(vector_env.reset)(key))
     walk = jax.jit(lambda carry: whole(carry[0]))
-    first, full_s, (_, overflow) = timed(walk, ((state, key), jnp.zeros(())), repeats)
+    first, full_s, (_, overflow) = timed(walk, ((state, key), jnp.zeros(steps)), repeats)
     _, bare_s, _ = timed(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
     full_rate, bare_rate = count * steps / full_s, count * steps / bare_s
     return {
