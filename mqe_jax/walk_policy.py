@@ -13,7 +13,8 @@ A feed-forward network takes as input the last 30 observations of 70 numbers:
 | clock | 4 | sine of each foot's phase, FL FR RL RR |
 
 adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives the action, clipped to +-10;
-the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32.
+the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32; in
+an environment's step in TF32 on an NVIDIA GPU.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ _LAYERS = {
 STEP = 0.02  # s, one policy step
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
+PRECISION = "tensorfloat32"  # of the networks' matrix products in an environment's step; float32 on a CPU
 
 Params = dict[str, dict[str, dict[str, jax.Array]]]
 
@@ -164,7 +166,8 @@ class WalkPolicy(Skill):
         observation = observe(self.robot, memory, command, proprioception)
         history = jnp.concatenate([memory.history[1:], observation[None]])
         flat = history.reshape(-1)
-        action = jnp.clip(infer_action(params, flat, infer_latent(params, flat)), -ACTION_CLIP, ACTION_CLIP)
+        latent = infer_latent(params, flat, precision=PRECISION)
+        action = jnp.clip(infer_action(params, flat, latent, precision=PRECISION), -ACTION_CLIP, ACTION_CLIP)
         gait = advance_gait(memory.gait, command)
         return self.robot.joint_targets(action), WalkMemory(history, action, memory.action, gait)
 

@@ -23,6 +23,8 @@ class MjxEngine(Engine):
 
     mjx_model: mjx.Model
     """The model on the device."""
+    unroll = 1
+    """Physics steps in one iteration of the loop over them; more compile longer."""
 
     @abc.abstractmethod
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
@@ -46,7 +48,8 @@ class MjxEngine(Engine):
             data, overflow = self.physics_step(*self._driven(model, self._clamped(carry[0]), ctrl))
             return (data, carry[1] | overflow), None
 
-        data, overflow = jax.lax.scan(substep, (data, jnp.zeros((), bool)), None, num_substeps)[0]
+        carry = data, jnp.zeros((), bool)
+        data, overflow = jax.lax.scan(substep, carry, None, num_substeps, unroll=self.unroll)[0]
         return self._clamped(data.replace(ctrl=ctrl)), overflow
 
     def _driven(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
@@ -106,6 +109,7 @@ class WarpEngine(MjxEngine):
     """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size."""
 
     impl = "warp"
+    unroll = 4
 
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
