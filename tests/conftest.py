@@ -1,14 +1,17 @@
 """Shared by all tests: the CPU, a compilation cache, skip reasons of GPU and soak tests, and a fake task for `mqe`."""
 
+import functools
+import gc
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 # Before the first import of jax; existing environment variables take precedence.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import pytest
 
@@ -26,6 +29,7 @@ def _soak_requested(config: pytest.Config) -> bool:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Disables XLA optimisation on the CPU, also in subprocesses; an existing XLA_FLAGS takes precedence."""
+    gc.set_threshold(50_000, 20, 50)  # tracing makes objects that stay: looking for garbage takes a third of its time
     given = os.environ.get("XLA_FLAGS", "")
     if os.environ["JAX_PLATFORMS"] == "cpu" and not _soak_requested(config) and UNOPTIMISED not in given:
         os.environ["XLA_FLAGS"] = f"{UNOPTIMISED} {given}".strip()
@@ -72,3 +76,26 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         return (fake_env.make_env if task == "fake" else real)(task, *arguments, **named)
 
     monkeypatch.setattr(setup, "make_env", make_env)
+
+
+@pytest.fixture(scope="module")
+def shared_programs() -> Iterator[None]:
+    """Trainings of one environment with the same settings share their learner and its compiled programs."""
+    from mqe_jax.train import runner
+    from mqe_jax.train.seeds import Seeds
+
+    learners, make_learner = {}, runner.make_learner
+
+    def shared_learner(env: Any, config: Any, trace: Any = None) -> Any:
+        key = env, repr(config), trace
+        if key not in learners:
+            learners[key] = make_learner(env, config, trace)
+        return learners[key]
+
+    class SharedSeeds(Seeds):
+        map = functools.cache(Seeds.map)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "make_learner", shared_learner)
+        patch.setattr(runner, "Seeds", functools.cache(SharedSeeds))
+        yield

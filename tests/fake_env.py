@@ -5,6 +5,7 @@ Its `mj_model` has two jointed boxes that rendering treats as robots, between a 
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -85,13 +86,8 @@ class FakeEnv:
     def reset(self, key: jax.Array) -> FakeState:
         model, false = self.mj_model, jnp.zeros((), bool)
         mocap = np.flatnonzero(model.body_mocapid >= 0)
-        data = FakeData(
-            jnp.asarray(model.qpos0, jnp.float32),
-            jnp.asarray(model.body_pos[mocap], jnp.float32),
-            jnp.asarray(model.body_quat[mocap], jnp.float32),
-            jnp.zeros(model.nu),
-            jnp.zeros(model.nv),
-        )
+        start = (jnp.asarray(x, jnp.float32) for x in (model.qpos0, model.body_pos[mocap], model.body_quat[mocap]))
+        data = FakeData(*start, jnp.zeros(model.nu), jnp.zeros(model.nv))
         zero = jnp.zeros(())
         metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
         metrics["overflow"] = zero
@@ -101,7 +97,6 @@ class FakeEnv:
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
         move = 0.1 * jnp.clip(action[:, 0], -1.0, 1.0)
         qpos = state.data.qpos.at[self.robot_x].add(move)
-        data = FakeData(qpos, state.data.mocap_pos, state.data.mocap_quat, state.data.ctrl, state.data.qvel)
         obs = qpos[self.robot_x][:, None]
         total = move.sum()
         metrics = {
@@ -111,11 +106,10 @@ class FakeEnv:
             "diverged": jnp.zeros(()),
             "overflow": (qpos[0] > self.overflow_x).astype(jnp.float32),
         }
-        end = state.step >= 9
-        reward = jnp.full(2, total)
-        return FakeState(
-            data, obs, obs[:, 0], obs, obs[:, 0], reward, ~end & end, end, metrics, state.key, state.step + 1
-        )
+        end, data = state.step >= 9, dataclasses.replace(state.data, qpos=qpos)
+        seen = {"obs": obs, "privileged_obs": obs[:, 0], "final_obs": obs, "final_privileged_obs": obs[:, 0]}
+        reward, step = jnp.full(2, total), state.step + 1
+        return dataclasses.replace(state, data=data, **seen, reward=reward, truncated=end, metrics=metrics, step=step)
 
 
 class FakeVectorEnv:
@@ -139,19 +133,7 @@ class FakeVectorEnv:
             data = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh.data, state.data)
             obs = jnp.where(done, fresh.obs, state.obs)
             step = jnp.where(done, 0, state.step)
-            return FakeState(
-                data,
-                obs,
-                obs[:, 0],
-                state.final_obs,
-                state.final_privileged_obs,
-                state.reward,
-                state.terminated,
-                state.truncated,
-                state.metrics,
-                state.key,
-                step,
-            )
+            return dataclasses.replace(state, data=data, obs=obs, privileged_obs=obs[:, 0], step=step)
 
         return jax.vmap(one)(state, action)
 

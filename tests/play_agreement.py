@@ -23,7 +23,6 @@ from mqe_jax.export.site import Entry, entries
 from mqe_jax.export.task import TaskFunctions, normal_numbers, state_arrays
 from mqe_jax.policies import all_agents
 
-CHECK = Path(__file__).with_name("play_check.mjs")
 STEPS = (1, 20)
 """Environment steps after which states are compared."""
 
@@ -57,7 +56,7 @@ def record(entry: Entry, steps: int, seed: int = 0, change: Any = lambda state, 
 
 
 def run_page(folder: Path, task: str, rollouts: list[Rollout], episodes: int) -> dict[str, Any]:
-    """Returns what play_check.mjs prints of rollouts and of episodes of the page's own."""
+    """Returns what `PAGE` prints of rollouts and of episodes of the page's own."""
     plain = []
     for rollout in rollouts:
         first = rollout["states"][0]
@@ -65,7 +64,9 @@ def run_page(folder: Path, task: str, rollouts: list[Rollout], episodes: int) ->
         start = {name: np.ravel(value).tolist() for name, value in start.items()}
         plain.append({"start": start} | {name: np.stack(rollout[name]).tolist() for name in ("actions", "noise")})
     given = json.dumps({"task": task, "rollouts": plain, "episodes": list(range(episodes))})
-    done = subprocess.run(["node", CHECK, folder], input=given, capture_output=True, text=True)
+    done = subprocess.run(
+        ["node", "--input-type=module", "-e", PAGE, folder], input=given, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -104,6 +105,57 @@ def measure(folder: Path, entry: Entry, count: int, episodes: int) -> dict[str, 
         report["outcome"] = {name: round(float(np.mean([row[name] for row in outcomes])), 4) for name in names}
         report["times_real_time"] = round(found["steps_per_second"] * entry.env.dt, 1)
     return report
+
+
+PAGE = """
+import fs from 'node:fs';
+import path from 'node:path';
+import { pathToFileURL } from 'node:url';
+
+const folder = path.resolve(process.argv[1]);
+const module = (name) => import(pathToFileURL(path.join(folder, name)).href);
+const { default: loadMujoco } = await module('lib/mujoco.js');
+const ort = await module('lib/ort.wasm.min.mjs');
+const { Site } = await module('episode.js');
+
+const input = JSON.parse(fs.readFileSync(0, 'utf8'));
+const mujoco = await loadMujoco();
+const site = new Site(async (name) => new Uint8Array(fs.readFileSync(path.join(folder, name))), mujoco, ort);
+
+const rollouts = [];
+const replayed = await site.episode(input.task);
+for (const { start, actions, noise } of input.rollouts) {
+  replayed.begin(start);
+  const states = [];
+  for (const [i, action] of actions.entries()) {
+    replayed.act = async () => action.flat();
+    replayed.noise = () => noise[i];
+    await replayed.step();
+    states.push({ qpos: [...replayed.physics.data.qpos], qvel: [...replayed.physics.data.qvel] });
+  }
+  rollouts.push({ qpos: states.map((state) => state.qpos), qvel: states.map((state) => state.qvel) });
+}
+
+const episodes = [];
+let steps = 0;
+const began = performance.now();
+const episode = await site.episode(input.task);
+for (const seed of input.episodes) {
+  episode.reset(seed);
+  while (episode.result === null) await episode.step();
+  steps += episode.steps;
+  episodes.push({ seed, result: episode.result, steps: episode.steps, outcome: { ...episode.outcome } });
+}
+const rate = steps ? (1000 * steps) / (performance.now() - began) : 0;
+const report = { version: mujoco.mj_versionString(), rollouts, episodes, steps_per_second: rate };
+process.stdout.write(JSON.stringify(report));
+"""
+"""Runs the page's code in Node, from JSON to JSON.
+
+Input: `task`, a folder of the site; `rollouts`, each with a `start` (arrays by name), `actions` and `noise` by step;
+`episodes`, seeds to play with the task's first policy. Output: for each rollout `qpos` and `qvel` after every
+environment step, for each episode its end and outcome, and environment steps per second.
+"""
 
 
 def main() -> int:

@@ -71,15 +71,8 @@ def robot_state(position: Any, **euler: Any) -> RobotState:
     """The state of two robots at rest at positions (2, 3), m, with the default joints; see `angles`."""
     joints = jnp.tile(jnp.asarray(GO1.default_joints, jnp.float32), (2, 1))
     none = jnp.zeros((2, 3))
-    return RobotState(
-        jnp.asarray(position),
-        euler_to_quaternion(angles(**euler)),
-        none,
-        none,
-        joints,
-        jnp.zeros((2, 12)),
-        jnp.zeros(2),
-    )
+    turn = euler_to_quaternion(angles(**euler))
+    return RobotState(jnp.asarray(position), turn, none, none, joints, jnp.zeros((2, 12)), jnp.zeros(2))
 
 
 def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()) -> State:

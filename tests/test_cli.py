@@ -1,4 +1,4 @@
-"""The command line: output, streams, settings, run folders and policies."""
+"""The command line: output, streams, settings, run folders, policies and profiles."""
 
 import json
 import subprocess
@@ -8,15 +8,17 @@ from typing import Any
 
 import fake_env
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from fake_env import SMALL, FakeEnv
 
 import mqe_jax
-from mqe_jax import cli, zoo
-from mqe_jax.cli import arguments, setup
+from mqe_jax import cli
+from mqe_jax.cli import arguments, profile, setup
+from mqe_jax.cli.profile import Operation
 from mqe_jax.cli.train import parse_train, parse_walk_train
-from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs import QuadrupedEnv, make
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
@@ -39,13 +41,10 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_alone_it_says_what_to_do_first(capfd: pytest.CaptureFixture[str]) -> None:
+def test_alone_it_says_what_to_do_first_and_its_version_on_request(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 0
     out = capfd.readouterr().out
     assert "mqe train go1gate" in out and "mqe render" in out
-
-
-def test_the_version_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert capfd.readouterr().out == f"mqe {mqe_jax.__version__}\n"
 
@@ -62,16 +61,16 @@ def test_every_training_setting_has_a_flag_with_its_meaning(capfd: pytest.Captur
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
     out = " ".join(capfd.readouterr().out.replace("│", " ").split())
-    assert "--ppo.gae-lambda" in out and "Trace decay of generalised advantage estimation." in out
-    assert "--ppo.gae-lambda FLOAT" in out and "(default: 0.95)" in out
+    for words in ("--ppo.gae-lambda FLOAT", "Trace decay of generalised advantage estimation.", "(default: 0.95)"):
+        assert words in out
     assert "--network.hidden-sizes" in out and "--seed" in out
 
 
 def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
     names = {path.name for path in run_folder.iterdir()}
     assert {"config.yaml", "metrics.csv", "curve.png", "policy.safetensors", "checkpoints"} <= names
-    columns = (run_folder / "metrics.csv").read_text().splitlines()[0].split(",")
-    assert {"overflow", "diverged", "episode_return"} <= set(columns)
+    columns = (run_folder / "metrics.csv").read_text().splitlines()[0]
+    assert {"overflow", "diverged", "episode_return"} <= set(columns.split(","))
 
 
 def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -113,21 +112,18 @@ def test_a_divergence_is_recorded_and_replayed(
     files = sorted((tmp_path / "dump").iterdir())
     assert json.loads(out)["diverged"] == 2 and "mqe replay" in err
     assert files[0].name == "diverged_0000.npz"
-    clip = tmp_path / "clip.png"
-    assert cli.main(["replay", str(files[0]), "-o", str(clip), "--json"]) == 0
+    assert cli.main(["replay", str(files[0]), "-o", "clip.png", "--json"]) == 0
     result = json.loads(capfd.readouterr().out)
     assert result["steps"] == result["diverged_after"] == 10 and result["first_step"] == 0
-    assert clip.stat().st_size > 500
+    assert Path("clip.png").stat().st_size > 500
 
 
-@pytest.mark.parametrize(("task", "num_envs", "agents"), [("go1plane", "2", 1), ("go1revolvingdoor", "4", 2)])
+@pytest.mark.parametrize(
+    ("task", "num_envs", "agents"),
+    [pytest.param("go1plane", "2", 1, marks=pytest.mark.soak), ("go1revolvingdoor", "4", 2)],
+)
 def test_a_divergence_in_training_is_recorded(
-    task: str,
-    num_envs: str,
-    agents: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    task: str, num_envs: str, agents: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
 ) -> None:
     """Of a match, whose teams are environments of their own, once and with the actions of both."""
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)  # in the second step
@@ -185,9 +181,7 @@ def test_the_best_of_several_episodes_is_rendered(
     (line,) = capfd.readouterr().out.splitlines()
     assert [len(episode) for episode in rendered] == [5]
     assert json.loads(line) == {
-        "task": "fake",
-        "renderer": "egl",
-        "rendered": 2,
+        **{"task": "fake", "renderer": "egl", "rendered": 2},
         "episodes": [
             {"success": 0.5, "average_step_reward": 2.0, "seconds": 0.5},
             {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3},
@@ -261,11 +255,31 @@ def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: py
     assert "holds NaN" in capfd.readouterr().err
 
 
-def test_tasks_are_listed_without_importing_mjx() -> None:
-    """Importing MJX takes a second, which `mqe tasks` avoids."""
-    code = "import sys; from mqe_jax.cli import main; print(main(['tasks']), 'mujoco.mjx' in sys.modules)"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "go1football-2vs2" in out and out.splitlines()[-1] == "0 False"
+START = """
+import sys
+class Missing:
+    def find_spec(self, name, *rest):
+        if name.split(".")[0] == "warp":
+            raise ModuleNotFoundError("No module named 'warp'")
+sys.meta_path.insert(0, Missing())
+import mqe_jax
+from mqe_jax.cli import main
+assert main(["tasks"]) == 0 and mqe_jax.tasks()
+print("mujoco.mjx" in sys.modules)
+from mqe_jax.engines.private import load_mjx
+print(load_mjx().__name__)
+"""
+
+
+def test_tasks_are_listed_without_mjx_and_nothing_prints_a_warning() -> None:
+    """Importing MJX takes a second; its note that Warp is missing is not printed. Python's warnings are errors."""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", START], capture_output=True, text=True, check=True)
+    first, *lines, last, late, name = done.stdout.splitlines()
+    assert done.stderr == "" and "Failed" not in done.stdout and (late, name) == ("False", "mujoco.mjx")
+    assert first.startswith("The tasks with their default parameters") and last.startswith("actions per agent")
+    rows = {line.split()[0]: line.split() for line in lines if line.startswith("go1")}
+    assert rows["go1gate"][-1] == "shipped" and rows["go1plane"][-1] == "none"
+    assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"]
 
 
 def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:
@@ -276,21 +290,56 @@ def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixtur
     assert not capfd.readouterr().err
 
 
-def test_importing_mjx_without_warp_prints_nothing() -> None:
-    code = """
-import sys
-class Missing:
-    def find_spec(self, name, *rest):
-        if name.split(".")[0] == "warp":
-            raise ModuleNotFoundError("No module named 'warp'")
-sys.meta_path.insert(0, Missing())
-from mqe_jax.engines.private import load_mjx
-print(load_mjx().__name__)
-"""
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout == "mujoco.mjx\n"
+# -- mqe bench --profile: times of operations by the parts of a step ---------------------------------------------------
 
 
-def test_a_policy_file_knows_its_task() -> None:
-    file = zoo.file_of("go1gate")
-    assert load_policy(file).config.task == "go1gate"
+def test_shares_divide_each_instant_equally_among_what_runs() -> None:
+    operations = [
+        Operation("physics", False, 10.0, 14.0),
+        Operation("physics", False, 12.0, 13.0),  # on another thread
+        Operation("control", False, 12.0, 16.0),
+        Operation("reset", True, 18.0, 20.0),
+    ]
+    found = profile.shares(operations)
+    assert found == pytest.approx({"physics": 3.167 / 10, "control": 2.833 / 10, "reset": 0.2, "idle": 0.2}, abs=1e-3)
+
+
+def test_operations_of_a_program_are_attributed_by_the_innermost_scope() -> None:
+    @jax.named_scope("task")
+    def outer(x: jax.Array) -> jax.Array:
+        with jax.named_scope("physics"):
+            x = jnp.sort(x @ x)
+        return jnp.tanh(x)
+
+    def loop(x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, 3, lambda _, x: jax.vmap(outer)(x), x)
+
+    start = jnp.ones((4, 300, 300))
+    program, seconds = profile.compiled(loop, start)
+    kinds = profile.scopes(program.as_text(), "other")
+    assert {part for part, kind in kinds.values() if kind == "sort"} == {"physics"}
+    found = profile.traced(lambda: program(start), program.as_text(), "other")
+    assert {"physics", "task"} <= {operation.part for operation in found}
+    assert profile.shares(found)["physics"] > profile.shares(found)["task"] > 0.0
+    assert set(seconds) == {"trace_s", "compile_s", "cached_s"} and min(seconds.values()) > 0.0
+
+
+def test_contacts_are_those_of_standing_robots() -> None:
+    env = make("go1plane", impl="c", control="position", num_envs=4)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
+    low = state.data.replace(qpos=state.data.qpos.at[:2, 2].set(0.27).at[2:, 2].set(5.0))
+    found = profile.contacts(env.physics.model, {name: np.asarray(x) for name, x in profile.sampled(low).items()})
+    assert found["contacts_max"] >= 4 and 0 < found["contacts_mean"] <= found["contacts_max"] / 2
+    assert found["rows_max"] > found["contacts_max"]
+
+
+@pytest.mark.soak
+def test_a_profile_of_a_task(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "profile.png"
+    arguments = ["--profile", "--sizes", "16", "64", "--steps", "4", "--repeats", "2", "--json", "-o", str(picture)]
+    assert cli.main(["bench", "go1gate", "--impl", "c", *arguments]) == 0
+    rows = json.loads(capfd.readouterr().out)["profiles"]
+    assert [row["num_envs"] for row in rows] == [16, 64] and picture.stat().st_size > 5000
+    for row in rows:
+        assert sum(row["step"].values()) == pytest.approx(1.0) and row["step"]["physics"] > 0.2
+        assert row["env_steps_per_s"] > 0 and row["cached_s"] < row["compile_s"] and row["training"]["learner"] > 0.0

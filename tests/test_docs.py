@@ -1,17 +1,33 @@
-"""The documentation: the site builds without a warning, its code runs, its commands exist."""
+"""The documentation: the site builds without a warning, its code and notebooks run, its commands exist; imports."""
 
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import json
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
 import pytest
 
 from mqe_jax.cli.arguments import parse
+from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.errors import InputError
+from mqe_jax.planners import scripted_policy
+from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.networks import NETWORKS
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -102,8 +118,6 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     )
     assert built.returncode == 0, built.stderr[-3000:]
     assert "WARNING" not in built.stderr
-    from mqe_jax.envs import TASKS, make
-
     overview = (tmp_path / "tasks" / "index.html").read_text(encoding="utf-8")
     for name in TASKS:
         page = (tmp_path / "tasks" / f"{name}.html").read_text(encoding="utf-8")
@@ -144,10 +158,192 @@ def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:
     assert docs_pages.links("[a](../b.py) [c](d.md)", here) == f"[a]({here}/blob/main/b.py) [c](d.md)"
     assert docs_pages.links("[a](../b.md)", here, "results") == "[a](../b.md)"
     assert docs_pages.links("[a](../../b.py)", here, "results") == f"[a]({here}/blob/main/b.py)"
-    colab = docs_pages.links("[a](../n.ipynb)", here)
-    assert colab.endswith(
-        "([open in Colab](https://colab.research.google.com/github/someone/mqe_jax/blob/main/n.ipynb))"
-    )
+    colab = "https://colab.research.google.com/github/someone/mqe_jax/blob/main/n.ipynb"
+    assert docs_pages.links("[a](../n.ipynb)", here).endswith(f"([open in Colab]({colab}))")
     assert docs_pages.repository(f'[project]\nurls.Repository = "{here}/"') == here
     assert docs_pages.repository("[project]") == ""
     assert docs_pages.formulas("`$HOME` and $x^2$").startswith("`$HOME` and <math")
+
+
+# -- modules and their imports -----------------------------------------------------------------------------------------
+
+
+PACKAGE = ROOT / "mqe_jax"
+
+
+def modules_of(tree: ast.AST) -> set[str]:
+    """Returns the modules of this package that a source file imports, at any nesting depth."""
+    names = [f"{n.module}.{a.name}" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names]
+    names += [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    return {name.split(".")[1] for name in names if name.startswith("mqe_jax.")}
+
+
+def wrong_imports(package: Path, order: list[str]) -> list[str]:
+    """Returns the imports of a package's modules from modules that are not before them."""
+    wrong = []
+    for path in sorted(package.rglob("*.py")):
+        if path == package / "__init__.py":
+            continue
+        module = path.relative_to(package).parts[0].removesuffix(".py")
+        others = modules_of(ast.parse(path.read_text(encoding="utf-8"))) - {module}
+        above = order[: order.index(module)] if module in order else []
+        wrong += [f"{path.relative_to(package)}: {module} may not import {x}" for x in sorted(others - {*above})]
+    return wrong
+
+
+def test_imports_follow_the_table_of_modules() -> None:
+    """The table names every module, each after those that it imports."""
+    order = re.findall(r"^\| `(\w+)", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
+    modules = {path.stem for path in PACKAGE.glob("*.py")} | {
+        path.parent.name for path in PACKAGE.glob("*/__init__.py")
+    }
+    assert sorted(order) == sorted(modules - {"__init__"})
+    assert wrong_imports(PACKAGE, order) == []
+
+
+def test_a_wrong_import_is_named(tmp_path: Path) -> None:
+    """An import of a module further down is found, also inside a function, and reported with its file."""
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "late.py").write_text("def late():\n    from mqe_jax.envs import make\n")
+    (tmp_path / "envs.py").write_text("from mqe_jax import train\nimport mqe_jax.train.late\n")
+    assert wrong_imports(tmp_path, ["train", "envs"]) == ["train/late.py: train may not import envs"]
+
+
+def test_the_learner_imports_no_learning_library() -> None:
+    for path in (PACKAGE / "train").glob("*.py"):
+        assert not re.search(r"^\s*(import|from) (flax|optax|brax|torch)\b", path.read_text(), re.MULTILINE), path
+
+
+# -- examples and notebooks --------------------------------------------------------------------------------------------
+
+
+EXAMPLES = ROOT / "examples"
+
+
+@pytest.fixture(autouse=True)
+def script_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Examples run as scripts, with their own folder on the import path."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+
+@pytest.fixture
+def example() -> Any:
+    """The module of the guide to a new task; its registrations are removed afterwards."""
+    spec = importlib.util.spec_from_file_location("new_task", EXAMPLES / "new_task.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["new_task"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["new_task"], TASKS["go1catch"], PLANNERS["go1catch"]
+
+
+def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:
+    env = VectorEnv(make("go1catch", impl="c", num_envs=8), 8)
+    plan = jax.vmap(scripted_policy(env.env))
+    result = evaluate(env, lambda obs, memory, _: (plan(obs), memory), 8, jax.random.PRNGKey(0))
+    assert result.success_rate >= 0.5
+    idle = evaluate(env, lambda obs, memory, _: (jnp.zeros((8, 1, 3)), memory), 8, jax.random.PRNGKey(0))
+    assert idle.success_rate == 0
+    np.testing.assert_allclose(
+        example.flee(jnp.array([3.0, 1.0]), jnp.array([3.0, 0.0]), speed=0.4), [0, 0.4], atol=1e-6
+    )
+    np.testing.assert_allclose(example.flee(jnp.array([3.0, 2.0]), jnp.array([3.0, 0.0]), speed=0.4), [0, 0])
+    pillar = env.env.compiled.model.geom("wall/pillar1")
+    np.testing.assert_allclose(pillar.pos[:2], [2.5, 0.0])
+
+
+def test_an_environment_of_ones_own_is_trained() -> None:
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "foreign_env.py"))
+    history = example["main"](num_envs=32, updates=25)
+    assert len(history) == 25 and history[-1] < 0.6 * history[0]
+
+
+def test_a_network_of_ones_own_is_trained() -> None:
+    runpy.run_path(str(EXAMPLES / "custom_network.py"))
+    try:
+        history = importlib.import_module("foreign_env").main(
+            num_envs=32, updates=25, network={"name": "mean_field", "width": 32}
+        )
+    finally:
+        NETWORKS.pop("mean_field")
+    assert history[-1] < 0.6 * history[0]
+
+
+def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "self_play.py"))
+    results = example["main"](num_envs=4, updates=3, snapshot_every=2, episodes=4)
+    assert len(results) == 2
+    assert all(sum(result.match.values()) == pytest.approx(1.0) for result in results)
+
+
+NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
+CLIPS = {"tour": 2, "design_a_task": 1, "compare_algorithms": 0}
+
+
+def run(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Runs a notebook in a kernel of its own, in an empty folder; returns its outputs by MIME type."""
+    nbformat, nbclient, _ = map(pytest.importorskip, ("nbformat", "nbclient", "ipykernel"))
+    notebook = nbformat.read(path, as_version=4)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    resources = {"metadata": {"path": str(tmp_path)}}
+    client = nbclient.NotebookClient(notebook, timeout=900, kernel_name="python3", resources=resources)
+    return [output.get("data", {}) for cell in client.execute().cells for output in cell.get("outputs", [])]
+
+
+def run_here(path: Path) -> list[dict[str, Any]]:
+    """Runs a notebook in this process, which starts faster and keeps compiled programs; returns its outputs."""
+    base = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell
+    traitlets, capture = map(importlib.import_module, ("traitlets.config", "IPython.utils.capture"))
+    interactive = type("Shell", (base,), {"enable_gui": lambda self, gui=None: None})
+    shell, values = interactive.instance(config=traitlets.Config({"HistoryManager": {"enabled": False}})), []
+    try:
+        with capture.capture_output() as captured:
+            for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+                if cell["cell_type"] == "code":
+                    done = shell.run_cell("".join(cell["source"]))
+                    done.raise_error()
+                    values.append(shell.display_formatter.format(done.result)[0])
+    finally:
+        interactive.clear_instance()
+    return values + [output.data for output in captured.outputs]
+
+
+def check(outputs: list[dict[str, Any]], name: str) -> None:
+    """Clips are inline, and plots are there."""
+    pages = [str(data["text/html"]) for data in outputs if "text/html" in data]
+    clips = [page for page in pages if "data:video/mp4;base64," in page or "data:image/gif;base64," in page]
+    assert len(clips) == CLIPS[name] and all(len(clip) > 2000 for clip in clips)
+    if name != "design_a_task":
+        assert any("image/png" in data for data in outputs)
+
+
+def test_notebooks_are_committed_without_outputs() -> None:
+    nbformat = pytest.importorskip("nbformat")
+    for path in NOTEBOOKS:
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+        assert code and all(not cell.outputs and cell.execution_count is None for cell in code), path
+        assert path.stem in CLIPS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_at_small_size(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MQE_NOTEBOOK_SMALL", "1")
+    monkeypatch.chdir(tmp_path)
+    try:
+        check(run_here(path), path.stem)
+    finally:
+        TASKS.pop("go1meet", None)  # of the notebook that designs a task
+        matplotlib.use("agg")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_whole_in_under_five_minutes(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MQE_NOTEBOOK_SMALL", raising=False)
+    start = time.monotonic()
+    check(run(path, tmp_path, monkeypatch), path.stem)
+    assert time.monotonic() - start < 300

@@ -35,29 +35,19 @@ from tests.states import made, moving, placed
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
 # Far apart, so that only the first robot touches them; the second one stands at x = 1.
 OBJECTS = {
-    "box": Box(),
-    "ball": Ball(),
-    "sheep": Sheep(),
-    "cylinder": Cylinder(x=40.0),
-    "door": Door(position=(50.0, 0.0)),
-    "seesaw": Seesaw(hinge=(60.0, 0.0, 0.545)),
-    "platform": Platform(center=(70.0, 0.0, 0.3)),
-}
+    "box": Box(), "ball": Ball(), "sheep": Sheep(), "cylinder": Cylinder(x=40.0), "door": Door(position=(50.0, 0.0)),
+    "seesaw": Seesaw(hinge=(60.0, 0.0, 0.545)), "platform": Platform(center=(70.0, 0.0, 0.3)),
+}  # fmt: skip
 PLACES = {"box": (10.0, 0.0, 0.5), "ball": (20.0, 0.0, 0.1), "sheep": (30.0, 0.0)}
 # What the robot meets, by the start of the geom's name: start of its trunk (x, y, z), and where it moves at 0.5 m/s.
 AHEAD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
 MEETINGS = {
-    "floor": ((4.0, 0.0, 0.5), DOWN),
-    "robot1/": ((0.2, 0.1, 0.33), AHEAD),
-    "wall/": ((2.3, 0.8, 0.33), AHEAD),
-    "object/box": ((9.0, 0.1, 0.33), AHEAD),
-    "object/ball": ((19.3, 0.1, 0.33), AHEAD),
-    "object/sheep": ((29.2, 0.1, 0.33), AHEAD),
-    "object/cylinder": ((38.2, 0.1, 0.33), AHEAD),
-    "object/door": ((49.4, 0.6, 0.33), AHEAD),
-    "object/seesaw": ((61.0, 0.1, 1.1), DOWN),
+    "floor": ((4.0, 0.0, 0.5), DOWN), "robot1/": ((0.2, 0.1, 0.33), AHEAD), "wall/": ((2.3, 0.8, 0.33), AHEAD),
+    "object/box": ((9.0, 0.1, 0.33), AHEAD), "object/ball": ((19.3, 0.1, 0.33), AHEAD),
+    "object/sheep": ((29.2, 0.1, 0.33), AHEAD), "object/cylinder": ((38.2, 0.1, 0.33), AHEAD),
+    "object/door": ((49.4, 0.6, 0.33), AHEAD), "object/seesaw": ((61.0, 0.1, 1.1), DOWN),
     "object/platform": ((70.0, 0.1, 0.8), DOWN),
-}
+}  # fmt: skip
 
 
 def met(scene: CompiledScene, name: str) -> mujoco.MjData:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_skills import StandAndLean
+from test_policies import StandAndLean
 
 from mqe_jax import cli, load_policy, make, zoo
 from mqe_jax.errors import InputError
@@ -140,7 +140,7 @@ def stub_env(agents: int) -> Any:
 
 
 def test_agents_of_mat_act_one_after_another() -> None:
-    env = stub_env(3)
+    env = stub_env(2)
     assert error_on_random_inputs(new_policy(env, "torque", name="mat", heads=2, blocks=2), env) < 2e-5
 
 

@@ -1,102 +1,59 @@
-"""Bad commands and Python calls: each ends at once with one line that names what is wrong. The list of bounds."""
+"""Bad input: Python calls and their bounds, and fuzz tests. The answer is one line that names the field or the file."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import fake_env
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
-from fake_env import SMALL
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 import mqe_jax
-from mqe_jax import cli, limits, memory
+from mqe_jax import limits, memory, robots
+from mqe_jax.adapters import gymnasium
+from mqe_jax.cli.arguments import parse
+from mqe_jax.cli.setup import parse_overrides
 from mqe_jax.envs import VectorEnv, make
+from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.opponents import Mirror, versus
-from mqe_jax.settings import build, check, override
+from mqe_jax.settings import build, check, load_yaml, override
+from mqe_jax.study.sweep import Sweep, load_sweep
+from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train
+from mqe_jax.view import messages
+from mqe_jax.view.messages import RefusedError, UnparsableError
 from mqe_jax.viz import clips, recording, render
+from mqe_jax.walk.torchscript import read_torchscript
+from tests import inputs
+from tests.test_walk_policy import write_torchscript
 
 KEY, NAN = jax.random.PRNGKey(0), math.nan
 
 
-# -- commands ----------------------------------------------------------------------------------------------------------
-
-COMMANDS: dict[str, tuple[list[str], str]] = {
-    "environments": (["eval", "go1gate", "--num-envs", "1000000000"], "num_envs: 1000000000"),
-    "environments of a training": (["train", "go1gate", "--num-envs", "1000000000"], "num_envs: 1000000000"),
-    "environments of a benchmark": (["bench", "go1gate", "--num-envs", "1000000000"], "num_envs: 1000000000"),
-    "candidates": (["render", "fake", "-o", "a.png", "--best-of", "100000000"], "best_of: 100000000"),
-    "layer": (["train", "fake", "--network.hidden-sizes", "1000000"], "hidden_sizes.0: 1000000"),
-    "endless clip": (["render", "fake", "-o", "a.gif", "--seconds", "inf"], "seconds: inf"),
-    "one pixel": (["render", "fake", "-o", "a.gif", "--width", "1"], "width: 1"),
-    "frame rate": (["render", "fake", "-o", "a.gif", "--fps", "1e-9"], "fps: 1e-09"),
-    "friction": (["bench", "go1gate", "--set", "friction=1e300"], "friction: '1e300'"),
-    "time limit": (["bench", "go1gate", "--set", "episode_length=1e-9"], "episode_length: '1e-9'"),
-    "host": (["view", "go1plane", "--control", "position", "--host", "a..b"], "host: 'a..b' is not allowed"),
-    "robots": (["bench", "go1plane", "--set", "num_agents=100000"], "num_agents: 100000"),
-    "flock": (["bench", "go1sheep-hard", "--set", "flock=[1000, 1000]"], "flock.0: 1000"),
-    "lag": (["bench", "go1gate", "--set", "randomization.action_lag=1000000000"], "action_lag: 1000000000"),
-    "tiny mass": (["bench", "go1seesaw", "--set", "plank.mass=1e-300"], "plank.mass"),
-    "run folder": (["train", "fake", *SMALL, "--run-dir", ""], "run-dir: '' is not allowed; it must be not empty"),
-    "run folder, joined": (["train", "fake", *SMALL, "--run-dir="], "run-dir: ''"),
-    "long word": (["eval", "x" * 100_000], "at most 4096 characters"),
-    "control character": (["eval", "a\x07b"], "control character"),
-    "no text": (["eval", "a\udcff"], "control character"),
-    "YAML: open list": (["bench", "go1gate", "--set", "gate_width=["], "set: the value of 'gate_width=['"),
-    "YAML: alias": (["bench", "go1gate", "--set", "gate_width=*x"], "set: the value of"),
-    "YAML: quote": (["bench", "go1gate", "--set", "gate_width='"], "set: the value of"),
-    "YAML: date": (["bench", "go1gate", "--set", "gate_width=2020-01-01"], "gate_width: '2020-01-01'"),
-    "YAML: depth": (["bench", "go1gate", "--set", "gate_width=" + "[" * 3000], "more than 32 deep"),
-    "flag: mapping": (["train", "fake", "--ppo.epochs", "{}"], "ppo.epochs"),
-    "flag: list": (["train", "fake", "--ppo.clip", "["], "ppo.clip"),
-    "flag: date": (["train", "fake", "--ppo.clip", "2020-01-01"], "ppo.clip"),
-    "table in a pipe": (["bench", "fake", "--csv", "fifo"], "csv: fifo: cannot be read (not a regular file)"),
-    "policy in a pipe": (["eval", "fake", "--policy", "./fifo"], "not a regular file"),
-    "settings in a pipe": (["train", "fake", "--config", "./fifo.yaml"], "fifo.yaml"),
-    "recording in a pipe": (["replay", "./fifo"], "not a regular file"),
-    "weights in a pipe": (["walk", "eval", "--weights", "./fifo"], "fifo"),
-    "folder of a sweep": (["sweep", "."], "not a regular file"),
-}
-
-
-@pytest.mark.usefixtures("fake_tasks")
-@pytest.mark.parametrize("case", COMMANDS)
-def test_bad_commands(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Exit code 2 and a short message; nothing is written."""
-    os.mkfifo("fifo")
-    os.mkfifo("fifo.yaml")
-    arguments, said = COMMANDS[case]
-    assert cli.main(arguments) == 2
-    out, err = capfd.readouterr()
-    shown = " ".join(err.replace("│", " ").split())
-    assert out == "" and said in shown and len(err) < 4000, err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "fifo.yaml"]
-
-
-# -- Python calls ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
-def given() -> dict[str, Any]:
+def made() -> dict[str, Any]:
     """What the calls need: a task and a match, both without the walk policy, and the fake task."""
     task, match, fake = make("go1gate", control="position"), make("go1tug", control="position"), fake_env.FakeEnv()
     poses = (np.zeros((3, fake.mj_model.nq)), np.zeros((3, 2, 3)), np.zeros((3, 2, 4)))
     config = override(TrainConfig(), {"num_envs": 2, "total_steps": 16, "rollout_steps": 8})
+    state = jax.eval_shape(task.reset, KEY)
     return {
-        "task": task, "match": match, "fake": fake, "batch": fake_env.FakeVectorEnv(fake, 2), "config": config,
-        "matches": VectorEnv(match, 2), "episode": recording.Episode(*poses, dt=0.02), "gif": Path("a.gif"),
-        "long": recording.Episode(*(np.zeros((99, *pose.shape[1:])) for pose in poses), dt=0.02),
+        "task": task, "state": state, "match": match, "fake": fake, "batch": fake_env.FakeVectorEnv(fake, 2),
+        "config": config, "matches": VectorEnv(match, 2), "episode": recording.Episode(*poses, dt=0.02),
+        "gif": Path("a.gif"), "long": recording.Episode(*(np.zeros((99, *pose.shape[1:])) for pose in poses), dt=0.02),
         "act": lambda obs, memory, key: (jnp.zeros((*obs.shape[:2], 3)), memory),
     }  # fmt: skip
 
@@ -115,6 +72,7 @@ def _render(x: Any, **options: Any) -> Any:
     )
 
 
+READERS = (load_yaml, read_torchscript, load_recording)
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("task: ", lambda x, v: make(v), (3, [], None)),
     ("impl: ", lambda x, v: make("go1gate", impl=v), (3, [])),
@@ -169,18 +127,30 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
     ("path: ", lambda x, v: load_config(v), (None, 3)),
     ("TrainConfig: ", lambda x, v: build(TrainConfig, v), (None, [1], "x")),
-    ("policy: ", lambda x, v: read_policy(v), (None, 3)),
+    ("policy: ", lambda x, v: read_policy(v), (None, 3, "\0")),
+    ("num_envs: ", lambda x, v: gymnasium.VectorEnv("go1plane", v, impl="c"), (0, NAN, 1.5, True, None, 10**12)),
+    ("spawn_joint_scale", lambda x, v: make("go1gate", spawn_joint_scale=v), ((1, 0), (NAN, 1), (1,), "64x64", 3)),
+    ("rewards", lambda x, v: make("go1gate", rewards=v), (3, "x", [], {"x": 1})),
+    ("randomization: ", lambda x, v: make("go1gate", randomization=v), (3, "x", [])),
+    ("action: ", lambda x, v: x["task"].step(x["state"], v), (np.zeros((1, 2, 12)), 3, [])),
+    ("unknown name", lambda x, v: build(TrainConfig, {v: 1}), ("", 3, b"a", "a" * 100, "\0")),
+    ("ppo: ", lambda x, v: override(TrainConfig(), {"ppo": v}), (3, "x", [], None)),
+    ("path: ", lambda x, v: load_yaml(v), (None, 3, "", "\0", [])),
+    ("path: ", lambda x, v: read_torchscript(v), (None, 3, {}, [])),
+    ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
+    ("name: ", lambda x, v: robots.get(v), (None, 3, {}, [])),
+    *(("not a regular file", lambda x, v, read=read: read(v), ("/", "/dev/zero")) for read in READERS),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("said", "call", "value"), [(*row[:2], value) for row in CALLS for value in row[2]])
 def test_bad_calls(
-    said: str, call: Any, value: Any, given: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    said: str, call: Any, value: Any, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An InputError that names the argument; nothing is written."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
-        call(given, value)
+        call(made, value)
     assert said in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 1000
     assert list(tmp_path.iterdir()) == []
 
@@ -208,12 +178,144 @@ def test_every_kind_has_both_bounds(name: str) -> None:
             check("x", value, kind)
 
 
-def test_memory_is_compared_before_it_is_allocated(given: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     assert 2**26 < memory.free_memory() < 2**50
     monkeypatch.setattr(memory, "free_memory", lambda: 2.0**30)
     with pytest.raises(InputError, match=r"num_envs: 131072 needs .* GB or more; at most 0\.5 GB may be used"):
-        VectorEnv(given["task"], 2**17)
-    config = override(given["config"], {"rollout_steps": 10_000, "num_envs": 100_000})
-    batch = fake_env.FakeVectorEnv(given["fake"], 100_000)
+        VectorEnv(made["task"], 2**17)
+    config = override(made["config"], {"rollout_steps": 10_000, "num_envs": 100_000})
+    batch = fake_env.FakeVectorEnv(made["fake"], 100_000)
     with pytest.raises(InputError, match="rollout_steps: 10000 needs"):
         train(batch, config, "run")
+
+
+LONGEST = 1200
+"""Characters of a message: what is allowed may be a list of names."""
+CASES = settings(
+    max_examples=60,
+    deadline=20_000,
+    derandomize=True,
+    database=None,
+    suppress_health_check=(HealthCheck.too_slow, HealthCheck.filter_too_much),
+)
+"""Hypothesis repeats the same inputs in every run; the soak draws new ones."""
+
+
+@contextlib.contextmanager
+def refusing(*names: str) -> Iterator[None]:
+    """Accepts an InputError of one line that has one of the names, if any; nothing else may be raised."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        assert "\n" not in text and len(text) <= LONGEST, text
+        assert not names or any(name in text for name in names), text
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@CASES
+@given(inputs.wrong_settings())
+@example(("training", "ppo.epochs", {}))
+@example(("training", "num_envs", 10**9))
+@example(("go1gate", "episode_length", 1e-9))
+@example(("go1gate", "friction", 1e300))
+def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str, Any]) -> None:
+    """In every record: training, sweeps, walking, networks and the parameters of all tasks."""
+    name, field, value = case
+    with pytest.raises(InputError) as refused:
+        build(inputs.records()[name], {field: value} | ({"tasks": ("go1gate",)} if name == "sweep" else {}))
+    text = str(refused.value)
+    assert field.split(".")[-1] in text and "\n" not in text and len(text) <= LONGEST, text
+
+
+@CASES
+@given(st.data())
+def test_a_number_within_its_bounds_is_taken_or_refused_for_another_field(data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from(sorted(inputs.records())))
+    fields = dict(inputs.numbers(inputs.records()[name]))
+    field = data.draw(st.sampled_from(sorted(fields)))
+    value = data.draw(inputs.allowed(fields[field]))
+    with refusing():
+        build(inputs.records()[name], {field: value} | ({"tasks": ("go1gate",)} if name == "sweep" else {}))
+
+
+@CASES
+@given(inputs.wrong_flags())
+def test_flags_are_parsed_or_refused(words: list[str]) -> None:
+    """A number outside its bounds is not parsed; other texts may be allowed where a text belongs."""
+    with refusing():
+        try:
+            command = parse(words)
+        except SystemExit as stop:
+            assert stop.code in (0, 2)
+        else:
+            parse_overrides(getattr(command, "set", []))
+
+
+@CASES
+@given(inputs.yaml_text(TrainConfig))
+def test_yaml_of_settings_is_read_or_refused(folder: Path, text: str) -> None:
+    file = folder / "settings.yaml"
+    file.write_text(text, encoding="utf-8", errors="replace")
+    with refusing(file.name):
+        load_config(file)
+
+
+@CASES
+@given(inputs.yaml_text(Sweep))
+def test_a_sweep_file_is_read_or_refused(folder: Path, text: str) -> None:
+    file = folder / "sweep.yaml"
+    file.write_text(f"tasks: [go1gate]\n{text}", encoding="utf-8", errors="replace")
+    with refusing(file.name):
+        load_sweep(file)
+
+
+TREE = {"weights": jnp.arange(12.0).reshape(3, 4), "count": jnp.int32(7)}
+
+
+@CASES
+@given(data=st.data(), kind=st.sampled_from(["policy", "checkpoint"]))
+def test_a_damaged_policy_or_checkpoint_is_refused(folder: Path, data: st.DataObject, kind: str) -> None:
+    file = folder / f"{kind}.safetensors"
+    save_tree(file, TREE, {"task": "fake", "dims": [2, 1, 2, 3, 2], "config": {}}, kind=kind)
+    whole = file.read_bytes()
+    content = data.draw(inputs.damaged(whole) | inputs.tensors_file(whole))
+    file.write_bytes(content)
+    with refusing(file.name):
+        read_policy(file)
+    with refusing(file.name):
+        read = load_tree(file, TREE, kind=kind).tree
+        assert all(bool((read[name] == TREE[name]).all()) for name in TREE), "read with other values"
+
+
+@CASES
+@given(data=st.data())
+def test_a_damaged_torchscript_archive_is_refused(folder: Path, data: st.DataObject) -> None:
+    file = folder / "body.jit"
+    layers = {"0.weight": jnp.ones((2, 3)), "0.bias": jnp.ones(2), "2.weight": jnp.ones((1, 2)), "2.bias": jnp.ones(1)}
+    write_torchscript(file, {name: value.__array__() for name, value in layers.items()})
+    file.write_bytes(data.draw(inputs.script_archive(file.read_bytes())))
+    with refusing(file.name):
+        weights = read_torchscript(file)
+        assert all(value.size < 2**21 for value in weights.values())
+
+
+@CASES
+@given(inputs.messages())
+def test_a_message_to_the_viewer_is_understood_or_refused(message: Any) -> None:
+    frame = msgspec.msgpack.encode(message)
+    with contextlib.suppress(UnparsableError, RefusedError):
+        messages.check(frame, lambda uuid: None)
+        camera = msgspec.convert(message, messages.Camera)  # no widget has a name, so that nothing else is accepted
+        assert all(map(math.isfinite, (*camera.position, *camera.look_at, camera.fov)))
+
+
+@settings(CASES, max_examples=30)
+@given(st.binary(max_size=40))
+def test_a_frame_of_any_bytes_is_refused(frame: bytes) -> None:
+    with pytest.raises((UnparsableError, RefusedError)):
+        messages.check(frame, lambda uuid: None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import math
@@ -22,13 +23,14 @@ from mqe_jax.cli.setup import parse_overrides
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.files import parse_json, parse_yaml, read_rows, read_tensors
-from mqe_jax.settings import build
+from mqe_jax.settings import build, load_yaml
 from mqe_jax.study.runs import read_curve
 from mqe_jax.train import checkpoint
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import read_policy
 from mqe_jax.walk.torchscript import read_torchscript
+from tests import inputs
 
 
 def peak() -> int:
@@ -52,6 +54,26 @@ YAMLS = {
     "null byte": "a: \0",
     "bytes": "a: \udcff",
 }
+
+
+CORPUS: dict[str, tuple[Any, bytes, str]] = {
+    # name: (reader, content, a word of the message)
+    "a date for a number": (load_config, b"num_envs: 2026-01-01", "2026-01-01"),
+    "an empty mapping": (load_config, b"ppo: {epochs: {}}", "epochs"),
+    "bytes": (load_config, b"\xff\xfe\x00", "YAML"),
+    "a list as YAML": (load_yaml, b"- a", "mapping"),
+    "a header of 2^40 bytes": (read_policy, b"\x00\x00\x00\x00\x00\x01\x00\x00{}", "policy"),
+    "no header": (read_policy, b"", "policy"),
+}
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_what_once_broke_is_refused(name: str, tmp_path: Path) -> None:
+    reader, content, word = CORPUS[name]
+    (tmp_path / "input").write_bytes(content)
+    with pytest.raises(InputError, match=r"^[^\n]*$") as refused:
+        reader(tmp_path / "input")
+    assert "input" in str(refused.value) and word in str(refused.value) and len(str(refused.value)) <= 1200
 
 
 @pytest.mark.parametrize("case", YAMLS)
@@ -182,9 +204,13 @@ def _tuple(values: tuple[int, ...]) -> bytes:
 
 
 def archived(data: bytes, storage: bytes = bytes(4)) -> bytes:
+    return zipped(b"\x80\x02" + data + b".", storage)
+
+
+def zipped(pickle: bytes, storage: bytes = bytes(4)) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("net/data.pkl", b"\x80\x02" + data + b".")
+        archive.writestr("net/data.pkl", pickle)
         archive.writestr("net/data/0", storage)
     return file.getvalue()
 
@@ -217,6 +243,8 @@ ARCHIVES: dict[str, Callable[[], bytes]] = {
     "truncated": lambda: archived(module(LINEAR))[:-30],
     "encrypted": lambda: encrypted(archived(module(LINEAR))),
     "no archive": lambda: b"hello",
+    "the start of an archive": lambda: b"PK\x03\x04",
+    **{f"pickle {i}": functools.partial(zipped, text) for i, text in enumerate(inputs.PICKLES)},
 }
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import subprocess
@@ -14,20 +13,20 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-from safetensors.numpy import load_file
 
 from mqe_jax import cli
 from mqe_jax.cli import setup
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
+from tests.training import assert_same_run, rows
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
 SIGNALS = pytest.mark.parametrize("number", list(ENDS), ids=lambda number: number.name)
 FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-steps", str(300 * 16)]
 FAKE += ["--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "4", "--checkpoint.every", "100000"]
+FAKE += ["--network.no-recurrent"]
 PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_env.py"))]
 GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
 GATE += ["--num-envs", "4", "--rollout-steps", "8", "--ppo.minibatches", "2", "--checkpoint.every", "100000"]
@@ -70,27 +69,8 @@ def end(process: subprocess.Popen[str], number: signal.Signals, seconds: float =
     return lines
 
 
-def rows(run_dir: Path) -> list[dict[str, str]]:
-    with (run_dir / "metrics.csv").open() as file:
-        return [{k: v for k, v in row.items() if k not in ("seconds", "fps")} for row in csv.DictReader(file)]
-
-
 def updates(run_dir: Path) -> int:
     return len(rows(run_dir)) if (run_dir / "metrics.csv").is_file() else 0
-
-
-def assert_same_run(one: Path, other: Path) -> None:
-    """Same metrics but for the times, same policy, same last checkpoint."""
-    assert rows(one) == rows(other)
-    for files in (
-        [run / "policy.safetensors" for run in (one, other)],
-        [list_checkpoints(r)[-1] for r in (one, other)],
-    ):
-        expected, found = map(load_file, files)
-        assert expected.keys() == found.keys()
-        for name, value in expected.items():
-            np.testing.assert_array_equal(value, found[name], err_msg=name)
-    assert not [path for path in other.rglob(".*")]
 
 
 @SIGNALS
@@ -102,9 +82,11 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("shared_programs")
 def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped between its regular checkpoints, it equals an uninterrupted one bit for bit."""
-    monkeypatch.setattr(setup, "make_env", fake_env.make_env)
+    environments = fake_env.make_env("fake", "none", {}, 4)
+    monkeypatch.setattr(setup, "make_env", lambda *_, **__: environments)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])
     wait_for(lambda: updates(stopped) >= 3, process)
@@ -217,13 +199,6 @@ def start_training(run_dir: Path, *flags: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([*command, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
 
 
-def newest(run_dir: Path) -> dict[str, np.ndarray]:
-    """Contents of the last checkpoint by name: parameters, optimiser, environments, keys."""
-    from safetensors.numpy import load_file
-
-    return load_file(max(list_checkpoints(run_dir)))
-
-
 @pytest.mark.soak
 def test_sigkill_and_resume_changes_nothing(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -236,9 +211,5 @@ def test_sigkill_and_resume_changes_nothing(tmp_path: Path) -> None:
     assert process.wait(60) == -signal.SIGKILL, "the training ended before it could be killed"
     assert start_training(killed, "--resume").wait(300) == 0
 
-    expected, resumed = newest(whole), newest(killed)
-    assert expected.keys() == resumed.keys()
-    for name, value in expected.items():
-        np.testing.assert_array_equal(value, resumed[name], err_msg=name)
-    updates = [len((run / "metrics.csv").read_text().splitlines()) - 1 for run in (whole, killed)]
-    assert updates == [STEPS, STEPS]
+    assert_same_run(whole, killed)
+    assert [updates(run) for run in (whole, killed)] == [STEPS, STEPS]

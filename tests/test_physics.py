@@ -237,7 +237,7 @@ class Frozen(CEngine):
 def test_a_new_engine_is_one_class_and_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(engines.ENGINES, "frozen", f"{__name__}:Frozen")
     env = make("go1gate", impl="frozen", control="position")
-    state = env.reset(jax.random.PRNGKey(0))
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     after = jax.jit(env.step)(state, jnp.ones((2, 12)))
     np.testing.assert_array_equal(after.data.qpos, state.data.qpos)
     assert env.impl == "frozen" and float(after.metrics["overflow"]) == 1.0

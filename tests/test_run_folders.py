@@ -1,25 +1,33 @@
-"""Run folders that are removed, renamed, replaced, or nested while or before a training writes to them."""
+"""Run folders that are lost or replaced while a training writes; files written whole; several seeds in one program."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import probes
+import jax
+import numpy as np
 import pytest
 from fake_env import SMALL
-from probes import Probe
-from test_train_run import settings
+from test_train_run import rows, settings
 
-from mqe_jax import cli, interrupts
+from mqe_jax import cli, files, interrupts
 from mqe_jax.errors import InputError
 from mqe_jax.files import locked, remove_temporaries, replacing, write_atomically
+from mqe_jax.settings import override
 from mqe_jax.train.checkpoint import list_checkpoints
-from mqe_jax.train.learner import Learner, make_learner
-from mqe_jax.train.runner import train
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import TrainState
+from mqe_jax.train.policy import read_policy
+from mqe_jax.train.runner import train, train_seeds
+from tests import training as probes
+from tests.training import Probe, Traces
 
+pytestmark = pytest.mark.usefixtures("shared_programs")
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 SETTINGS = settings(network__recurrent=False, ppo__epochs=1, ppo__minibatches=1)
 
@@ -37,18 +45,9 @@ LOST: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def learner() -> Learner:
-    """The compiled learner of all trainings of this file."""
-    return make_learner(PROBE, SETTINGS)
-
-
 @pytest.mark.parametrize("how", LOST)
-def test_a_training_stops_when_its_folder_is_lost(
-    how: str, tmp_path: Path, learner: Learner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> None:
     """With one line; neither the old path nor the folder that is there now gets a file."""
-    monkeypatch.setattr("mqe_jax.train.runner.make_learner", lambda *_: learner)
     folder = tmp_path / "runs" / "run"
 
     def lose(state: object, row: dict[str, float]) -> None:
@@ -65,11 +64,8 @@ def test_a_training_stops_when_its_folder_is_lost(
     assert not [path for path in tmp_path.rglob(".*")]
 
 
-def test_a_second_training_keeps_its_checkpoints(
-    tmp_path: Path, learner: Learner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_training_keeps_its_checkpoints(tmp_path: Path) -> None:
     """Of a folder that is renamed while a training writes to it, and replaced by another training."""
-    monkeypatch.setattr("mqe_jax.train.runner.make_learner", lambda *_: learner)
     folder, seen = tmp_path / "run", {}
 
     def lose(state: object, row: dict[str, float]) -> None:
@@ -108,11 +104,8 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
             assert sorted(Path(folder).rglob("*")) == before
 
 
-def test_files_of_dead_processes_go_when_a_run_starts(
-    tmp_path: Path, learner: Learner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_dead_processes_go_when_a_run_starts(tmp_path: Path) -> None:
     """Those of processes that run, such as a clip that is being written, stay."""
-    monkeypatch.setattr("mqe_jax.train.runner.make_learner", lambda *_: learner)
     dead = 2**22 + 1  # above the largest process number
     (tmp_path / "checkpoints").mkdir()
     gone = [f".policy.{n}.tmp.safetensors" for n in (dead, os.getpid())]
@@ -130,3 +123,127 @@ def test_a_file_that_is_being_written_is_not_removed(tmp_path: Path) -> None:
         assert temporary in interrupts.temporaries
         remove_temporaries(tmp_path)
     assert (tmp_path / "a.txt").read_text() == "new"
+
+
+# -- files are written whole -------------------------------------------------------------------------------------------
+
+
+def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, seen = tmp_path / "policy.safetensors", []
+    path.write_bytes(b"old")
+    monkeypatch.setattr(os, "fsync", lambda descriptor: seen.append((path.read_bytes(), os.fstat(descriptor).st_size)))
+    files.write_atomically(path, b"the new one")
+    assert seen == [(b"old", len(b"the new one"))]  # flushed before it is renamed
+    assert path.read_bytes() == b"the new one" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"old")
+    with pytest.raises(KeyError), files.replacing(path) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".mp4"
+        temporary.write_bytes(b"ha")
+        raise KeyError
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+# -- several seeds in one program, evaluation during training ----------------------------------------------------------
+
+
+def seeded(seed: int, **values: Any) -> TrainConfig:
+    """Settings of a training of four updates, a checkpoint after each."""
+    return settings(seed=seed, **{"total_steps": 4 * 16, "checkpoint__every": 1, **values})
+
+
+class Stop(Exception):
+    """An externally stopped training run."""
+
+
+def stop_after(updates: int) -> Any:
+    """A callback that stops a training run midway."""
+
+    def on_update(state: Any, row: dict[str, float]) -> None:
+        if row["updates"] > updates:
+            raise Stop
+
+    return on_update
+
+
+@pytest.fixture(scope="module")
+def alone(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Traces, TrainState]:
+    """A training of seed 1 by itself: its folder, recorded steps and last state."""
+    folder, recorder = tmp_path_factory.mktemp("alone"), Traces()
+    (state,) = train_seeds(PROBE, [seeded(1)], [folder], recorder=recorder)
+    return folder, recorder, state
+
+
+@pytest.mark.soak
+def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
+    configs = [seeded(seed) for seed in (0, 1, 2)]
+    folders = [tmp_path / f"seed{config.seed}" for config in configs]
+    with pytest.raises(Stop):
+        train_seeds(PROBE, configs, folders, on_update=stop_after(2))
+    (folders[1] / "checkpoints" / "step_000000000032.safetensors").unlink()  # killed between two seeds' checkpoints
+    states = train_seeds(PROBE, configs, folders, resume=True)
+    pairs = zip(jax.tree.leaves(states[1].params), jax.tree.leaves(alone[2].params), strict=True)
+    for together, single in pairs:
+        np.testing.assert_allclose(together, single, rtol=1e-4, atol=1e-5)
+    assert int(states[1].updates) == 4
+    assert [len((folder / "metrics.csv").read_text().splitlines()) for folder in (folders[1], alone[0])] == [5, 5]
+    assert read_policy(folders[2]).metadata["env_steps"] == 64
+    longer = [override(config, {"total_steps": 80}) for config in configs]
+    assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 5  # one seed resumes separately
+
+
+def test_seeds_together_are_recorded_and_learn_as_alone(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
+    recorder, folders = Traces(), [tmp_path / "0", tmp_path / "1"]
+    train_seeds(PROBE, [seeded(0), seeded(1)], folders, recorder=recorder)
+    assert len(recorder.all) == len(alone[1].all) == 4
+    for together, single in zip(recorder.all, alone[1].all, strict=True):
+        assert together.snapshot.shape == together.diverged.shape == (4, 8)
+        np.testing.assert_array_equal(together.snapshot[:, 4:], single.snapshot)
+        np.testing.assert_allclose(together.action[:, 4:], single.action, atol=1e-4)
+    for one, other in zip(rows(folders[1]), rows(alone[0]), strict=True):
+        assert one.keys() == other.keys() and "trace" not in one
+        for name in one.keys() - {"seconds", "fps"}:
+            np.testing.assert_allclose(float(one[name]), float(other[name]), rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+def test_seeds_must_have_the_same_settings(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="only in the seed"):
+        train_seeds(PROBE, [seeded(0), seeded(1, ppo__clip=0.3)], [tmp_path / "a", tmp_path / "b"])
+
+
+def test_a_checkpoint_without_environments_is_small_and_resumes(
+    tmp_path: Path, alone: tuple[Path, Traces, TrainState]
+) -> None:
+    config = seeded(1, checkpoint__environments=False)
+    with pytest.raises(Stop):
+        train(PROBE, config, tmp_path, on_update=stop_after(2))
+    small, large = (list_checkpoints(folder)[-1].stat().st_size for folder in (tmp_path, alone[0]))
+    assert small < large
+    state = train(PROBE, config, tmp_path, resume=True)
+    assert int(state.updates) == 4
+    assert np.all(np.asarray(state.rollout.env_state.step) >= 0)
+
+
+def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_path: Path) -> None:
+    configs = [seeded(seed, evaluation__every=2, evaluation__episodes=4, total_steps=5 * 16) for seed in (0, 1)]
+    folders = [tmp_path / f"seed{config.seed}" for config in configs]
+    with pytest.raises(Stop):
+        train_seeds(PROBE, configs, folders, on_update=stop_after(4), eval_env=PROBE)
+    train_seeds(PROBE, configs, folders, resume=True, eval_env=PROBE)
+    for folder in folders:
+        record = json.loads((folder / "evaluations.json").read_text())
+        assert [e["env_steps"] for e in record["evaluations"]] == [32, 64, 80]
+        assert record["absolute"]["episodes"] == 40
+        best = max(record["evaluations"], key=lambda e: e["sampled"]["average_step_reward"])
+        assert record["absolute"]["env_steps"] == best["env_steps"]
+        (policy,) = (folder / "best").glob("*.safetensors")
+        assert read_policy(policy).metadata["env_steps"] == best["env_steps"]
+        assert best["deterministic"]["average_step_reward"] != best["sampled"]["average_step_reward"]
+
+
+def test_evaluation_needs_environments(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"evaluation\.every"):
+        train(PROBE, seeded(0, evaluation__every=2), tmp_path)

@@ -11,10 +11,9 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 
-from tests.soak import memory, play
-from tests.soak.contained import Outcome
-from tests.soak.memory import Sample
-from tests.soak.report import Options, Report
+from tests.soak import play, processes
+from tests.soak.__main__ import Options, Report
+from tests.soak.processes import Outcome, Sample
 from tests.states import initial, made, placed
 
 
@@ -40,7 +39,7 @@ def test_a_report_is_resumed_and_repeats_only_rows_that_were_cut_off(tmp_path: P
 def test_memory_and_descriptors_may_not_grow_after_the_warm_up(grown: float, files: int, wrong: int) -> None:
     rows = [Sample(2.0 * i, int(5e8 * min(1.0, 0.5 + i / 60)), 20, 9) for i in range(300)]
     rows += [Sample(600.0 + 2.0 * i, int(5e8 * grown), files, 9) for i in range(60)]
-    row, found = memory.judged(rows, [])
+    row, found = processes.judged(rows, [])
     assert row["minutes"] == 12.0 and row["descriptors_late"] == files
     assert len(found) == wrong
 
@@ -59,7 +58,7 @@ def test_a_robot_behind_a_wall_or_below_the_ground_is_outside() -> None:
 PROGRAM = """
 import json, sys, time
 from pathlib import Path
-from tests.soak import contained as c
+from tests.soak import processes as c
 c.SECONDS, c.BYTES = 3.0, 3 * 10**8
 def hangs(): time.sleep(60)
 def grows(): return len([b"x" * (10**7 + i) for i in range(100)] + [time.sleep(60)])

@@ -18,7 +18,7 @@ from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import override, to_mapping
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.estimates import group
-from mqe_jax.study.runs import REWARD, Cell, Run, load_reference, table
+from mqe_jax.study.runs import REWARD, Cell, load_reference, table
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
@@ -39,10 +39,10 @@ def policy_of(seed: int, **network: Any) -> TrainedPolicy:
     settings = {"normalization": {"observations": True}, "evaluation": {"every": 1}, "total_steps": 100_000}
     config = override(TrainConfig(task=CELL.task, seed=seed), {**settings, **network})
     built = config.network.build(DIMS)
-    params = built.policy_params(built.init(jax.random.PRNGKey(seed)))
+    params = built.policy_params(jax.jit(built.init)(jax.random.PRNGKey(seed)))
     leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.PRNGKey(seed), len(leaves))
-    moved = [x + 0.05 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    random = np.random.default_rng(seed)
+    moved = [x + jnp.asarray(random.normal(0.0, 0.05, x.shape), x.dtype) for x in leaves]
     statistics = running_init(DIMS.observation)._replace(samples=jnp.float32(4e7), mean=jnp.full(16, 0.123))
     steps = config.num_updates * config.steps_per_update
     metadata = {"task": CELL.task, "env_steps": steps}
@@ -172,16 +172,6 @@ def test_every_published_run_belongs_to_a_sweep() -> None:
         sweep = sweeps.load_sweep(RESULTS / "sweeps.yaml", part)
         planned |= {(cell, seed) for cell in sweeps.select(sweep) for seed in sweep.seeds}
     assert {(run.cell, run.seed) for run in publish.read_tables(RESULTS)} <= planned
-
-
-@pytest.mark.parametrize("file", sorted(RESULTS.glob("policies/*/*.safetensors")), ids=lambda file: file.stem)
-def test_published_policies_are_the_best_of_their_cells(file: Path) -> None:
-    policy = read_policy(file)
-    cell = Cell.at(file.with_suffix(""))
-    runs: list[Run] = [run for run in publish.read_tables(RESULTS) if run.cell == cell]
-    best = max(runs, key=lambda run: (run.absolute or {})["sampled"][REWARD])
-    assert best.absolute is not None and best.absolute["env_steps"] == policy.metadata["env_steps"]
-    assert (best.seed, cell.task) == (policy.config.seed, policy.config.task)
 
 
 @pytest.mark.parametrize(

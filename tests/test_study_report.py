@@ -1,6 +1,6 @@
 """Reports from made-up runs: same data, same files; figures, tables and reference values. Statistics of few runs.
 
-The statistics are compared with the package `rliable` 1.2.0 on random matrices (data/rliable.json), which samples its
+The statistics are compared with the package `rliable` 1.2.0 on random matrices (`PACKAGE`), which samples its
 bootstrap from numpy's global state, seeded before each interval.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -137,16 +136,46 @@ def test_cells_are_named_by_their_folders() -> None:
 
 # -- statistics --
 
-FIXTURE = json.loads((Path(__file__).parent / "data" / "rliable.json").read_text(encoding="utf-8"))
-CASES = pytest.mark.parametrize("case", FIXTURE["cases"], ids=lambda case: str(np.shape(case["x"])))
+# Of rliable 1.2.0: x, y and what it returns for them.
+PACKAGE: dict[str, Any] = {
+    "seed": 7, "samples": 500, "thresholds": [-1.0, -0.25, 0.0, 0.5, 1.5],
+    "cases": [
+        {"x": [[0.13, -0.13, 0.64, 0.1, -0.54, 0.36], [1.3, 0.95, -0.7, -1.27, -0.62, 0.04], [-2.33, -0.22, -1.25,
+        -0.73, -0.54, -0.32], [0.41, 1.04, -0.13, 1.37, -0.67, 0.35], [0.9, 0.09, -0.74, -0.92, -0.46, 0.22]], "y":
+        [[0.13, -0.13, 0.64, 0.1, -0.54, 0.36], [-0.35, 0.17, 1.08, 1.79, -0.96, 1.81], [1.65, 1.08, 0.56, -0.01,
+        1.76, 2.26], [2.1, 1.62, 0.66, -0.91, 0.3, 0.96], [-0.99, 0.7, 0.73, 1.0, -0.88, -0.36]], "iqm":
+        -0.14625000000000002, "probability_of_improvement": 0.30333333333333334, "profile": [0.9, 0.5666666666666667,
+        0.4666666666666667, 0.2, 0.0], "iqm_interval": [-0.34574999999999995, 0.11914062499999992],
+        "improvement_interval": [0.1549166666666667, 0.43], "profile_interval": [[0.8, 1.0], [0.43333333333333335,
+        0.7], [0.3333333333333333, 0.6], [0.06666666666666667, 0.3333333333333333], [0.0, 0.0]]},
+        {"x": [[-0.44], [-1.17], [1.74]], "y": [[-0.44], [0.63], [0.04], [1.88]], "iqm": 0.04333333333333337,
+        "probability_of_improvement": 0.2916666666666667, "profile": [0.6666666666666666, 0.3333333333333333,
+        0.3333333333333333, 0.3333333333333333, 0.3333333333333333], "iqm_interval": [-1.17, 1.74],
+        "improvement_interval": [0.0, 0.75], "profile_interval": [[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [0.0, 1.0],
+        [0.0, 1.0]]},
+        {"x": [[1.32, 0.63], [-2.2, 0.05], [0.68, 1.0], [-0.62, 1.82], [-1.32, -0.66], [0.94, 0.05], [2.0, 0.19],
+        [-0.63, -0.38], [-1.09, -1.28], [0.63, 0.58]], "y": [[1.32, 0.63], [1.99, 0.01], [1.87, -0.13], [-0.44, 0.55],
+        [1.33, 0.46], [-0.29, -1.04], [-1.1, 0.8]], "iqm": 0.118, "probability_of_improvement": 0.41428571428571426,
+        "profile": [0.8, 0.6, 0.6, 0.45, 0.1], "iqm_interval": [-0.3534499999999998, 0.617525],
+        "improvement_interval": [0.2266964285714286, 0.5964285714285714], "profile_interval": [[0.6, 0.95], [0.4,
+        0.8], [0.4, 0.8], [0.25, 0.65], [0.0, 0.25]]},
+        {"x": [[0.99, -0.16, -1.07]], "y": [[0.99, -0.16, -1.07], [0.92, -1.95, 0.69]], "iqm": -0.08,
+        "probability_of_improvement": 0.5833333333333334, "profile": [0.6666666666666666, 0.6666666666666666,
+        0.3333333333333333, 0.3333333333333333, 0.0], "iqm_interval": [-0.08, -0.08], "improvement_interval":
+        [0.4166666666666667, 0.75], "profile_interval": [[0.6666666666666666, 0.6666666666666666],
+        [0.6666666666666666, 0.6666666666666666], [0.3333333333333333, 0.3333333333333333], [0.3333333333333333,
+        0.3333333333333333], [0.0, 0.0]]},
+    ],
+}  # fmt: skip
+CASES = pytest.mark.parametrize("case", PACKAGE["cases"], ids=lambda case: str(np.shape(case["x"])))
 
 
 class PackageRandom:
     """The package's samples: numpy's older generator, one index per run and task, the matrices in turn."""
 
     def __init__(self, *shapes: tuple[int, ...]) -> None:
-        state = np.random.RandomState(FIXTURE["seed"])
-        draws = [[state.randint(0, shape[0], shape) for shape in shapes] for _ in range(FIXTURE["samples"])]
+        state = np.random.RandomState(PACKAGE["seed"])
+        draws = [[state.randint(0, shape[0], shape) for shape in shapes] for _ in range(PACKAGE["samples"])]
         self.drawn = [np.stack(matrix) for matrix in zip(*draws, strict=True)]
 
     def integers(self, low: int, high: int, size: tuple[int, ...]) -> np.ndarray:
@@ -161,14 +190,14 @@ def test_point_estimates_equal_the_package(case: dict[str, Any]) -> None:
     np.testing.assert_allclose(statistics.interquartile_mean(x), case["iqm"], rtol=1e-12)
     improvement = statistics.probability_of_improvement(x, y)
     np.testing.assert_allclose(improvement, case["probability_of_improvement"], rtol=1e-12)
-    profile = statistics.performance_profile(x, FIXTURE["thresholds"])
+    profile = statistics.performance_profile(x, PACKAGE["thresholds"])
     np.testing.assert_allclose(profile, case["profile"], rtol=1e-12)
 
 
 @CASES
 def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> None:
     x, y = np.array(case["x"]), np.array(case["y"])
-    samples = FIXTURE["samples"]
+    samples = PACKAGE["samples"]
 
     def interval(scores: Any, statistic: Any, random: Any) -> np.ndarray:
         return np.stack(statistics.bootstrap_interval(scores, statistic, random, samples=samples), axis=-1)
@@ -179,7 +208,7 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
     np.testing.assert_allclose(improvement, case["improvement_interval"], rtol=1e-9, atol=1e-12)
 
     def profile(scores: np.ndarray) -> np.ndarray:
-        return statistics.performance_profile(scores, FIXTURE["thresholds"])
+        return statistics.performance_profile(scores, PACKAGE["thresholds"])
 
     profiles = interval([x], profile, PackageRandom(x.shape))
     np.testing.assert_allclose(profiles, case["profile_interval"], rtol=1e-9, atol=1e-12)

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import assert_same
 from safetensors.numpy import save_file
 
 from mqe_jax.errors import InputError
@@ -21,6 +20,7 @@ from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
+from tests.training import assert_same
 
 ROWS = [
     {"env_steps": 100, "average_step_reward": 0.25, "success": math.nan},

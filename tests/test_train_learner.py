@@ -7,9 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
-from probes import Probe, Traces
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build, override
@@ -18,6 +16,8 @@ from mqe_jax.train.evaluate import Evaluator, evaluate
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
+from tests import training as probes
+from tests.training import Probe, Traces
 
 
 def small(**values: Any) -> TrainConfig:
@@ -258,7 +258,7 @@ def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered
     config = small(num_envs=4, stagger_episodes=True, network__critic_input="observations", ppo__epochs=1)
     config = override(config, {"normalization.observations": True})
     config = override(config, {"curriculum.failure_bootstrap": 0.5})
-    state = make_learner(Foreign(), config).init(jax.random.PRNGKey(1))
+    state = jax.jit(make_learner(Foreign(), config).init)(jax.random.PRNGKey(1))
     assert len(np.unique(state.rollout.env_state.step)) > 1
     _, metrics = learn(Foreign(), config, 1)
     assert all(np.isfinite(float(value)) for value in metrics.values())

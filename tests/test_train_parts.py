@@ -116,14 +116,8 @@ def test_schedules_by_hand() -> None:
 def test_the_assistance_follows_success_below_its_annealed_value() -> None:
     config = TrainConfig(curriculum=Curriculum(assistance=0.8, assistance_step=0.1))
     fixed = TrainConfig(curriculum=Curriculum(assistance=0.8))
-    for success, before, after in (
-        (0.9, 0.5, 0.4),
-        (0.5, 0.5, 0.5),
-        (0.1, 0.5, 0.6),
-        (math.nan, 0.5, 0.5),
-        (1.0, 0.05, 0.0),
-        (0.0, 0.75, 0.8),
-    ):
+    rows = (0.9, 0.5, 0.4), (0.5, 0.5, 0.5), (0.1, 0.5, 0.6), (math.nan, 0.5, 0.5), (1.0, 0.05, 0.0), (0.0, 0.75, 0.8)
+    for success, before, after in rows:
         now = jnp.float32(before), jnp.float32(success)
         assert float(next_assistance(config, *now)) == pytest.approx(after)
         assert float(next_assistance(fixed, *now)) == pytest.approx(0.8)
@@ -134,7 +128,7 @@ def test_running_statistics_merge_as_one_batch() -> None:
     statistics = running_init(3)
     np.testing.assert_array_equal(running_normalize(statistics, data), data)
     for part in (data[:10], data[10:35], data[35:]):
-        statistics = running_update(statistics, part.reshape(-1, 1, 3))
+        statistics = jax.jit(running_update)(statistics, part.reshape(-1, 1, 3))
     np.testing.assert_allclose(statistics.mean, data.mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(statistics.variance, data.var(axis=0), rtol=1e-4)
     np.testing.assert_array_equal(running_normalize(statistics, jnp.array([1e6, -1e6, 3.0]))[:2], [10.0, -10.0])
@@ -226,9 +220,10 @@ def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
     )
     dims = EnvDims(agents=1, observation=2, privileged=0, action=3, values=1)
     network = settings.build(dims)
-    params = network.init(KEY)
+    params = jax.jit(network.init)(KEY)
     obs, first, action = jnp.zeros((1, 1, 1, 2)), jnp.zeros((1, 1), bool), jnp.zeros((1, 1, 1, 3))
 
+    @jax.jit
     def entropy(log_std: jax.Array) -> jax.Array:
         now = network.evaluate(
             {**params, "log_std": log_std}, network.initial_memory(1), first, obs, obs[:, :, 0], action
@@ -259,9 +254,9 @@ def test_normalised_layers_by_hand(recurrent: bool) -> None:
     dims = EnvDims(agents=2, observation=3, privileged=0, action=2, values=2)
     network = settings.build(dims)
     obs = jax.random.normal(KEY, (6, 2, 3))
-    params = jax.tree.map(lambda x: x + 0.1, network.init(KEY))
+    params = jax.tree.map(lambda x: x + 0.1, jax.jit(network.init)(KEY))
     memory = network.initial_memory(6)
-    mean, _, after = network.act(params, memory.actor, obs, None)
+    mean, _, after = jax.jit(network.act)(params, memory.actor, obs, None)
 
     actor = params["actor"]
     norm = lambda i, x: nn.layer_norm(actor["norm"][str(i)], x)  # noqa: E731

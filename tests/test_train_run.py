@@ -14,10 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
-from probes import Probe, Traces, assert_same
 
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import build, override
@@ -31,7 +28,10 @@ from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
 from mqe_jax.viz.curves import draw_curve
+from tests import training as probes
+from tests.training import Probe, Traces, assert_same
 
+pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 
@@ -55,26 +55,8 @@ def rows(run_dir: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_programs_are_kept(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Shares one compiled update between all training runs of this file."""
-    names = (
-        "jax_compilation_cache_dir",
-        "jax_persistent_cache_min_compile_time_secs",
-        "jax_persistent_cache_min_entry_size_bytes",
-    )
-    before = [getattr(jax.config, name) for name in names]
-    for name, value in zip(names, (str(tmp_path_factory.mktemp("compiled")), 0.5, -1), strict=True):
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield
-    for name, value in zip(names, before, strict=True):
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-
-
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
+def straight(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
     """A complete training run: its folder and its last state."""
     run_dir = tmp_path_factory.mktemp("runs") / "straight"
     return run_dir, train(PROBE, settings(), run_dir)

@@ -267,14 +267,8 @@ def test_shipped_policy_walks() -> None:
 
 def test_actuator_network_computes_softsign_layers() -> None:
     random = np.random.default_rng(0)
-    shapes: dict[str, tuple[int, ...]] = {
-        "0.weight": (32, 6),
-        "0.bias": (32,),
-        "2.weight": (32, 32),
-        "2.bias": (32,),
-        "4.weight": (1, 32),
-        "4.bias": (1,),
-    }
+    shapes: dict[str, tuple[int, ...]] = {"0.weight": (32, 6), "2.weight": (32, 32), "4.weight": (1, 32)}
+    shapes |= {"0.bias": (32,), "2.bias": (32,), "4.bias": (1,)}
     flat = {name: random.normal(size=shape) for name, shape in shapes.items()}
     params: Any = {}
     for name, value in flat.items():

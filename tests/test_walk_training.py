@@ -23,7 +23,7 @@ from mqe_jax.train.types import NetworkMemory
 from mqe_jax.walk.network import WalkNetwork, mirror_action, mirror_history, symmetry_loss, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
-from tests.probes import Probe
+from tests.training import Probe
 
 DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
 
@@ -57,17 +57,8 @@ def probe(num_envs: int = 4) -> Any:
     def pay(hidden: jax.Array, action: jax.Array) -> jax.Array:
         return -jnp.mean(jnp.square(action), axis=-1)
 
-    return Probe(
-        waves,
-        pay,
-        num_envs=num_envs,
-        num_agents=1,
-        action_size=12,
-        features=69,
-        max_episode_steps=5,
-        odd_episode_steps=31,
-        teams=((0,),),
-    )
+    sizes = {"num_agents": 1, "action_size": 12, "features": 69}
+    return Probe(waves, pay, num_envs, **sizes, max_episode_steps=5, odd_episode_steps=31, teams=((0,),))
 
 
 def settings(**changes: Any) -> Any:
@@ -99,18 +90,26 @@ def test_only_the_critic_learns_at_first() -> None:
 
 def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> None:
     network = WalkNetwork(symmetry_coef=0.0).build(DIMS)
-    params = network.init(jax.random.PRNGKey(0))
+    params = jax.jit(network.init)(jax.random.PRNGKey(0))
     obs = jax.random.normal(jax.random.PRNGKey(1), (3, 2, 1, 70))
     privileged = jax.random.normal(jax.random.PRNGKey(2), (3, 2, 5))
     rest = NetworkMemory(jnp.zeros((2, 29, 70)), ()), jnp.zeros((3, 2), bool), obs, privileged, jnp.zeros((3, 2, 1, 12))
 
-    def adaptation(params: Any) -> jax.Array:
-        return network.evaluate(params, *rest).losses["adaptation"]
+    @jax.jit
+    def evaluated(params: Any) -> Any:
+        """The adaptation loss, and the gradient of the log-densities."""
+
+        def log_prob(params: Any) -> tuple[jax.Array, jax.Array]:
+            now = network.evaluate(params, *rest)
+            return now.log_prob.sum(), now.losses["adaptation"]
+
+        gradient, loss = jax.grad(log_prob, has_aux=True)(params)
+        return loss, gradient["policy"]["adaptation"]
 
     latent = walk_policy.infer_latent(params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0]))
     error = np.square(latent - privileged[..., -2:]).mean()
-    assert float(adaptation(params)) == pytest.approx(float(error), rel=1e-5)
-    policy_gradient = jax.grad(lambda p: network.evaluate(p, *rest).log_prob.sum())(params)["policy"]["adaptation"]
+    loss, policy_gradient = evaluated(params)
+    assert float(loss) == pytest.approx(float(error), rel=1e-5)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(policy_gradient))  # the body's input has no gradient
 
 

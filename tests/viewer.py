@@ -25,17 +25,10 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.view.session import Session
 
 CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
-    "position": [3.0, 0.0, 2.0],
-    "fov": 0.87,
-    "near": 0.01,
-    "far": 1000.0,
-    "image_height": 480,
-    "image_width": 640,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, 0.0, 1.0],
-}
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [3.0, 0.0, 2.0],
+    "fov": 0.87, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 640,
+    "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
+}  # fmt: skip
 """Message that a browser sends first, with its camera's pose; viser ignores widgets before it."""
 
 
@@ -170,15 +163,12 @@ BAD_NUMBERS = (math.nan, math.inf, 1e300, None, "1", True, [0.0], {})
 OTHERS = (
     {"type": "FileTransferStartUpload", "part_count": 2**40, "size_bytes": 2**60, "filename": "x", "mime_type": ""},
     {"type": "FileTransferPart", "transfer_uuid": "x", "part_index": 0, "content": b"x" * 20_000},
-    {"type": "GuiFormDirtyMessage"},
-    {"type": "GuiFormSubmitMessage"},
+    *(
+        {"type": kind}
+        for kind in ("GuiFormDirtyMessage", "GuiFormSubmitMessage", "GuiRemoveMessage", "ResetGuiMessage")
+    ),
     {"type": "RunJavascriptMessage", "source": "alert(1)"},
-    {"type": "GuiRemoveMessage"},
-    {"type": "ResetGuiMessage"},
-    {"type": "Message"},
-    {"type": "NoSuchMessage"},
-    {"type": 1},
-    {"type": None},
+    *({"type": kind} for kind in ("Message", "NoSuchMessage", 1, None)),
     {},
 )
 
@@ -234,15 +224,13 @@ def _command(rng: np.random.Generator, panel: Panel) -> dict[str, Any]:
 
 def _keys(rng: np.random.Generator, panel: Panel) -> dict[str, Any]:
     """A valid message with a key less or a key more."""
-    message = _pick(
-        rng,
-        (
-            CAMERA,
-            {"type": "GuiUpdateMessage", "uuid": panel.uuid("Speed"), "updates": {"value": 2.0}},
-            {"type": "GuiButtonHoldMessage", "uuid": panel.uuid("Forward"), "frequency": 10.0},
-            {"type": "CommandTriggerMessage", "uuid": panel.commands["Reset"]},
-        ),
+    messages = (
+        CAMERA,
+        {"type": "GuiUpdateMessage", "uuid": panel.uuid("Speed"), "updates": {"value": 2.0}},
+        {"type": "GuiButtonHoldMessage", "uuid": panel.uuid("Forward"), "frequency": 10.0},
+        {"type": "CommandTriggerMessage", "uuid": panel.commands["Reset"]},
     )
+    message = _pick(rng, messages)
     if rng.integers(2):
         lost = _pick(rng, message.keys())
         return {key: value for key, value in message.items() if key != lost}

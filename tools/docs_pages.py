@@ -1,9 +1,9 @@
 """MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
-Generated: one page per task (clip, sizes, observation, rewards, parameters) with an overview, and the pages
-reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/ lead to the
-repository's address, `[project.urls]` in pyproject.toml; where it is not set they become paths, so that the built site
-needs neither the repository nor another host.
+Generated: the README as first page, one page per task (clip, sizes, observation, rewards, parameters) with an overview,
+and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/
+lead to the repository's address, `[project.urls]` in pyproject.toml; where it is not set they become paths, so that the
+built site needs neither the repository nor another host.
 """
 
 from __future__ import annotations
@@ -102,7 +102,13 @@ def pages() -> dict[str, str]:
         from mqe_jax.envs import TASKS
     made = {f"tasks/{name}.md": task_page(task) for name, task in TASKS.items()}
     made["tasks/index.md"] = overview(TASKS)
+    made["index.md"] = front((ROOT / "README.md").read_text(encoding="utf-8"))
     return made
+
+
+def front(readme: str) -> str:
+    """Returns the README as the site's first page, with its links as from docs/."""
+    return re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
 
 
 def overview(tasks: Mapping[str, Any]) -> str:

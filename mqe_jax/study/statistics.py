@@ -2,7 +2,7 @@
 
 Scores are float arrays (runs, tasks); a statistic maps scores with any leading axes (..., runs, tasks) to (...).
 Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 2022, arXiv 2209.10485 (their use in
-MARL). Numbers equal those of the `rliable` package (tests/data/rliable.json).
+MARL). Numbers equal those of the `rliable` package (tests/test_study_report.py).
 """
 
 from __future__ import annotations

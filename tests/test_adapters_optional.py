@@ -1,9 +1,13 @@
-"""The Brax and JaxMARL adapters: their conventions, automatic resets, names of tasks, and the example."""
+"""The adapters of Brax, JaxMARL and PettingZoo: conventions, resets, names of tasks, and the libraries' own tests."""
 
 from __future__ import annotations
 
+import functools
 import importlib
+import pickle
 import sys
+import types
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,14 @@ from mqe_jax.errors import InputError
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 COUNT, LIMIT, STEPS = 3, 3, 7
+GIVEN = r"actions: for \['robot_0'\]; expected one for each of robot_0, robot_1"
 TASKS = ["go1gate", *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate")]
+
+
+def adapter(library: str) -> Any:
+    """The adapter of a library; without it the test is skipped."""
+    pytest.importorskip(library, reason=f"needs the extra {library}")
+    return importlib.import_module(f"mqe_jax.adapters.{library}")
 
 
 def task_env(task: str) -> Any:
@@ -29,24 +40,22 @@ def task_env(task: str) -> Any:
 @pytest.mark.parametrize("task", TASKS)
 def test_brax_rollout(task: str) -> None:
     """Under `wrap`: shapes, truncation separate from done, final observations, new episodes after each reset."""
-    pytest.importorskip("brax", reason="needs the extra brax")
-    from mqe_jax.adapters.brax import FINAL_OBS, Env, wrap
-
-    env = Env(task_env(task))
+    brax = adapter("brax")
+    env = brax.Env(task_env(task))
     assert env.episode_length == LIMIT and env.backend == "c"
-    wrapped = wrap(env, env.episode_length)
+    wrapped = brax.wrap(env, env.episode_length)
     step, action_size = wrapped.step, env.action_size
 
     @jax.jit
     def play(key: jax.Array) -> Any:
         def one(state: Any, _: None) -> Any:
             state = step(state, jnp.zeros((COUNT, action_size)))
-            names = ("truncation", FINAL_OBS, "steps")
+            names = ("truncation", brax.FINAL_OBS, "steps")
             return state, (state.obs, state.reward, state.done, *(state.info[name] for name in names))
 
         first = wrapped.reset(jax.random.split(key, COUNT))
         rows = jax.lax.scan(one, first, None, STEPS)[1]
-        return first.obs, first.info[FINAL_OBS], rows
+        return first.obs, first.info[brax.FINAL_OBS], rows
 
     start, final, (obs, reward, done, truncation, final_obs, steps) = play(jax.random.PRNGKey(0))
     np.testing.assert_array_equal(start, final)
@@ -65,10 +74,7 @@ def test_brax_rollout(task: str) -> None:
 @pytest.mark.soak
 def test_brax_done_is_a_termination() -> None:
     """Without EpisodeWrapper, only info reports the time limit; the metrics are the task's."""
-    pytest.importorskip("brax", reason="needs the extra brax")
-    from mqe_jax.adapters.brax import Env
-
-    env = Env(task_env("go1gate"))
+    env = adapter("brax").Env(task_env("go1gate"))
     state = env.reset(jax.random.PRNGKey(0))
     own: Any = state.pipeline_state
     late = own.__class__(**{**own.__dict__, "step": jnp.asarray(LIMIT - 1)})
@@ -80,53 +86,37 @@ def test_brax_done_is_a_termination() -> None:
 
 def test_brax_wrap_names_what_it_does_not_take() -> None:
     """Foreign environments, and randomisation functions of Brax's kind."""
-    pytest.importorskip("brax", reason="needs the extra brax")
-    from brax.envs.wrappers.training import VmapWrapper
-
-    from mqe_jax.adapters.brax import Env, wrap
-
-    env = Env(task_env("go1gate"))
+    brax = adapter("brax")
+    vectorised = importlib.import_module("brax.envs.wrappers.training").VmapWrapper(brax.Env(task_env("go1gate")))
     with pytest.raises(InputError, match="randomization_fn: not supported"):
-        wrap(VmapWrapper(env), randomization_fn=lambda system: system)
+        brax.wrap(vectorised, randomization_fn=lambda system: system)
     with pytest.raises(InputError, match="env: object is not"):
-        wrap(type("Foreign", (), {"unwrapped": object()})())  # type: ignore[arg-type]
+        brax.wrap(type("Foreign", (), {"unwrapped": object()})())  # type: ignore[arg-type]
 
 
 def test_brax_action_of_another_size_is_named() -> None:
-    pytest.importorskip("brax", reason="needs the extra brax")
-    from mqe_jax.adapters.brax import Env
-
-    env = Env(task_env("go1gate"))
+    env = adapter("brax").Env(task_env("go1gate"))
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     with pytest.raises(InputError, match=rf"action: shape \(3,\); expected \({env.action_size},\)"):
         jax.eval_shape(env.step, state, jnp.zeros(3))
 
 
 def test_jaxmarl_missing_agent_is_named() -> None:
-    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    from mqe_jax.adapters.jaxmarl import Env
-
-    env = Env(task_env("go1gate"))
+    env = adapter("jaxmarl").Env(task_env("go1gate"))
     _, state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    with pytest.raises(InputError, match=r"actions: for \['robot_0'\]; expected one for each of robot_0, robot_1"):
+    with pytest.raises(InputError, match=GIVEN):
         jax.eval_shape(env.step, jax.random.PRNGKey(1), state, {"robot_0": jnp.zeros(3)})
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_jaxmarl_rollout(task: str) -> None:
     """Under LogWrapper: dicts by agent, truncation in the infos, one value per agent, new episodes after a reset."""
-    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    pytest.importorskip("six", reason="gymnax, which JaxMARL imports, needs six")
-    from jaxmarl.wrappers.baselines import LogWrapper
-
-    from mqe_jax.adapters.jaxmarl import Env
-
-    env = Env(task_env(task))
+    env = adapter("jaxmarl").Env(task_env(task))
     agents: Any = env.agents
     spaces: Any = env.observation_spaces
     assert agents == [f"robot_{i}" for i in range(env.num_agents)] and env.name == task
     assert [a for team in env.agent_classes.values() for a in team] == agents
-    wrapped = LogWrapper(env)
+    wrapped = importlib.import_module("jaxmarl.wrappers.baselines").LogWrapper(env)
     zero = {agent: jnp.zeros((COUNT, env.env.action_size)) for agent in agents}
 
     @jax.jit
@@ -156,10 +146,7 @@ def test_jaxmarl_rollout(task: str) -> None:
 @pytest.mark.soak
 def test_jaxmarl_resets_to_a_given_state() -> None:
     """An ended episode continues from `reset_state`; a running one does not."""
-    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    from mqe_jax.adapters.jaxmarl import Env
-
-    env = Env(mqe_jax.make("go1gate", impl="c", episode_length=2 * 0.02))
+    env = adapter("jaxmarl").Env(mqe_jax.make("go1gate", impl="c", episode_length=2 * 0.02))
     obs, start = env.reset(jax.random.PRNGKey(1))
     zero = {agent: jnp.zeros(3) for agent in env.agents}
     running, state, *_ = env.step(jax.random.PRNGKey(2), start, zero, start)
@@ -171,7 +158,7 @@ def test_jaxmarl_resets_to_a_given_state() -> None:
     assert np.abs(state.final_obs - state.obs).max() > 1e-4
 
 
-@pytest.mark.parametrize("library", ["brax", "jaxmarl"])
+@pytest.mark.parametrize("library", ["brax", "jaxmarl", "pettingzoo"])
 def test_without_the_library_the_extra_is_named(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Importing the adapter names the extra to install."""
     for name in [name for name in sys.modules if name.split(".")[0] == library]:
@@ -185,7 +172,7 @@ def test_without_the_library_the_extra_is_named(library: str, monkeypatch: pytes
 @pytest.mark.soak
 def test_brax_ppo_example_trains() -> None:
     """Brax's own PPO runs through the adapter and reports evaluations."""
-    pytest.importorskip("brax", reason="needs the extra brax")
+    adapter("brax")
     brax_ppo = importlib.import_module("brax_ppo")
 
     env = brax_ppo.Env("go1gate", impl="c", episode_length=0.5)
@@ -195,19 +182,15 @@ def test_brax_ppo_example_trains() -> None:
 
 
 def test_brax_knows_the_tasks_by_name() -> None:
-    brax_envs = pytest.importorskip("brax.envs", reason="needs the extra brax")
-    from mqe_jax.adapters.brax import Env
-
-    env = brax_envs.get_environment("go1gate", impl="c", control="position")
-    assert isinstance(env, Env) and env.action_size == 24
+    brax = adapter("brax")
+    env = importlib.import_module("brax.envs").get_environment("go1gate", impl="c", control="position")
+    assert isinstance(env, brax.Env) and env.action_size == 24
 
 
 def test_jaxmarl_makes_the_tasks_and_still_its_own() -> None:
-    jaxmarl = pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    from mqe_jax.adapters import jaxmarl as adapter
-
-    adapter.register()
-    assert isinstance(jaxmarl.make("go1gate", impl="c", control="position"), adapter.Env)
+    ours, jaxmarl = adapter("jaxmarl"), importlib.import_module("jaxmarl")
+    ours.register()
+    assert isinstance(jaxmarl.make("go1gate", impl="c", control="position"), ours.Env)
     assert jaxmarl.registered_envs.count("go1gate") == 1
     assert jaxmarl.make("MPE_simple_spread_v3").num_agents == 3
     with pytest.raises(ValueError, match="go1gat is not in registered"):
@@ -216,11 +199,8 @@ def test_jaxmarl_makes_the_tasks_and_still_its_own() -> None:
 
 def test_jaxmarl_world_state_and_discrete_actions() -> None:
     """The world state is the privileged observation; an integer sets one command to its limit, 0 none."""
-    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
-    from mqe_jax.adapters.jaxmarl import Env
-
     task = task_env("go1gate")
-    env = Env(task, discrete=True)
+    env = adapter("jaxmarl").Env(task, discrete=True)
     _, state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     assert jax.eval_shape(env.get_world_state, state).shape == (env.world_state_size(),)
     assert env.world_state_size() == task.privileged_observation_size
@@ -237,7 +217,7 @@ def test_jaxmarl_world_state_and_discrete_actions() -> None:
 
 def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
     """`python -m mqe_jax.adapters SCRIPT` passes the arguments on and finds modules beside the script."""
-    pytest.importorskip("jaxmarl", reason="needs the extra jaxmarl")
+    adapter("jaxmarl")
     runner = importlib.import_module("mqe_jax.adapters.__main__")
     monkeypatch.setattr(sys, "argv", list(sys.argv))
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -255,3 +235,113 @@ def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any
         with pytest.raises(SystemExit, match="2"):
             runner.main(wrong)
         assert "expected a Python file" in capsys.readouterr().err
+
+
+# -- PettingZoo --------------------------------------------------------------------------------------------------------
+
+SHORT: dict[str, Any] = {"episode_length": 5 * 0.02, "impl": "c"}
+
+
+@pytest.fixture
+def zoo() -> Any:
+    """The adapter of PettingZoo."""
+    return adapter("pettingzoo")
+
+
+def own_test(name: str) -> Any:
+    """One of PettingZoo's own tests."""
+    return getattr(importlib.import_module("pettingzoo.test"), name)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_parallel_api(task: str, zoo: Any) -> None:
+    """PettingZoo's parallel_api_test passes without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        own_test("parallel_api_test")(zoo.parallel_env(task, **SHORT), num_cycles=12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_parallel_seed(task: str, zoo: Any) -> None:
+    """PettingZoo's parallel_seed_test: the same seed gives the same episode, exactly."""
+    own_test("parallel_seed_test")(functools.partial(zoo.parallel_env, task, **SHORT), num_cycles=10)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_max_cycles(task: str, zoo: Any) -> None:
+    """PettingZoo's max_cycles_test, on the module for the default task, else on its two functions for the task."""
+    module = types.SimpleNamespace(
+        parallel_env=functools.partial(zoo.parallel_env, task), env=functools.partial(zoo.env, task)
+    )
+    own_test("max_cycles_test")(zoo if task == "go1gate" else module)
+
+
+def test_steps_of_both_forms(zoo: Any) -> None:
+    """Agents are named robot_i with their own rewards and infos, end together, and an ended episode has no agents."""
+    env = zoo.parallel_env("go1gate", **SHORT)
+    obs, infos = env.reset(seed=3)
+    assert env.agents == env.possible_agents == ["robot_0", "robot_1"] == list(obs)
+    assert env.teams == (("robot_0", "robot_1"),) and infos == {"robot_0": {}, "robot_1": {}}
+    assert env.state() in env.state_space
+    zero = {agent: np.zeros(3, np.float32) for agent in env.agents}
+    for _ in range(4):
+        obs, reward, *_ = env.step(zero)
+        assert set(obs) == set(reward) == set(env.possible_agents)
+        assert all(obs[agent] in env.observation_space(agent) for agent in obs)
+    *_, terminated, truncated, infos = env.step(zero)
+    assert truncated == {"robot_0": True, "robot_1": True} and not any(terminated.values())
+    assert infos["robot_0"]["success"] == 0.0 and infos["robot_0"] is not infos["robot_1"]
+    assert env.agents == [] and env.step({}) == ({}, {}, {}, {}, {})
+    env.close()
+
+
+def test_teams_and_zero_sum_rewards_of_a_match(zoo: Any) -> None:
+    """A match has two teams, by name."""
+    env = zoo.parallel_env("go1tug", impl="c")
+    assert env.teams == (("robot_0",), ("robot_1",)) and env.metadata["name"] == "go1tug"
+
+
+def test_pettingzoo_knows_the_tasks_by_name(zoo: Any) -> None:
+    """In both registries, once however often the module registers."""
+    pettingzoo = importlib.import_module("pettingzoo")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        zoo.register()
+        env = pettingzoo.make("parallel", "mqe/go1sheep-easy-v0", impl="c", control="position")
+    assert env.metadata["name"] == "go1sheep-easy"
+    assert {f"mqe/{task}-v0" for task in tasks()} <= set(pettingzoo.parallel_registry) & set(pettingzoo.aec_registry)
+
+
+def test_a_copy_is_a_new_environment_with_the_same_settings(zoo: Any) -> None:
+    """Vectorisers copy environments by pickling them."""
+    env = zoo.parallel_env("go1gate", **SHORT)
+    copy = pickle.loads(pickle.dumps(env))
+    assert copy.task is not env.task and copy.task.params == env.task.params
+    np.testing.assert_array_equal(copy.reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"])
+
+
+def test_render_of_pettingzoo(zoo: Any) -> None:
+    """An image in the mode rgb_array, otherwise none."""
+    env = zoo.parallel_env("go1gate", render_mode="rgb_array", render_size=(96, 64), **SHORT)
+    env.reset(seed=0)
+    image = env.render()
+    assert image is not None and image.shape == (64, 96, 3) and image.std() > 5
+    assert zoo.parallel_env("go1gate", **SHORT).render() is None
+
+
+def test_bad_input_is_named(zoo: Any) -> None:
+    """Actions of the wrong agents, a state before the reset, an unknown mode, two time limits."""
+    env = zoo.parallel_env("go1gate", **SHORT)
+    with pytest.raises(InputError, match="reset the environment first"):
+        env.state()
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=GIVEN):
+        env.step({"robot_0": np.zeros(3, np.float32)})
+    with pytest.raises(InputError, match="render_mode: 'human'"):
+        zoo.parallel_env(render_mode="human")
+    with pytest.raises(InputError, match=r"max_cycles: -1 is not allowed; .* greater than 0"):
+        zoo.parallel_env("go1gate", max_cycles=-1, impl="c", control="position")
+    with pytest.raises(InputError, match="episode_length: give either this or max_cycles"):
+        zoo.parallel_env("go1gate", max_cycles=4, **SHORT)
+    with pytest.raises(InputError, match="need the id of a task"):
+        zoo.parallel_env(env.task, max_cycles=4)

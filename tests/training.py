@@ -1,15 +1,25 @@
-"""For the learner's tests: physics-free environments with known solutions, and a comparison of trees."""
+"""For tests of training: physics-free environments with known solutions; comparisons of trees and of runs.
+
+`python -m tests.training RUN_A RUN_B [--rename OLD=NEW ...]` compares two runs bit for bit: every metric but times, and
+every array of policy and last checkpoint. It exits with 1 and names the first difference of each kind. With `--rename`,
+columns and arrays of RUN_A are looked up under a new name in RUN_B.
+"""
 
 from __future__ import annotations
 
+import argparse
+import csv
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from safetensors.numpy import load_file
 
+from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.types import Trace
 
 
@@ -75,27 +85,11 @@ class Probe:
         hidden = jax.random.rademacher(draw, (n,), jnp.float32)
         step = jnp.zeros((n,), jnp.int32)
         obs, privileged = self._observe(hidden, step)
-        zero = jnp.zeros((n,))
-        return ProbeState(
-            hidden=hidden,
-            obs=obs,
-            privileged_obs=privileged,
-            final_obs=obs,
-            final_privileged_obs=privileged,
-            reward=jnp.zeros((n, self.num_agents)),
-            terminated=zero > 0,
-            truncated=zero > 0,
-            metrics={
-                "reward/pay": zero,
-                "average_step_reward": zero,
-                "success": zero,
-                "team0/win": zero,
-                "diverged": zero,
-                "overflow": zero,
-            },
-            key=key,
-            step=step,
-        )
+        zero, reward = jnp.zeros((n,)), jnp.zeros((n, self.num_agents))
+        names = ("reward/pay", "average_step_reward", "success", "team0/win", "diverged", "overflow")
+        metrics = dict.fromkeys(names, zero)
+        seen = hidden, obs, privileged, obs, privileged
+        return ProbeState(*seen, reward, terminated=zero > 0, truncated=zero > 0, metrics=metrics, key=key, step=step)
 
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
         key, draw = jax.random.split(state.key)
@@ -115,27 +109,11 @@ class Probe:
         terminates = jnp.full(done.shape, self.terminates)
         if self.even_truncate:
             terminates &= jnp.arange(self.num_envs) % 2 == 1
-        short = done & (limit == jnp.minimum(odd, self.max_episode_steps))
-        return ProbeState(
-            hidden=hidden,
-            obs=obs,
-            privileged_obs=privileged,
-            final_obs=final_obs,
-            final_privileged_obs=final_privileged,
-            reward=reward,
-            terminated=done & terminates,
-            truncated=done & ~terminates,
-            metrics={
-                "reward/pay": pay,
-                "average_step_reward": pay,
-                "success": short.astype(jnp.float32),
-                "team0/win": short.astype(jnp.float32),
-                "diverged": jnp.zeros(done.shape),
-                "overflow": (jnp.arange(self.num_envs) % 2).astype(jnp.float32),
-            },
-            key=key,
-            step=step,
-        )
+        short = (done & (limit == jnp.minimum(odd, self.max_episode_steps))).astype(jnp.float32)
+        metrics = {"reward/pay": pay, "average_step_reward": pay, "success": short, "team0/win": short}
+        metrics |= {"diverged": jnp.zeros(done.shape), "overflow": (jnp.arange(self.num_envs) % 2).astype(jnp.float32)}
+        seen = hidden, obs, privileged, final_obs, final_privileged
+        return ProbeState(*seen, reward, done & terminates, done & ~terminates, metrics, key, step)
 
 
 def show_hidden(hidden: jax.Array, step: jax.Array) -> jax.Array:
@@ -205,3 +183,58 @@ def assert_same(one: Any, other: Any) -> None:
     assert one_structure == other_structure
     for a, b in zip(one_leaves, other_leaves, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    """Returns the rows of a run's metrics.csv without the columns of times."""
+    with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        return [{k: v for k, v in row.items() if k not in ("seconds", "fps")} for row in csv.DictReader(file)]
+
+
+def content(run: Path) -> dict[str, np.ndarray]:
+    """Returns these columns, as text, and the arrays of the policy and of the last checkpoint, where there is one."""
+    table = rows(run)
+    checkpoint = latest(run)
+    arrays = load_file(checkpoint) if checkpoint is not None else {}
+    columns = {name: np.array([row[name] for row in table]) for name in table[0]}
+    policy = {f"policy/{name}": array for name, array in load_file(run / "policy.safetensors").items()}
+    return columns | policy | {f"checkpoint/{name}": array for name, array in arrays.items()}
+
+
+def differences(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> list[str]:
+    """Returns one line for each entry that differs."""
+    found = [f"{name}: only in one run" for name in first.keys() ^ second.keys()]
+    for name in first.keys() & second.keys():
+        a, b = first[name], second[name]
+        if a.shape != b.shape:
+            found.append(f"{name}: {a.shape} and {b.shape}")
+            continue
+        unequal = a != b if a.dtype.kind != "f" else ~((a == b) | (np.isnan(a) & np.isnan(b)))
+        if unequal.any():
+            place = tuple(np.argwhere(unequal)[0].tolist())
+            found.append(f"{name}: at {place} {a[place]} and {b[place]}")
+    return found
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """Asserts that two runs are the same, and that the second one has no unfinished files."""
+    assert differences(content(one), content(other)) == []
+    assert not [path for path in other.rglob(".*")]
+
+
+def main() -> int:
+    """Prints the differences; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", nargs=2, type=Path)
+    parser.add_argument("--rename", nargs="*", default=[], metavar="OLD=NEW")
+    arguments = parser.parse_args()
+    names = dict(pair.split("=", 1) for pair in arguments.rename)
+    first, second = map(content, arguments.runs)
+    first = {names.get(name, name): values for name, values in first.items()}
+    found = differences(first, second)
+    print("\n".join(found) or f"equal: {len(first)} metrics and arrays")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""Climb on Seesaw: its scene, observation, rewards and endings on states made by hand, and the plank's physics."""
+"""Narrow Gate and Climb on Seesaw on states made by hand; endings of every task."""
 
 from __future__ import annotations
 
@@ -12,16 +12,146 @@ import numpy as np
 import pytest
 
 from mqe_jax import objects
-from mqe_jax.envs import Moment, State, make
+from mqe_jax.envs import TASKS, Moment, QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.objects import Door, Seesaw
 from mqe_jax.planners.cooperative import plan_seesaw, plan_seesaw_alone
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import angles, initial, made, moving, placed, robot_state, stepper
+from tests.states import angles, initial, made, moving, placed, robot_state, stepper, still
+
+
+@pytest.fixture(scope="module")
+def gate() -> QuadrupedEnv:
+    return made("go1gate")
+
+
+@pytest.fixture(scope="module")
+def gate_fresh(gate: QuadrupedEnv) -> State:
+    return initial(gate)
+
+
+def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv, gate_fresh: State) -> None:
+    both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
+    state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.4, 0.2]]))
+    obs = gate.observation_layout.pack(gate.observe(state, both))
+    first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
+    second = [0, 1, 4, 5, 0.6, 0, 0, 0.2, 1, 2, 0.3, 0, 0, 0.1, 3.4, 0.2]
+    np.testing.assert_allclose(obs, [first, second], atol=1e-6)
+
+
+def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, gate_fresh: State) -> None:
+    before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
+    # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
+    state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.5, 0.0]]))
+    after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
+    terms = gate.rewards(Moment(state, before), Moment(state, after), jnp.array(True))
+    assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
+    assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
+    # hypot(0.3, 0.43) = 0.524 m apart, which is not closer than 0.5 m
+    assert float(terms["crowding"]) == 0
+    reward, logged = weigh(terms, gate.params.rewards, 2)
+    np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
+    close = robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]])
+    near = gate.rewards(Moment(state, after), Moment(state, close), jnp.array(False))
+    assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
+    assert float(near["collision"]) == 0
+    assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
+
+
+def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, gate_fresh: State) -> None:
+    state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.5, 0.0]]))
+    both, one = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]]), robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
+    fine = jnp.array(False)
+    assert float(gate.outcome(state, both, fine)["success"]) == 1
+    assert float(gate.outcome(state, both, ~fine)["success"]) == 0
+    assert float(gate.outcome(state, one, fine)["success"]) == 0
+    assert float(gate.outcome(state, one, fine)["success/one"]) == 1
+
+
+# -- endings of every task: a fall, the time limit, and a collision in the tasks that end on one -----------------------
+
+
+def ground_height(env: Any, x: float, y: float) -> float:
+    """Height of the ground or object below (x, y), m."""
+    model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
+    data.qpos[env.index.base_qpos[:, 2]] = 50.0
+    mujoco.mj_kinematics(model, data)
+    geom = np.zeros(1, np.int32)
+    return 5.0 - mujoco.mj_ray(model, data, np.array([x, y, 5.0]), np.array([0, 0, -1.0]), None, 1, -1, geom)
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_endings(task: str) -> None:
+    """From the spawn poses, at standing height."""
+    env, step = made(task), stepper(task)
+    pose = np.array(env.spawn_poses())
+    height = [ground_height(env, x, y) + env.robot.stand_height + 0.01 for x, y, _ in pose]
+    position, euler = np.c_[pose[:, :2], height], np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
+
+    after = step(placed(env, position, euler), still(env))
+    assert not after.terminated and not after.truncated
+
+    late = dataclasses.replace(placed(env, position, euler), step=jnp.int32(env.max_steps - 1))
+    after = step(late, still(env))
+    assert after.truncated and not after.terminated
+
+    rolled, high = euler.copy(), position.copy()
+    rolled[-1, 0], high[-1, 2] = env.params.max_roll + 0.1, high[-1, 2] + 0.5
+    assert step(placed(env, high, rolled), still(env)).terminated
+    rolled[-1, 0] = env.params.max_roll - 0.1
+    assert not step(placed(env, high, rolled), still(env)).terminated
+
+    # The first robot's trunk lies across the second's: they touch.
+    if len(pose) > 1:
+        touching, across = position.copy(), euler.copy()
+        touching[0] = touching[1] + [0.0, 0.0, 0.09]
+        across[0, 2] = pose[1, 2] + np.pi / 2
+        bumped = step(placed(env, touching, across), still(env))
+        assert bool(bumped.metrics["collision"])
+        assert bool(bumped.terminated) == env.params.end_on_collision
+
+
+@pytest.mark.parametrize(
+    ("tasks", "time_limit", "end_on_collision"),
+    [
+        (("go1gate", "go1seesaw"), 10, True),
+        (("go1sheep-easy", "go1sheep-hard"), 15, True),
+        (("go1pushbox", "go1tug", "go1wrestling"), 15, False),
+        (("go1football-defender", "go1bridge", "go1football-1vs1", "go1football-2vs2"), 20, False),
+        (("go1revolvingdoor",), 5, False),
+    ],
+)
+def test_limits_are_those_of_the_paper(tasks: tuple[str, ...], time_limit: float, end_on_collision: bool) -> None:
+    for params in (made(task).params for task in tasks):
+        assert (params.episode_length, params.end_on_collision) == (time_limit, end_on_collision)
+
 
 SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
+
+
+@pytest.mark.parametrize(("task", "ceiling"), [("go1gate", True), ("go1seesaw", False)])
+def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(task: str, ceiling: bool) -> None:
+    env, step = made(task), stepper(task)
+    for height, euler, ends in (
+        (0.9, angles(roll=(0.9, 0.0)), True),
+        (0.9, angles(pitch=(1.2, 0.0)), False),
+        (1.6, angles(), ceiling),
+    ):
+        assert step(placed(env, [[1.0, -0.75, height], SPAWN[1]], euler), still(env)).terminated == ends
+    at_wall = placed(env, [[0.33, -0.75, 0.31], SPAWN[1]], angles(yaw=(np.pi, 0.0)))  # the head against the back wall
+    bumped = step(moving(env, at_wall, [-1.5, 0.0, 0.0]), still(env))
+    assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
+
+
+def test_a_trunk_too_low_has_fallen(gate: QuadrupedEnv) -> None:
+    assert gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]])).tolist() == [True, False]
+
+
+# -- Climb on Seesaw ---------------------------------------------------------------------------------------------------
+
+
 WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
 
 
@@ -132,27 +262,13 @@ def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: S
     assert float(env.outcome(fresh, up, fine)["success/height"]) == pytest.approx(1.3)
 
 
-def test_endings(env: Any, step: Any, fresh: State) -> None:
-    """A fall, a trunk too low, a collision and the time limit end an episode; standing, also high up, does not."""
-    still = jnp.zeros((2, 12))
-    stand = placed(env, SPAWN, state=fresh)
-    after = step(stand, still)
-    assert not after.terminated and not after.truncated
-    late = step(dataclasses.replace(stand, step=jnp.int32(env.max_steps - 1)), still)
-    assert late.truncated and not late.terminated
-    high = [[1.0, -0.75, 1.6], SPAWN[1]]
-    assert not step(placed(env, high, state=fresh), still).terminated
-    assert not step(placed(env, high, angles(pitch=(1.2, 0.0)), state=fresh), still).terminated
-    rolled = step(placed(env, high, angles(roll=(0.9, 0.0)), state=fresh), still)
+def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(env: Any, step: Any, fresh: State) -> None:
+    rolled = step(placed(env, [[1.0, -0.75, 1.6], SPAWN[1]], angles(roll=(0.9, 0.0)), state=fresh), still(env))
     assert rolled.terminated and float(rolled.metrics["reward/fall"]) == -2
-    turned = [[0.0, 0.0, np.pi], [0.0, 0.0, 0.0]]  # the head against the back wall
-    at_wall = placed(env, [[0.33, -0.75, 0.31], SPAWN[1]], turned, state=fresh)
-    bumped = step(moving(env, at_wall, [-1.5, 0.0, 0.0]), still)
-    assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
     low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
     qpos = low.data.qpos.at[env.index.joint_qpos[0, 1::3]].set(np.pi)
-    low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still)
+    low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still(env))
     assert low.terminated and float(low.metrics["collision"]) == 0 and float(low.metrics["reward/fall"]) == 0
 
 
@@ -192,12 +308,10 @@ def test_a_weight_beyond_the_hinge_tips_the_plank_slowly(place: float) -> None:
 
 
 def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step: Any, fresh: State) -> None:
-    still = jnp.zeros((2, 12))
-
     def stand(first: Any, second: Any, pitch: Any) -> State:
         after = placed(env, [first, second], angles(pitch=pitch), state=fresh)
         for _ in range(30):
-            after = step(after, still)
+            after = step(after, still(env))
         return after
 
     held = stand(on_plank(7.0), on_plank(3.9), (-0.25, -0.25))
@@ -210,7 +324,7 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
 
 
 def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
-    """Through the walk policy, in a few environments; examples/alone.py measures many."""
+    """Through the walk policy, in a few environments."""
     env, count = make("go1seesaw", impl="c", num_envs=20), 10
     partner = (jnp.arange(2 * count) < count)[:, None, None]
     layout = env.observation_layout
