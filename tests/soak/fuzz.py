@@ -80,7 +80,7 @@ def flag_cases() -> st.SearchStrategy[Any]:
         command = next(name for name in COMMANDS if words[: len(name.split())] == name.split())
         fields = [name.replace("_", "-") for name, _ in inputs.numbers(inputs.command_record(command))]
         codes = (2,) if words[-1].partition("=")[0].removeprefix("--") in fields else (0, 2)
-        words = [*words, *(SMALL if words[0] == "train" else [])]
+        words = [*words[:-1], *(SMALL if words[0] == "train" else []), words[-1]]  # of two flags the last one counts
         return " ".join(map(repr, words)), lambda: cli.main(words), _nothing, codes
 
     return inputs.wrong_flags().filter(lambda words: "\x00" not in "".join(words)).map(case)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import resource
 import shutil
@@ -15,24 +16,25 @@ from tests.soak.report import Report
 from tests.test_interrupts import assert_same_run, end, start, updates
 
 UPDATES = 120
-TRAIN = ["-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo", "--num-envs", "4"]
-TRAIN += [
-    "--rollout-steps",
-    "8",
-    "--ppo.minibatches",
-    "2",
-    "--checkpoint.every",
-    "7",
-    "--total-steps",
-    str(UPDATES * 32),
-]
+TRAIN = ["train", "go1gate", "--impl", "c", "--config", "demo", "--num-envs", "4", "--rollout-steps", "8"]
+TRAIN += ["--ppo.minibatches", "2", "--checkpoint.every", "7", "--total-steps", str(UPDATES * 32)]
 TRAIN += ["--evaluation.every", "30", "--evaluation.episodes", "2"]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
+AIMED = 6
+"""Of that many signals, the last is sent when a file is being written."""
 
 
-def command(run: Path) -> list[str]:
-    """Returns the command that trains into a folder, or continues there."""
-    return [sys.executable, *TRAIN, "--resume", "--run-dir", str(run)]
+def command(run: Path, programs: Path | None = None) -> list[str]:
+    """Returns the command that trains into a folder, or continues there; compiled programs are kept beside it."""
+    folder = (programs or run.with_suffix(".programs")).resolve()
+    environment = ["env", f"JAX_COMPILATION_CACHE_DIR={folder}", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.3"]
+    return [*environment, sys.executable, "-m", "mqe_jax.cli", *TRAIN, "--resume", "--run-dir", str(run)]
+
+
+def remove(run: Path) -> None:
+    """Removes a run and its compiled programs."""
+    for folder in (run, run.with_suffix(".programs")):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def whole_run(report: Report) -> tuple[Path, float]:
@@ -41,16 +43,19 @@ def whole_run(report: Report) -> tuple[Path, float]:
     whole, clocked, seconds = kept / "whole", kept / "clocked", kept / "seconds"
     if not seconds.exists():
         for folder in (whole, clocked):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove(folder)
             began = time.monotonic()
-            subprocess.run(command(folder), check=True, capture_output=True)
+            subprocess.run(command(folder, kept / "whole.programs"), check=True, capture_output=True)
         assert_same_run(whole, clocked)
         seconds.write_text(str(time.monotonic() - began), encoding="utf-8")
     return whole, float(seconds.read_text(encoding="utf-8"))
 
 
 def kills(report: Report) -> None:
-    """Ends a training by signals at random moments after its start, resumes it as often, and compares the result."""
+    """Ends a training by signals at random moments after its start, resumes it as often, and compares the result.
+
+    Every training begins without compiled programs.
+    """
     rows = [f"{number} {SIGNALS[number % len(SIGNALS)].name}" for number in range(2 * report.options.kills)]
     names = list(report.pending("kills", rows))
     if not names:
@@ -62,23 +67,44 @@ def kills(report: Report) -> None:
             break
         number, kind = name.split()
         moments = random.Random(f"{report.options.seed} {number}")
-        before = updates(run)
+        before, began = updates(run), time.time()
         process = start(command(run))
         moment = moments.uniform(0.0, 0.8 * seconds)
         try:
             process.wait(moment)
         except subprocess.TimeoutExpired:
             ended += 1
+        while int(number) % AIMED == AIMED - 1 and process.poll() is None and not _unfinished(run):
+            pass
         said, wrong = _end(process, signal.Signals[kind])
         done = updates(run)
+        row = {"after_s": round(time.time() - began, 2), "during": _phase(run, began, before), "updates": done}
         if done >= UPDATES or (ended >= 5 and done > before):
             wrong += _compare(run, whole)
-            shutil.rmtree(run, ignore_errors=True)
+            remove(run)
             ended = 0
-        report.add("kills", name, {"after_s": round(moment, 2), "updates": done, "said": said}, wrong)
+        report.add("kills", name, {**row, "said": said}, wrong)
     if run.exists():
         report.add("kills", "the rest", {"updates": updates(run)}, _compare(run, whole))
-        shutil.rmtree(run, ignore_errors=True)
+        remove(run)
+
+
+def _unfinished(run: Path) -> list[str]:
+    """Returns the names of files that are being written, or that a process left unfinished."""
+    folders = [run, run / "checkpoints", run / "best", run.with_suffix(".programs")]
+    return [name for folder in folders if folder.is_dir() for name in os.listdir(folder) if name.startswith(".")]
+
+
+def _phase(run: Path, began: float, before: int) -> str:
+    """Returns what a process did that began at a time and `before` updates, when it ended."""
+    if names := _unfinished(run):
+        return f"writing {names[0].split('.')[1]}"
+    if updates(run) >= UPDATES:
+        return "after the last update"
+    if updates(run) > before:
+        return "training"
+    settings = run / "config.yaml"
+    return "compiling" if settings.exists() and settings.stat().st_mtime > began else "start"
 
 
 def _end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[str, list[str]]:
@@ -110,6 +136,8 @@ def _compare(run: Path, whole: Path) -> list[str]:
         assert_same_run(whole, run)
     except AssertionError as error:
         return [f"differs: {' '.join(str(error).split())[:300]}"]
+    if "persistent compilation cache" in done.stderr or _unfinished(run):
+        return [f"unfinished files: {_unfinished(run)}, {done.stderr[-300:]}"]
     if len({(folder / "evaluations.json").read_text() for folder in (whole, run)}) > 1:
         return ["evaluations.json differs"]
     files = [{path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} for folder in (whole, run)]
@@ -127,7 +155,7 @@ def disk(report: Report) -> None:
     whole = whole_run(report)[0] if names else Path()
     for name in names:
         run, moment = report.folder / "kept" / "full", MOMENTS[name]
-        shutil.rmtree(run, ignore_errors=True)
+        remove(run)
         process = start(command(run))
         while process.poll() is None and moment >= 0 and not (run / "config.yaml").exists():
             time.sleep(0.001)
