@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import json
 import resource
 import shutil
 from collections.abc import Iterator
@@ -30,6 +31,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
+from mqe_jax.train.start import without_environments
 from mqe_jax.viz.curves import draw_curve
 
 KEY = jax.random.PRNGKey(0)
@@ -124,6 +126,18 @@ def test_what_a_run_leaves_behind(straight: tuple[Path, TrainState]) -> None:
     assert not [p for p in run_dir.rglob("*") if p.name.endswith(".tmp")]
 
 
+def test_statistics_cover_all_observations_and_all_privileged_ones(straight: tuple[Path, TrainState]) -> None:
+    """Of 80 steps, two agents; the privileged observation is a sign in the first of four steps, otherwise 0."""
+    agents, privileged = straight[1].obs_normalizer
+    assert float(agents.samples) == 160 and float(privileged.samples) == 80
+    np.testing.assert_allclose(privileged.variance + privileged.mean**2, 0.25, rtol=1e-5)
+
+
+def test_a_checkpoint_without_environments_has_all_else(straight: tuple[Path, TrainState]) -> None:
+    names = {field.name for field in dataclasses.fields(TrainState)}
+    assert set(without_environments(straight[1])) == names - {"rollout"}
+
+
 def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:
     run_dir, expected = straight
     assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
@@ -209,6 +223,15 @@ def largest_file(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_evaluations_are_read_in_the_order_of_their_file(tmp_path: Path) -> None:
+    """So that a resumed run writes the same file."""
+    rewards = {"average_step_reward": 1.0}
+    point = {"env_steps": 16, "episodes": 2, "sampled": rewards, "deterministic": rewards}
+    text = json.dumps({"evaluations": [point], "absolute": None, "ended_at": 16}, indent=1)
+    (tmp_path / "evaluations.json").write_text(text)
+    assert json.dumps(read_evaluations(tmp_path), indent=1) == text
 
 
 def test_a_writer_that_fails_ends_the_training_and_names_its_file(

@@ -19,9 +19,11 @@ UPDATES = 120
 TRAIN = ["train", "go1gate", "--impl", "c", "--config", "demo", "--num-envs", "4", "--rollout-steps", "8"]
 TRAIN += ["--ppo.minibatches", "2", "--checkpoint.every", "7", "--total-steps", str(UPDATES * 32)]
 TRAIN += ["--evaluation.every", "30", "--evaluation.episodes", "2"]
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
-AIMED = 6
+SIGNALS = 3 * (signal.SIGKILL,) + (signal.SIGTERM,) + 3 * (signal.SIGKILL,) + (signal.SIGINT,)
+AIMED = 5
 """Of that many signals, the last is sent when a file is being written."""
+COLD = 3
+"""Of that many trainings, the first begins without compiled programs."""
 
 
 def command(run: Path, programs: Path | None = None) -> list[str]:
@@ -31,9 +33,9 @@ def command(run: Path, programs: Path | None = None) -> list[str]:
     return [*environment, sys.executable, "-m", "mqe_jax.cli", *TRAIN, "--resume", "--run-dir", str(run)]
 
 
-def remove(run: Path) -> None:
-    """Removes a run and its compiled programs."""
-    for folder in (run, run.with_suffix(".programs")):
+def remove(run: Path, programs: bool) -> None:
+    """Removes a run, and its compiled programs where wanted."""
+    for folder in (run, *([run.with_suffix(".programs")] * programs)):
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -43,7 +45,7 @@ def whole_run(report: Report) -> tuple[Path, float]:
     whole, clocked, seconds = kept / "whole", kept / "clocked", kept / "seconds"
     if not seconds.exists():
         for folder in (whole, clocked):
-            remove(folder)
+            remove(folder, programs=True)
             began = time.monotonic()
             subprocess.run(command(folder, kept / "whole.programs"), check=True, capture_output=True)
         assert_same_run(whole, clocked)
@@ -52,16 +54,13 @@ def whole_run(report: Report) -> tuple[Path, float]:
 
 
 def kills(report: Report) -> None:
-    """Ends a training by signals at random moments after its start, resumes it as often, and compares the result.
-
-    Every training begins without compiled programs.
-    """
-    rows = [f"{number} {SIGNALS[number % len(SIGNALS)].name}" for number in range(2 * report.options.kills)]
+    """Ends a training by signals at random moments after its start, resumes it as often, and compares the result."""
+    rows = [f"{number} {SIGNALS[number % len(SIGNALS)].name}" for number in range(4 * report.options.kills // 3)]
     names = list(report.pending("kills", rows))
     if not names:
         return
     whole, seconds = whole_run(report)
-    run, ended = report.folder / "kept" / "killed", 0
+    run, ended, trainings = report.folder / "kept" / "killed", 0, 0
     for name in names:
         if report.seconds_left() < 0.0:
             break
@@ -81,12 +80,12 @@ def kills(report: Report) -> None:
         row = {"after_s": round(time.time() - began, 2), "during": _phase(run, began, before), "updates": done}
         if done >= UPDATES or (ended >= 5 and done > before):
             wrong += _compare(run, whole)
-            remove(run)
-            ended = 0
+            trainings, ended = trainings + 1, 0
+            remove(run, programs=trainings % COLD == 0)
         report.add("kills", name, {**row, "said": said}, wrong)
     if run.exists():
         report.add("kills", "the rest", {"updates": updates(run)}, _compare(run, whole))
-        remove(run)
+        remove(run, programs=True)
 
 
 def _unfinished(run: Path) -> list[str]:
@@ -155,7 +154,7 @@ def disk(report: Report) -> None:
     whole = whole_run(report)[0] if names else Path()
     for name in names:
         run, moment = report.folder / "kept" / "full", MOMENTS[name]
-        remove(run)
+        remove(run, programs=moment < 0)
         process = start(command(run))
         while process.poll() is None and moment >= 0 and not (run / "config.yaml").exists():
             time.sleep(0.001)

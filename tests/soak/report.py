@@ -30,7 +30,7 @@ class Options:
     num_envs: int = 256
     """Parallel environments of play."""
     kills: int = 30
-    """SIGKILLs; as many signals again are SIGINT or SIGTERM."""
+    """SIGKILLs; a third as many signals are SIGINT or SIGTERM."""
     cases: int = 400
     """Bad inputs of the fuzzer."""
     seed: int = 0
