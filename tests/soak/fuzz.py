@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,7 +39,7 @@ SMALL = [*fake_env.SMALL, "--network.hidden-sizes", "4"]
 def fuzz(report: Report) -> None:
     """Draws inputs of every kind, until there are as many as wanted or the time is over."""
     setup.make_env = with_fake(setup.make_env)
-    kinds = {kind.__name__.removesuffix("_cases"): kind for kind in (flag_cases, file_cases, call_cases)}
+    kinds = {kind.__name__.removesuffix("_cases"): kind for kind in (flag_cases, file_cases, call_cases, run_cases)}
     count = -(-report.options.cases // CHUNK)
     rows = [f"{kind} {number}" for number in range(-(-count // len(kinds))) for kind in kinds][:count]
     for name in report.pending("fuzz", rows):
@@ -123,6 +126,50 @@ def file_cases() -> st.SearchStrategy[Any]:
             (folder / name).write_bytes(content)
 
         return f"{name} {content[:120]!r}", lambda: cli.main(READERS[name]), prepare, (0, 2)
+
+    return case()
+
+
+RUN = "sweep/runs/fake/mappo/seed0"
+EVALUATED = [*SMALL, "--checkpoint.every", "1", "--evaluation.every", "1", "--evaluation.episodes", "2"]
+RUN_READERS = (
+    ["report", "sweep"],
+    ["pack", "sweep", "-o", "packed"],
+    ["eval", RUN, "--episodes", "2"],
+    ["train", "fake", *EVALUATED, "--resume", "--run-dir", RUN],
+)
+"""The commands that read a run's files."""
+
+
+@functools.cache
+def finished_run() -> dict[str, bytes]:
+    """Returns the files of a run of the task `fake`, by name."""
+    with tempfile.TemporaryDirectory() as name:
+        command = [sys.executable, "-m", "tests.fake_env", "train", "fake", *EVALUATED, "--run-dir", f"{name}/run"]
+        subprocess.run(command, check=True, capture_output=True)
+        files = [path for path in Path(name, "run").rglob("*.*") if path.suffix in (".yaml", ".csv", ".json")]
+        files += Path(name, "run").rglob("*.safetensors")
+        return {path.relative_to(f"{name}/run").as_posix(): path.read_bytes() for path in sorted(files)}
+
+
+def run_cases() -> st.SearchStrategy[Any]:
+    """A finished run with one file that is damaged, replaced or missing."""
+    files = finished_run()
+
+    @st.composite
+    def case(draw: st.DrawFn) -> Any:
+        name, words = draw(st.sampled_from(sorted(files))), draw(st.sampled_from(RUN_READERS))
+        hostile = st.sampled_from(inputs.TEXTS).map(lambda text: text.encode("utf-8", "replace")) | st.none()
+        changed = inputs.tensors_file(files[name]) if name.endswith("safetensors") else hostile
+        content = draw(inputs.damaged(files[name]) | changed)
+
+        def prepare(folder: Path) -> None:
+            for other, bytes_ in {**files, name: content}.items():
+                (folder / RUN / other).parent.mkdir(parents=True, exist_ok=True)
+                if bytes_ is not None:
+                    (folder / RUN / other).write_bytes(bytes_)
+
+        return f"{words[0]} {name} {(content or b'')[:200]!r}", lambda: cli.main(words), prepare, (0, 2)
 
     return case()
 
