@@ -152,6 +152,7 @@ def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
 def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
     assert len(set(one_pass.traces)) == 1
     assert [int(state.updates) for state in one_pass.states] == [0, 1, 2, 3]
+    assert len({tuple(state.key.tolist()) for state in one_pass.states}) == 4, "a random key is used again"
     for name, value in one_pass.metrics[0].items():
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
