@@ -168,6 +168,18 @@ def test_a_bonus_for_entropy_widens_the_policy() -> None:
     assert np.all(np.diff(entropy) > 0.005), entropy
 
 
+def test_advantages_are_clipped_at_multiples_of_their_usual_size() -> None:
+    """So that the policy's loss does not depend on the unit of rewards."""
+
+    def pay(hidden: jax.Array, action: jax.Array) -> jax.Array:
+        return 1e-3 * probes.pay_near_hidden(hidden, action)
+
+    config = small(num_envs=4, ppo={"epochs": 1, "minibatches": 1, "advantage_clip": 1.0})
+    config = override(config, {"normalization.advantages": False})
+    _, metrics = learn(Probe(probes.show_hidden, pay, num_envs=4), config, 1)
+    assert 0.1 < float(metrics["loss/policy"]) <= 2.0
+
+
 def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn, permutation = [], jax.random.permutation
 
