@@ -12,7 +12,7 @@ Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, valida
 
 Every number has bounds: those of its kind (`mqe_jax.limits`), or of `Number` and `Integer` where a field is a plain
 `float` or `int`. Booleans are rejected as numbers; numpy scalars and strings such as "7e-4" (which YAML does not read
-as a number) are accepted; "none" means None for an optional field.
+as a number) are accepted, bytes are not; "none" means None for an optional field.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ def _none(value: Any) -> Any:
 
 
 def _number(kind: type, value: Any) -> Any:
-    if type(value).__name__.startswith("bool"):
+    if type(value).__name__.startswith(("bool", "byte")):
         raise ValueError("a number")
     try:
         return float(value) if isinstance(value, str) and kind is int else value
@@ -253,8 +253,8 @@ def _number(kind: type, value: Any) -> Any:
 
 
 def _text(value: Any) -> Any:
-    if isinstance(value, str | Path) and not is_text(str(value)):
-        raise ValueError(TEXT)
+    if isinstance(value, bytes | bytearray) or (isinstance(value, str | Path) and not is_text(str(value))):
+        raise ValueError(f"a text, {TEXT}")
     return value
 
 

@@ -69,7 +69,7 @@ def refused(kind: Any) -> Strategy:
     low, high = limits.bounds(kind)
     beyond = [st.floats(max_value=low, exclude_max=True), st.floats(min_value=high, exclude_min=True)]
     others: list[Strategy] = [st.just(float("nan")), st.booleans(), st.sampled_from(NO_NUMBERS)]
-    others += [st.just([1]), st.just({})]
+    others += [st.just([1]), st.just({}), st.just(b"1")]
     if typing.get_args(kind)[0] is int:
         beyond = [st.integers(max_value=int(low) - 1), st.integers(min_value=int(high) + 1)]
         others += [st.integers(int(low), int(low) + 9).map(lambda x: x + 0.5), st.just("1.5")]
@@ -121,7 +121,7 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
     text = st.sampled_from(TEXTS) | st.text(max_size=20)
     if command in LONG or (fields and draw(st.integers(0, 3))):
         field = draw(st.sampled_from(sorted(fields)))
-        value = draw(refused(fields[field]).filter(lambda x: not isinstance(x, list)))
+        value = draw(refused(fields[field]).filter(lambda x: not isinstance(x, list | bytes)))
         return [*words, f"--{field.replace('_', '-')}={value}"]
     flag = draw(st.sampled_from(["--set=", "--set=gate_width=", "--seed=", "--policy=", "--config=", "--nope=", ""]))
     return [*words, flag + "nothing " * (not flag) + draw(text)]

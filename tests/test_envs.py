@@ -82,6 +82,8 @@ def test_contract(task: str, count: int, steps: int) -> None:
     np.testing.assert_array_equal(np.asarray(state.step) == 0, ended)
     assert np.all(np.abs(np.asarray(state.obs - state.final_obs)).max((1, 2))[ended] > 0)
     np.testing.assert_array_equal(np.asarray(state.obs)[~ended], np.asarray(state.final_obs)[~ended])
+    same = np.all(np.asarray(state.privileged_obs == state.final_privileged_obs), axis=1)
+    np.testing.assert_array_equal(same, ~ended)
     spawned = np.asarray(state.data.qpos)[ended][:, env.index.base_qpos[:, 2]]
     np.testing.assert_allclose(spawned, env.params.spawn_height, atol=1e-6)
 

@@ -149,15 +149,18 @@ def test_the_rating_follows_results_against_the_scripted_policy() -> None:
     state = jax.jit(learner.init)(KEY)
     scripted, older = state.rollout.env_state.opponents
 
-    def after(wins: int, losses: int) -> float:
+    def after(wins: int, losses: int, before: float = 0.0) -> float:
         beaten = dataclasses.replace(scripted, outcomes=jnp.array([wins, 0, losses]))
         env_state = dataclasses.replace(state.rollout.env_state, opponents=(beaten, older))
-        changed = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state))
+        rated = state.extra._replace(rating=jnp.float32(before))
+        changed = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state), extra=rated)
         now, metrics = env.after(changed)
         assert float(metrics["league/win/scripted"]) == pytest.approx(wins / (wins + losses))
         return float(now.extra.rating)
 
     assert after(3, 1) == pytest.approx(1.0) and after(2, 2) == 0.0 and after(0, 500) == -30.0
+    # 400 points above the scripted policy 10 wins of 11 games are expected
+    assert after(10, 1, 400.0) == pytest.approx(400.0) and after(11, 0, 400.0) == pytest.approx(401.0)
 
 
 def test_a_pool_too_small_for_its_blocks_is_refused() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
+from mqe_jax.envs.state import Moment
 from mqe_jax.objects import Cylinder, Door
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
@@ -118,6 +119,12 @@ def test_tug_observation_and_rewards() -> None:
     # From y 0.1 back to 0.06, still on robot 1's half: that counts half. On robot 0's half: it counts for robot 1.
     np.testing.assert_allclose(terms_of(env, before, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6)
     np.testing.assert_allclose(terms_of(env, before, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6)
+
+
+def test_tug_shows_where_the_cylinder_was_before_the_step() -> None:
+    env = made("go1tug")
+    moments = [Moment(state, env.read(state.data)) for state in (tug_state(env, 0.1), tug_state(env, 0.13))]
+    assert float(env.step_task(*moments).previous_y) == pytest.approx(0.1)
 
 
 def test_tug_result_and_end() -> None:

@@ -283,3 +283,19 @@ def pushed(robots: int) -> float:
 
 def test_two_robots_push_the_box_clearly_faster_than_one() -> None:
     assert 0.1 < pushed(1) < 0.7 * pushed(2)
+
+
+def test_motor_strength_is_a_factor_on_all_torques() -> None:
+    """Also on those that the joint's angle and speed cause, in PD control."""
+    env = make("go1plane", impl="c", control="position", num_envs=1, randomization={"motor_strength": (0.5, 0.8)})
+    params, model = env.randomizer.sample(jax.random.PRNGKey(0)), env.compiled.model
+    data, varied, forces = mujoco.MjData(model), model.__copy__(), []
+    for name, value in env.randomizer.fields(params).items():
+        getattr(varied, name)[:] = value
+    data.ctrl[:], data.qvel[:] = data.qpos[env.index.joint_qpos].ravel() + 0.1, 0.5
+    for used in (model, varied):
+        mujoco.mj_forward(used, data)
+        forces.append(data.actuator_force[env.index.actuator])
+    strength = np.asarray(params.motor_strength)[:, None]
+    assert 0.5 <= strength.min() < strength.max() <= 0.8 and np.abs(forces[0]).min() > 1.0
+    np.testing.assert_allclose(forces[1], strength * forces[0], rtol=1e-5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from fake_env import SMALL
 from test_train_run import rows, settings
 
 from mqe_jax import cli, files, interrupts
+from mqe_jax.cli import programs
 from mqe_jax.errors import InputError
 from mqe_jax.files import locked, remove_temporaries, replacing, write_atomically
 from mqe_jax.settings import override
@@ -247,3 +249,30 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
 def test_evaluation_needs_environments(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"evaluation\.every"):
         train(PROBE, seeded(0, evaluation__every=2), tmp_path)
+
+
+def test_a_compiled_program_is_stored_whole_or_not_at_all(tmp_path: Path) -> None:
+    """JAX reads a file that was cut off, by a kill or a full disk, in vain at every start, and never replaces it."""
+    from jax._src.lru_cache import LRUCache
+
+    programs.write_whole()
+    cache, (soft, hard) = LRUCache(str(tmp_path), max_size=-1), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            cache.put("jit_step-1", bytes(1000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert cache.get("jit_step-1") is None and list(tmp_path.iterdir()) == []
+    cache.put("jit_step-1", bytes(1000))
+    assert cache.get("jit_step-1") == bytes(1000)
+
+
+def test_parts_of_programs_that_a_killed_process_left_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    (tmp_path / ".jit_step-1-cache.999999999.tmp").write_bytes(b"half")
+    (tmp_path / "jit_step-2-cache").write_bytes(b"whole")
+    programs.write_whole()
+    assert [path.name for path in tmp_path.iterdir()] == ["jit_step-2-cache"]

@@ -59,22 +59,27 @@ PROGRAM = """
 import json, sys, time
 from pathlib import Path
 from tests.soak import processes as c
-c.SECONDS, c.BYTES = 3.0, 3 * 10**8
+c.SECONDS, c.WAITING, c.BYTES = 0.5, 8.0, 3 * 10**8
 def hangs(): time.sleep(60)
+def computes():
+    while time.process_time() < 0.7: pass  # of this process
+    return 2
 def grows(): return len([b"x" * (10**7 + i) for i in range(100)] + [time.sleep(60)])
 def fails(): raise KeyError("x")
 def leaves(): Path(".a.1.tmp").touch(); return 2
 def refuses(): print("mqe: a: 1 is not allowed", file=sys.stderr); return 2
-print(json.dumps([vars(c.contained(act)) for act in (hangs, grows, fails, leaves, refuses)]))
+print(json.dumps([vars(c.contained(act)) for act in (hangs, computes, grows, fails, leaves, refuses)]))
 """
 
 
-def test_a_contained_program_that_hangs_grows_fails_or_leaves_files_is_found() -> None:
+def test_a_contained_program_that_hangs_grows_fails_or_leaves_files_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     root = Path(__file__).parents[1]
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=root)
     assert done.returncode == 0, done.stderr
-    hangs, grows, fails, leaves, refuses = (Outcome(**fields) for fields in json.loads(done.stdout))
-    assert hangs.code is None and 3.0 < hangs.seconds < 12.0 and hangs.failures(2)
+    hangs, computes, grows, fails, leaves, refuses = (Outcome(**fields) for fields in json.loads(done.stdout))
+    monkeypatch.setattr(processes, "SECONDS", 0.5)
+    assert hangs.code is None and 4.0 < hangs.seconds < 12.0 and hangs.computing < 0.5
+    assert computes.code == 2 and "computing" in computes.failures(2)[0]
     assert grows.code is None and grows.memory > 3 * 10**8 and grows.failures(2)
     assert "a traceback" in fails.failures(1)
     assert leaves.failures(2) == ["left .a.1.tmp"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import json
 import math
 import struct
 from pathlib import Path
@@ -20,6 +21,7 @@ from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.monitor import read_evaluations
 from tests.training import assert_same
 
 ROWS = [
@@ -240,3 +242,12 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "a has dtype float32; int32" in error_of({**TREE, "a": jnp.zeros((2, 3), jnp.int32)})
     assert "d is missing" in error_of({**TREE, "d": jnp.zeros(())})
     assert "unexpected entry c/0" in error_of({k: v for k, v in TREE.items() if k != "c"})
+
+
+def test_evaluations_are_read_in_the_order_of_their_file(tmp_path: Path) -> None:
+    """So that a resumed run writes the same file."""
+    rewards = {"average_step_reward": 1.0}
+    point = {"env_steps": 16, "episodes": 2, "sampled": rewards, "deterministic": rewards}
+    text = json.dumps({"evaluations": [point], "absolute": None, "ended_at": 16}, indent=1)
+    (tmp_path / "evaluations.json").write_text(text)
+    assert json.dumps(read_evaluations(tmp_path), indent=1) == text

@@ -152,6 +152,7 @@ def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
 def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
     assert len(set(one_pass.traces)) == 1
     assert [int(state.updates) for state in one_pass.states] == [0, 1, 2, 3]
+    assert len({tuple(state.key.tolist()) for state in one_pass.states}) == 4, "a random key is used again"
     for name, value in one_pass.metrics[0].items():
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
@@ -165,6 +166,18 @@ def test_a_bonus_for_entropy_widens_the_policy() -> None:
         state, metrics = update(state)
         entropy.append(float(metrics["entropy"]))
     assert np.all(np.diff(entropy) > 0.005), entropy
+
+
+def test_advantages_are_clipped_at_multiples_of_their_usual_size() -> None:
+    """So that the policy's loss does not depend on the unit of rewards."""
+
+    def pay(hidden: jax.Array, action: jax.Array) -> jax.Array:
+        return 1e-3 * probes.pay_near_hidden(hidden, action)
+
+    config = small(num_envs=4, ppo={"epochs": 1, "minibatches": 1, "advantage_clip": 1.0})
+    config = override(config, {"normalization.advantages": False})
+    _, metrics = learn(Probe(probes.show_hidden, pay, num_envs=4), config, 1)
+    assert 0.1 < float(metrics["loss/policy"]) <= 2.0
 
 
 def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,6 +27,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
+from mqe_jax.train.start import without_environments
 from mqe_jax.viz.curves import draw_curve
 from tests import training as probes
 from tests.training import Probe, Traces, assert_same
@@ -104,6 +105,18 @@ def test_what_a_run_leaves_behind(straight: tuple[Path, TrainState]) -> None:
         "step_000000000080.safetensors",
     ]
     assert not [p for p in run_dir.rglob("*") if p.name.endswith(".tmp")]
+
+
+def test_statistics_cover_all_observations_and_all_privileged_ones(straight: tuple[Path, TrainState]) -> None:
+    """Of 80 steps, two agents; the privileged observation is a sign in the first of four steps, otherwise 0."""
+    agents, privileged = straight[1].obs_normalizer
+    assert float(agents.samples) == 160 and float(privileged.samples) == 80
+    np.testing.assert_allclose(privileged.variance + privileged.mean**2, 0.25, rtol=1e-5)
+
+
+def test_a_checkpoint_without_environments_has_all_else(straight: tuple[Path, TrainState]) -> None:
+    names = {field.name for field in dataclasses.fields(TrainState)}
+    assert set(without_environments(straight[1])) == names - {"rollout"}
 
 
 def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:

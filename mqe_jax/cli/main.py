@@ -5,12 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import platform
 import signal
 import sys
-import zlib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from mqe_jax import interrupts
@@ -29,7 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         interrupts.install()
-        _keep_programs()
+        from mqe_jax.cli import programs  # after `interrupts.install`
+
+        programs.keep()
     try:
         code, message = _attempt(sys.argv[1:] if arguments is None else arguments)
     finally:
@@ -38,22 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with contextlib.suppress(OSError):  # standard error may be a file on a full disk
             print(f"mqe: {message}", file=sys.stderr, flush=True)
     return code
-
-
-def _keep_programs() -> None:
-    """Has JAX store compiled programs in the user's cache folder, one for each kind of processor, unless told where."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    with contextlib.suppress(OSError, RuntimeError):  # without a home, or one that cannot be written, nothing is stored
-        lines = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
-        flags = next(
-            (line for line in lines.splitlines() if line.startswith(("flags", "Features"))), platform.machine()
-        )
-        folder = home / "mqe_jax" / f"programs-{zlib.crc32(flags.encode()):08x}"
-        folder.mkdir(parents=True, exist_ok=True)
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 
 def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
@@ -87,8 +70,10 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
 
 
 def _run(command: Any) -> None:
+    from mqe_jax.cli import programs
     from mqe_jax.cli.options import standard_output
 
+    programs.write_whole()
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:
         result = command.run()

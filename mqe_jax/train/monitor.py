@@ -160,12 +160,14 @@ class EvaluationLog:
 
 
 def read_evaluations(run_dir: Path) -> dict[str, Any]:
-    """Reads a run's evaluations; without the file there are none; InputError if the file is damaged."""
+    """Reads a run's evaluations, as they were written; without the file none; InputError if the file is damaged."""
     path = run_dir / EVALUATIONS_FILE
     if not path.is_file():
         return {"evaluations": [], "absolute": None}
+    read = read_json(path)
     try:
-        return dict(pydantic.TypeAdapter(_Evaluations).validate_python(read_json(path)))
+        pydantic.TypeAdapter(_Evaluations).validate_python(read)  # which returns another order
+        return read
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -33,7 +33,8 @@ from mqe_jax.envs import TASKS
 from mqe_jax.files import write_atomically
 from mqe_jax.robots import ROBOTS
 from tests.engines import agreement, pairs
-from tests.soak.commands import disk, fuzz, kills
+from tests.soak.fuzz import fuzz
+from tests.soak.kills import disk, kills
 from tests.soak.play import PLAYS, play
 from tests.soak.processes import memory
 
@@ -55,7 +56,7 @@ class Options:
     num_envs: int = 256
     """Parallel environments of play."""
     kills: int = 30
-    """SIGKILLs; as many signals again are SIGINT or SIGTERM."""
+    """SIGKILLs; a third as many signals are SIGINT or SIGTERM."""
     cases: int = 400
     """Bad inputs of the fuzzer."""
     seed: int = 0

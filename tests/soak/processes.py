@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 SECONDS, BYTES = 20.0, 2 * 10**9
-"""Time and resident memory after which a process is killed."""
+"""Largest computing time, s, and resident memory of a process."""
+WAITING = 3.0
+"""A process is killed after that many times `SECONDS`: on a busy machine it waits for the processor."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Outcome:
     """Standard error."""
     seconds: float
     """Time it took."""
+    computing: float
+    """Time for which it used a processor, s."""
     memory: int
     """Largest resident memory, bytes."""
     left: list[str]
@@ -44,7 +48,8 @@ class Outcome:
         codes = (code,) if isinstance(code, int) else code
         wrong = [] if self.code in codes else [f"exit code {self.code}: {self.said[-200:]!r}"]
         wrong += ["a traceback"] if "Traceback" in self.said else []
-        wrong += [f"{self.seconds:.0f} s"] if self.seconds > SECONDS else []
+        slow = self.computing > SECONDS or self.seconds > WAITING * SECONDS
+        wrong += [f"{self.seconds:.0f} s, {self.computing:.0f} s of them computing"] if slow else []
         wrong += [f"{self.memory / 1e9:.1f} GB"] if self.memory > BYTES else []
         # What tyro says of flags has a frame of several lines.
         lines = [line for line in self.said.splitlines() if line.strip() and line[0] not in "╭│╰─"]
@@ -66,17 +71,17 @@ def contained(act: Callable[[], int], prepare: Callable[[Path], None] = lambda f
         pid = os.fork()
         if pid == 0:
             _child(act, folder, said)
-        memory, status = 0, 0
-        while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
+        memory = 0
+        while not (ended := os.wait4(pid, os.WNOHANG))[0]:
             memory = max(memory, _resident(pid))
-            if time.monotonic() - began > SECONDS or memory > BYTES:
+            if time.monotonic() - began > WAITING * SECONDS or memory > BYTES:
                 os.kill(pid, signal.SIGKILL)
             time.sleep(0.005)
-        status = ended[1]
+        _, status, usage = ended
         left = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
         code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
         text = said.read_text(encoding="utf-8", errors="replace")
-        return Outcome(code, text, time.monotonic() - began, memory, left)
+        return Outcome(code, text, time.monotonic() - began, usage.ru_utime + usage.ru_stime, memory, left)
 
 
 def _resident(pid: int) -> int:

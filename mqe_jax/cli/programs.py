@@ -1,0 +1,51 @@
+"""Compiled programs that JAX stores in the user's cache folder: where they are, and that each file is whole."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import zlib
+from pathlib import Path
+from typing import Any
+
+
+def keep() -> None:
+    """Has JAX store compiled programs in the user's cache folder, one for each kind of processor, unless told where."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    with contextlib.suppress(OSError, RuntimeError):  # without a home, or one that cannot be written, nothing is stored
+        lines = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
+        flags = next(
+            (line for line in lines.splitlines() if line.startswith(("flags", "Features"))), platform.machine()
+        )
+        folder = home / "mqe_jax" / f"programs-{zlib.crc32(flags.encode()):08x}"
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+
+
+def write_whole() -> None:
+    """Has JAX write the files of compiled programs atomically, and removes what killed processes left of them.
+
+    JAX itself writes them in place and never replaces one. A file cut off by a kill or a full disk would be read in
+    vain at every later start, with a warning, and its program compiled anew. Imports JAX.
+    """
+    from mqe_jax.files import remove_temporaries, write_atomically
+
+    with contextlib.suppress(ImportError, AttributeError):  # a private class; another JAX writes as it does
+        from jax._src.lru_cache import LRUCache
+
+        original = LRUCache.put
+
+        def put(self: Any, key: str, value: bytes) -> None:
+            if self.eviction_enabled:
+                return original(self, key, value)
+            path = Path(self.path, f"{key}-cache")
+            if not path.exists():
+                write_atomically(path, value)
+
+        LRUCache.put = put if original.__module__ != __name__ else original
+    with contextlib.suppress(KeyError, OSError):
+        remove_temporaries(Path(os.environ["JAX_COMPILATION_CACHE_DIR"]))
