@@ -200,7 +200,8 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
             raise InputError("policy: bad")
         return session(Driven(), num_envs=3)
 
-    viewer = Viewer(session(Driven()), port=free_port(), menu=Menu(open_choice, Choice("go1gate"), {}))
+    viewer = Viewer(port=free_port(), menu=Menu(open_choice, Choice("go1gate"), {}))
+    viewer.show(session(Driven()))
     first, panel, gui = viewer.session, viewer._panel, viewer.server.gui
     widgets, commands = len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)
     assert not viewer._exchanged()
