@@ -1,7 +1,8 @@
-"""Trains Narrow Gate with TorchRL's multi-agent PPO, a central critic and shared parameters, through PettingZoo.
+"""Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters, through PettingZoo.
 
     pip install 'mqe-jax[pettingzoo]' torchrl
     python examples/torchrl_mappo.py --steps 20000
+    python examples/torchrl_mappo.py --task go1tug --opponent idle
 
 TorchRL steps one environment on the host: the example demonstrates compatibility, not speed.
 """
@@ -52,7 +53,7 @@ def train(task: str = "go1gate", steps: int = 20_000, batch: int = BATCH, **sett
     for data in collectors.Collector(env, actor, frames_per_batch=batch, total_frames=steps):
         ended = data["next", GROUP, "done"]
         returns.append(float(data["next", *total][ended].mean()))
-        print(f"return {returns[-1]:.3f}", flush=True)
+        print(f"{batch * len(returns)} steps, return {returns[-1]:.3f}", flush=True)
         for _ in range(EPOCHS):
             with torch.no_grad():
                 loss.value_estimator(
@@ -95,8 +96,12 @@ def networks(env: Any) -> tuple[Any, Any]:
 def main() -> None:
     """Runs the example."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--task", default="go1gate")
+    parser.add_argument("--opponent", help="policy of team 1 of a match")
     parser.add_argument("--steps", type=int, default=20_000)
-    train("go1gate", parser.parse_args().steps, rewards=TRAINING_REWARDS)
+    arguments = parser.parse_args()
+    settings: dict[str, Any] = {"rewards": TRAINING_REWARDS} if arguments.task == "go1gate" else {}
+    train(arguments.task, arguments.steps, opponent=arguments.opponent, **settings)
 
 
 if __name__ == "__main__":

@@ -121,6 +121,18 @@ def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(st
     np.testing.assert_allclose(scene._root.position, 0.0)
 
 
+def test_the_scene_before_the_session_is_the_middle_of_the_initial_states(stage: Any) -> None:
+    from mqe_jax.view.stage import start_frame
+
+    frame, index = start_frame(stage.env, 3), stage.env.index
+    assert [x.shape for x in (frame.qpos, frame.mocap_pos)] == [stage.frame.qpos.shape, stage.frame.mocap_pos.shape]
+    np.testing.assert_allclose(frame.qpos[:, index.base_qpos], stage.frame.qpos[:, index.base_qpos], atol=0.3)
+    np.testing.assert_allclose(frame.qpos[:, index.joint_qpos], stage.frame.qpos[:, index.joint_qpos], atol=0.8)
+    spread = stage.env.compiled.anchor_spread.max()
+    np.testing.assert_allclose(frame.mocap_pos, stage.frame.mocap_pos, atol=spread + 1e-6)
+    stage.stage.draw(frame)
+
+
 def test_cameras_follow_robots_and_the_ball() -> None:
     pytest.importorskip("mjviser")
     from mqe_jax.view.stage import followable
@@ -200,7 +212,8 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
             raise InputError("policy: bad")
         return session(Driven(), num_envs=3)
 
-    viewer = Viewer(session(Driven()), port=free_port(), menu=Menu(open_choice, Choice("go1gate"), {}))
+    viewer = Viewer(port=free_port(), menu=Menu(open_choice, Choice("go1gate"), {}))
+    viewer.show(session(Driven()))
     first, panel, gui = viewer.session, viewer._panel, viewer.server.gui
     widgets, commands = len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)
     assert not viewer._exchanged()

@@ -52,7 +52,9 @@ def viewer() -> Iterator[SimpleNamespace]:
             if "open http" in line:
                 break
         threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop the viewer
-        yield SimpleNamespace(port=port, process=process, said=said)
+        viewer = SimpleNamespace(port=port, process=process, said=said)
+        wait_for_panel(viewer, lambda panel: " at " in panel.values["state"], STARTUP)
+        yield viewer
         process.send_signal(signal.SIGINT)
         try:
             assert process.wait(30) == 130

@@ -51,11 +51,12 @@ class View(PolicyOptions):
         runs = find_runs([Path("runs"), Path(self.target).parent])
         own = self.policy or (self.target if Path(self.target).exists() else DEFAULT)
         menu = Menu(open_choice, Choice(env.name, own, self.opponent or DEFAULT), runs)
-        viewer = Viewer(Session(env, vector_env, policy, self.seed), self.host, self.port, menu)
+        viewer = Viewer(self.host, self.port, menu)
+        viewer.announce(env, self.num_envs)
         if self.host not in _LOCAL:
             echo(f"mqe: warning: every machine that reaches {self.host} can open this page and control the robots")
         echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
-        viewer.run()
+        viewer.run(lambda: Session(env, vector_env, policy, self.seed))
 
 
 def _check_address(host: str, port: int) -> None:

@@ -81,6 +81,11 @@ class Stage:
             batch.handle.batched_positions = positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
             batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
 
+    def overview(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns camera position and look-at point (3,), m, for the whole scene."""
+        size = np.hypot(self.size[0], self.size[1] * self._count)
+        return seen(self.centre * [1.0, 0.0, 0.0], 1.4 * float(size))
+
     def release(self) -> None:
         """Resets the position of the root frame."""
         self._root.position = (0.0, 0.0, 0.0)
@@ -106,12 +111,12 @@ class Stage:
         )
 
     def _grouped(self, moving: dict[int, list[int]]) -> list[list[int]]:
-        """Returns the moving bodies, grouped by mesh."""
+        """Returns the moving bodies, grouped by their geoms: bodies with the same ones share a mesh."""
+        names = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
+        fields = [np.round(getattr(self._model, f"geom_{name}"), 5) + 0.0 for name in names]
         groups: dict[bytes, list[int]] = {}
         for body, geoms in moving.items():
-            mesh = merge_geoms(self._model, geoms)
-            appearance = np.round(mesh.vertices, 5).tobytes() + bytes(mesh.visual.vertex_colors)  # type: ignore[attr-defined]
-            groups.setdefault(appearance, []).append(body)
+            groups.setdefault(b"".join(field[geoms].tobytes() for field in fields), []).append(body)
         return list(groups.values())
 
     def _add_batch(self, name: str, geoms: list[int], bodies: list[int]) -> _Batch:
@@ -138,6 +143,21 @@ class Stage:
             lod="off",
             flat_shading=True,
         )
+
+
+def seen(look_at: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns camera position and look-at point (3,), m, at a distance from behind and above, m."""
+    return look_at + distance * np.array([-0.62, -0.28, 0.73]), look_at
+
+
+def start_frame(env: Any, num_envs: int) -> Episode:
+    """Returns the robots at their start, in `num_envs` frames: the mean of the initial states, without compilation."""
+    index, data = env.index, mujoco.MjData(env.compiled.model)
+    qpos = data.qpos.copy()
+    qpos[index.joint_qpos] = env.robot.default_joints
+    for row, (x, y, yaw) in zip(index.base_qpos, env.spawn_poses(), strict=True):
+        qpos[row] = (x, y, env.params.spawn_height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+    return Episode(*(np.stack([x] * num_envs) for x in (qpos, data.mocap_pos, data.mocap_quat)), dt=env.dt)
 
 
 def followable(model: mujoco.MjModel) -> dict[str, int]:

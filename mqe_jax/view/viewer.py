@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import Any
 
+import mujoco
 import numpy as np
 import viser
 
@@ -14,7 +17,8 @@ from mqe_jax.view.panel import FREE, Panel
 from mqe_jax.view.readout import robot_labels
 from mqe_jax.view.server import open_server
 from mqe_jax.view.session import Session
-from mqe_jax.view.stage import Stage
+from mqe_jax.view.stage import Stage, seen, start_frame
+from mqe_jax.viz.recording import Episode
 
 DRAW_RATE = 25.0
 PANEL_RATE = 5.0
@@ -33,38 +37,57 @@ class Viewer:
     url: str
     """Address of the page."""
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, menu: Menu | None = None) -> None:
-        """Starts the server and draws the session; `menu` lets the page choose others."""
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080, menu: Menu | None = None) -> None:
+        """Starts the server with an empty page; `menu` lets the page choose other sessions."""
         self.server = open_server(host, port, "mqe view")
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
         self._menu = menu
-        self._show(session)
+        self._announced = False
 
-    def _show(self, session: Session) -> None:
-        """Builds scene and panel of a session, in place of the last ones."""
-        self.session = session
+    def announce(self, env: Any, num_envs: int) -> None:
+        """Shows a task with its robots at their start, before the session that `run` opens: that compiles."""
+        self._build(env.mj_model, start_frame(env, num_envs))
+        self.server.gui.add_markdown(f"**{env.name}** is being compiled")
+        self._announced = True
+
+    def _build(self, model: mujoco.MjModel, frame: Episode) -> None:
+        """Builds the scene, in place of the last one, and clears the panel."""
         self.server.scene.reset()
+        self._clear()
+        self._stage = Stage(self.server, model, frame)
+        camera = self.server.initial_camera
+        camera.position, camera.look_at = self._stage.overview()
+        camera.fov = _FIELD_OF_VIEW
+
+    def _clear(self) -> None:
         self.server.gui.reset()
         self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
+
+    def show(self, session: Session) -> None:
+        """Builds scene and panel of a session, in place of the last ones; the scene of `announce` stays."""
+        self.session = session
         model = session.env.mj_model
-        self._stage = Stage(self.server, model, session.frame())
+        if self._announced:
+            self._clear()
+        else:
+            self._build(model, session.frame())
+        self._announced = False
         self._overlay, self._shapes = Overlay(self.server, model, self._stage.offset), False
         robots = robot_labels(model)
         named = {f"robot {i + 1}": label for i, label in enumerate(robots)}
         self._bodies = {named.get(label, label): body for label, body in self._stage.bodies.items()}
         agents = robots[: session.env.num_agents]
         self._panel = Panel(self.server, session, tuple(self._bodies), self._aim, agents, self._menu)
-        camera = self.server.initial_camera
-        camera.position, camera.look_at = self._view()
-        camera.fov = _FIELD_OF_VIEW
 
-    def run(self) -> None:
-        """Steps and renders at the session's speed until an exception; then stops the server."""
-        due = drawn = shown = time.monotonic()
-        self.session.advance()  # compiles the step
-        due, counted = time.monotonic(), self.session.steps
+    def run(self, open_session: Callable[[], Session]) -> None:
+        """Opens a session, steps and renders it at its speed until an exception; then stops the server."""
         try:
+            self.show(open_session())
+            self._panel.say(f"**{self.session.env.name}**: its step is being compiled")
+            self.session.advance()
+            due = drawn = shown = time.monotonic()
+            counted = self.session.steps
             while True:
                 if self._exchanged():
                     due, counted = time.monotonic(), self.session.steps
@@ -103,7 +126,7 @@ class Viewer:
             self.session.paused = True
             return False
         self._menu.shown = choice
-        self._show(session)
+        self.show(session)
         for client in self.server.get_clients().values():
             client.camera.position, client.camera.look_at = self._view()
         return True
@@ -141,12 +164,7 @@ class Viewer:
 
     def _view(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns camera position and look-at point (3,), m, for the whole scene or the followed body."""
-        if self._followed() is not None:
-            centre, distance = np.array([0.0, 0.0, 0.2]), 3.0
-        else:
-            centre = self._stage.centre * [1.0, 0.0, 0.0]
-            distance = 1.4 * float(np.hypot(self._stage.size[0], self._stage.size[1] * self.session.num_envs))
-        return centre + distance * np.array([-0.62, -0.28, 0.73]), centre
+        return self._stage.overview() if self._followed() is None else seen(np.array([0.0, 0.0, 0.2]), 3.0)
 
     def _aim(self) -> None:
         """Resets the cameras of all clients after a change of the followed body."""

@@ -1,15 +1,11 @@
 // Draws a MuJoCo model with three.js: the visible geoms of a body are one mesh, coloured by vertex.
 import * as three from 'three';
+import { Camera } from './camera.js';
 import { mergeGeometries } from './lib/BufferGeometryUtils.js';
-import { OrbitControls } from './lib/OrbitControls.js';
 
 const HIDDEN_GROUP = 3; // collision shapes and invisible planes
 const SKY = 0xcfe0ee;
 const BEYOND = 0.04; // m beside the track, up to the outer face of its walls
-const BESIDE = [-0.45, -1, 0.9]; // direction of the camera from the middle of the scene, with the x axis to the right
-const BEHIND_START = [-1, -0.25, 0.9]; // with the x axis upwards
-const [BACK, ABOVE, AHEAD] = [2.4, 1.3, 0.8]; // m, of the camera from the robot that it follows, and its target
-const SMOOTH = 0.12; // s, time constant of the camera that follows a robot
 
 /** Geometry of a geom by MuJoCo's type number, or null where it is not drawn; finer with more `detail`. */
 function shape(type, [a, b, c], detail) {
@@ -81,11 +77,7 @@ export class Drawing {
     this.renderer.setPixelRatio(low ? 1 : Math.min(window.devicePixelRatio, 2));
     this.renderer.localClippingEnabled = true;
     this.renderer.shadowMap.enabled = !low;
-    this.camera = new three.PerspectiveCamera(40, 1, 0.1, 120);
-    this.camera.up.set(0, 0, 1);
-    this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.maxPolarAngle = 1.5;
-    this.follow = null; // number of the robot that the camera follows
+    this.camera = new Camera(canvas);
   }
 
   /** Shows a model; `settings` are those of `scene.json`. */
@@ -101,7 +93,7 @@ export class Drawing {
     this.track = [1, -1].map((side) => new three.Plane(new three.Vector3(0, side, 0), edge));
     this.addLight();
     this.addGeoms(model);
-    this.size = null; // frames the scene in the next drawing
+    this.camera.show(model, this.boxes, settings);
   }
 
   addLight() {
@@ -158,8 +150,8 @@ export class Drawing {
     return geometry.setAttribute('color', new three.BufferAttribute(colors, 3));
   }
 
-  /** Draws the bodies where `data` has them, on a canvas of the size that the page gives it. */
-  draw(data, seconds) {
+  /** Draws the bodies where `data` has them, on a canvas whose upper part is covered by a bar, pixels. */
+  draw(data, seconds, bar) {
     const { xpos, xquat } = data;
     this.bodies.forEach((group, body) => {
       group.position.set(xpos[3 * body], xpos[3 * body + 1], xpos[3 * body + 2]);
@@ -167,68 +159,19 @@ export class Drawing {
       group.quaternion.set(x, y, z, w);
     });
     const { clientWidth: width, clientHeight: height } = this.renderer.domElement;
-    if (`${width} ${height}` !== this.size) {
-      this.size = `${width} ${height}`;
+    if (`${width} ${height} ${bar}` !== this.size) {
+      this.size = `${width} ${height} ${bar}`;
       this.renderer.setSize(width, height, false);
-      this.camera.aspect = width / height;
-      this.camera.updateProjectionMatrix();
-      if (this.follow === null) this.frame();
+      this.camera.resize(width, height, bar);
     }
-    if (this.follow !== null) this.chase(data.qpos, seconds);
-    this.controls.update();
-    this.renderer.render(this.scene, this.camera);
-  }
-
-  /** Follows a robot, or shows the whole scene (null). */
-  look(robot) {
-    this.follow = robot;
-    this.jump = true;
-    if (robot === null) this.size = null;
-  }
-
-  /** Moves the camera back from the middle of the scene until all of it, within the track, is in the picture. */
-  frame() {
-    const { length, width } = this.settings.track;
-    const box = new three.Box3();
-    this.scene.updateMatrixWorld();
-    this.boxes.forEach(([body, extent]) => box.union(extent.clone().applyMatrix4(this.bodies[body].matrixWorld)));
-    box.min.max(new three.Vector3(-BEYOND, -width / 2 - BEYOND, 0));
-    box.max.min(new three.Vector3(length + BEYOND, width / 2 + BEYOND, 2));
-    const corners = [box.min, box.max].flatMap(({ x }) =>
-      [box.min, box.max].flatMap(({ y }) => [box.min, box.max].map(({ z }) => new three.Vector3(x, y, z))),
-    );
-    const middle = box.getCenter(new three.Vector3());
-    const { x: long, y: broad } = box.getSize(new three.Vector3());
-    const beside = long > 0.9 * broad === this.camera.aspect > 1; // longer side along that of the picture
-    const direction = new three.Vector3(...(beside ? BESIDE : BEHIND_START)).normalize();
-    const outside = (corner) => {
-      const { x, y } = corner.clone().project(this.camera);
-      return Math.abs(x) > 0.97 || y < -0.95 || y > 0.8; // room for the bar at the top
-    };
-    this.controls.target.copy(middle);
-    for (let distance = 2; distance < 60; distance *= 1.03) {
-      this.camera.position.copy(middle).addScaledVector(direction, distance);
-      this.camera.lookAt(middle);
-      this.camera.updateMatrixWorld();
-      if (!corners.some(outside)) break;
-    }
-  }
-
-  /** Moves the camera behind the robot that it follows. */
-  chase(qpos, seconds) {
-    const [x, y, z, w, i, j, k] = this.settings.robots[this.follow].base_qpos.map((address) => qpos[address]);
-    const yaw = Math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k));
-    const [forward, left] = [Math.cos(yaw), Math.sin(yaw)];
-    const share = this.jump ? 1 : 1 - Math.exp(-seconds / SMOOTH);
-    this.jump = false;
-    this.camera.position.lerp(new three.Vector3(x - BACK * forward, y - BACK * left, z + ABOVE), share);
-    this.controls.target.lerp(new three.Vector3(x + AHEAD * forward, y + AHEAD * left, z), share);
+    this.camera.update(data, seconds);
+    this.renderer.render(this.scene, this.camera.lens);
   }
 
   /** Frees the drawing's memory; its canvas cannot be used again. */
   dispose() {
     this.scene?.traverse((item) => item.geometry?.dispose());
-    this.controls.dispose();
+    this.camera.dispose();
     this.renderer.dispose();
   }
 }

@@ -73,9 +73,9 @@ async function load(name, chosen) {
   const robots = settings.robots.map((_, i) => [String(i), `robot ${i + 1}`]);
   const agents = robots.slice(0, settings.teams.flat().length);
   if (page.drive !== '' && !(Number(page.drive) < agents.length)) page.drive = '';
-  if (page.view !== '' && !(Number(page.view) < robots.length)) page.view = '';
+  if (page.view !== 'scene' && !(Number(page.view) < robots.length)) page.view = '';
   fill(element('drive'), [['', 'nobody'], ...agents], page.drive);
-  fill(element('view'), [['', 'scene'], ...robots], page.view);
+  fill(element('view'), [['', 'action'], ['scene', 'whole scene'], ...robots], page.view);
   element('robots').replaceChildren(
     ...robots.flatMap(([i, text]) => [dot(Number(i)), make('small', { textContent: `${text.slice(6)} ` })]),
   );
@@ -113,6 +113,7 @@ function restartScores() {
 function start() {
   episode.reset(page.seed);
   page.due = 0;
+  drawing.camera.jump();
   element('result').hidden = true;
   remember();
   show();
@@ -136,14 +137,14 @@ function setDrive(robot) {
 function setView(view) {
   page.view = view;
   element('view').value = view;
-  drawing.look(view === '' ? null : Number(view));
+  drawing.camera.look(view);
 }
 
 /** The first key or touch that drives takes over the first robot, or the one that the camera follows. */
 function takeOver() {
   if (page.drive !== '' || !episode) return;
-  const followed = Number(page.view);
-  const robot = page.view !== '' && followed < episode.driven.length ? page.view : '0';
+  const followed = /\d/.test(page.view) && Number(page.view) < episode.driven.length;
+  const robot = followed ? page.view : '0';
   setDrive(robot);
   setView(robot);
   remember();
@@ -159,8 +160,9 @@ function finish() {
   if (isMatch()) {
     const winner = settings.teams.findIndex((_, team) => outcome[`team${team}/win`] > 0.5);
     if (winner >= 0) scores.wins[winner] += 1;
-    const marks = winner < 0 ? [] : settings.teams[winner].map(dot);
-    said.replaceChildren(...marks, winner < 0 ? `Draw${reason}` : `Team ${winner + 1} wins${reason}`);
+    const [marks, name] = winner < 0 ? [[], ''] : [settings.teams[winner].map(dot), `Team ${winner + 1} wins`];
+    const own = winner >= 0 && page.drive !== '' && settings.teams[winner].includes(Number(page.drive));
+    said.replaceChildren(...marks, (own ? 'You win' : name || 'Draw') + reason);
   } else {
     const { success } = outcome;
     scores.success += success;
@@ -181,8 +183,9 @@ function show() {
     const marks = settings.teams.map((team) => dot(team[0]));
     element('score').replaceChildren(marks[0], `${wins[0]} : ${wins[1]} `, marks[1]);
   } else {
-    const now = `now ${Math.round(100 * outcome.success)}%`;
-    element('score').textContent = episodes ? `success ${(success / episodes).toFixed(2)} of ${episodes}, ${now}` : now;
+    const percent = (share) => `${Math.round(100 * share)}%`;
+    const mean = episodes ? `, mean of ${episodes}: ${percent(success / episodes)}` : '';
+    element('score').textContent = `success ${percent(outcome.success)}${mean}`;
   }
 }
 
@@ -252,7 +255,7 @@ function play() {
     }
     const behind = page.due >= episode.settings.dt && episode.result === null;
     if (!behind || now - drawn > LONGEST_SKIP) {
-      drawing.draw(episode.physics.data, (now - drawn) / 1000);
+      drawing.draw(episode.physics.data, (now - drawn) / 1000, element('bar').offsetHeight);
       show();
       drawn = now;
       meter.frames += 1;
@@ -304,7 +307,7 @@ function listen() {
       element('status').textContent = '';
     });
   });
-  const views = () => ['', ...episode.settings.robots.map((_, i) => String(i))];
+  const views = () => ['', 'scene', ...episode.settings.robots.map((_, i) => String(i))];
   const keys = {
     Space: pause,
     KeyR: () => later(start),
