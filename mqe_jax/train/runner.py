@@ -29,12 +29,13 @@ from mqe_jax.train.checkpoint import (
     save_checkpoint,
 )
 from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.devices import Processes
 from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
-from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
+from mqe_jax.train.start import CONFIG_FILE, first_state, initial_key, learned, without_environments
 from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -98,20 +99,37 @@ def train_seeds(
         fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
     check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
-    learner = make_learner(env, configs[0], None if recorder is None else recorder.trace)
+    learner, processes = _learner(env, configs[0], recorder)
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
     with contextlib.ExitStack() as locks:
-        for folder in folders:
-            check_alone(folder)
-        for folder in folders:
-            check_folder(folder)
-            locks.enter_context(locked(folder))
-            for inner in (folder, *folder.glob("*/")):
-                remove_temporaries(inner)
-        for folder in folders:
-            check_run(folder, resume, run_files)
+        if processes.leads:
+            for folder in folders:
+                check_alone(folder)
+            for folder in folders:
+                check_folder(folder)
+                locks.enter_context(locked(folder))
+                for inner in (folder, *folder.glob("*/")):
+                    remove_temporaries(inner)
+            for folder in folders:
+                check_run(folder, resume, run_files)
+        processes.gather([0])  # the others wait for these checks
         checkpoints = _common_checkpoints(folders)
-        return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update, stop)
+        training = _Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
+        return training.run(on_update, stop)
+
+
+def _learner(env: VectorEnv, config: TrainConfig, recorder: Recorder | None) -> tuple[Learner, Processes]:
+    """Returns the learner of this process, which has its share of the environments, and all processes."""
+    trace, count = None if recorder is None else recorder.trace, jax.process_count()
+    whole = own = make_learner(env, config, trace)
+    if count > 1:
+        if recorder is not None:
+            raise InputError(f"recorder: not allowed in {count} processes; start the same training in one")
+        share: Any = getattr(env, "share", None)
+        if share is None:
+            raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
+        own = make_learner(share(count), config, processes=count)
+    return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
 
 
 def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
@@ -138,6 +156,7 @@ class _Training:
         self,
         env: VectorEnv,
         learner: Learner,
+        processes: Processes,
         configs: Sequence[TrainConfig],
         folders: Sequence[Path],
         checkpoints: Sequence[Path | None],
@@ -145,16 +164,19 @@ class _Training:
         recorder: Recorder | None,
     ) -> None:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
-        self._config = configs[0]
+        self._config, self._processes = configs[0], processes
         self._seeds = seeds = Seeds(learner.init, len(configs))
-        first = [first_state(env, learner, c, path, seeds.shared) for c, path in zip(configs, checkpoints, strict=True)]
+        first = [
+            first_state(env, learner, processes, own, path, seeds.shared)
+            for own, path in zip(configs, checkpoints, strict=True)
+        ]
         self._state = seeds.stack([state for state, _ in first])
-        self._update = seeds.map(learner.update)
+        self._update = processes.stacked(seeds.shared).compile(seeds.map(learner.update), more=True)
         self._env_steps = int(first[0][0].updates) * self._config.steps_per_update
         self._saved = -1 if checkpoints[0] is None else self._env_steps
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
-        if self._config.evaluation.every is not None and eval_env is not None:
+        if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
             self._monitor = Monitor(eval_env, self._config)
         self._evaluations: list[EvaluationLog] = []
         self._logs = contextlib.ExitStack()
@@ -166,7 +188,7 @@ class _Training:
         if self._saved == self._env_steps:
             self._save_policies()  # a run that ended between checkpoint and policy has an older one
         self._save()  # so that a run killed before its first regular checkpoint can be resumed too
-        for own, folder in zip(self._configs, self._folders, strict=True):
+        for own, folder in zip(self._configs, self._folders, strict=True) if self._processes.leads else ():
             write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
         total_steps = config.num_updates * config.steps_per_update
@@ -174,16 +196,19 @@ class _Training:
             makers = (CsvLog, *(LOGGERS[name] for name in config.loggers))
             files: list[list[MetricsLog]] = [[] for _ in self._folders]
             for folder, own_logs in zip(self._folders, files, strict=True):
-                for make_log in makers:
+                for make_log in makers if self._processes.leads else ():
                     own_logs.append(make_log(folder, self._env_steps))
                     logs.callback(own_logs[-1].close)
-            progress_log = logs.enter_context(ProgressLog(config.task or self._env.name, self._env_steps, total_steps))
+            progress_log = ProgressLog(config.task or self._env.name, self._env_steps, total_steps)
+            if self._processes.leads:
+                logs.enter_context(progress_log)
             logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
-                while self._env_steps < total_steps and not stop():
+                while self._env_steps < total_steps and not self._processes.gather([stop()]).any():
                     rows = self._step(files)
-                    progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                    if self._processes.leads:
+                        progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                     if on_update is not None:
                         for i, row in enumerate(rows):
                             on_update(self._seeds.take(self._state, i), row)
@@ -252,22 +277,28 @@ class _Training:
                 metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
                 metadata["environments"] = config.checkpoint.environments
                 state = self._seeds.take(self._state, i)
-                whole = config.checkpoint.environments
-                tree = without_shared(state, self._seeds.shared) if whole else without_environments(state)
-                save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+                if config.checkpoint.environments:
+                    tree = self._processes.join(without_shared(state, self._seeds.shared))
+                else:
+                    tree = without_environments(state)
+                if self._processes.leads:
+                    save_checkpoint(folder, tree, self._env_steps, metadata, kept)
             self._save_policies()
             self._saved = self._env_steps
             for log in self._evaluations:
                 log.prune()
 
     def _save_policies(self) -> None:
+        if not self._processes.leads:
+            return
         for folder, policy in zip(self._folders, self._policies(), strict=True):
             save_policy(folder, policy)
 
     def _evaluate_if_due(self) -> bool:
         """Evaluates after every `evaluation.every` updates and after the last one; returns whether it was due."""
         updates, last = self._env_steps // self._config.steps_per_update, self._config.num_updates
-        due = self._monitor is not None and updates > 0 and updates % (self._config.evaluation.every or 1) == 0
+        every = self._config.evaluation.every
+        due = every is not None and updates > 0 and updates % every == 0
         if due or updates >= last:
             self._evaluate()
         return due
