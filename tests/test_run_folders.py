@@ -48,7 +48,7 @@ def test_a_training_stops_when_its_folder_is_lost(
     how: str, tmp_path: Path, learner: Learner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With one line; neither the old path nor the folder that is there now gets a file."""
-    monkeypatch.setattr("mqe_jax.train.runner.make_learner", lambda *_: learner)
+    monkeypatch.setattr("mqe_jax.train.start.make_learner", lambda *_: learner)
     folder = tmp_path / "runs" / "run"
 
     def lose(state: object, row: dict[str, float]) -> None:
@@ -69,7 +69,7 @@ def test_a_second_training_keeps_its_checkpoints(
     tmp_path: Path, learner: Learner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a folder that is renamed while a training writes to it, and replaced by another training."""
-    monkeypatch.setattr("mqe_jax.train.runner.make_learner", lambda *_: learner)
+    monkeypatch.setattr("mqe_jax.train.start.make_learner", lambda *_: learner)
     folder, seen = tmp_path / "run", {}
 
     def lose(state: object, row: dict[str, float]) -> None:
@@ -112,7 +112,7 @@ def test_files_of_dead_processes_go_when_a_run_starts(
     tmp_path: Path, learner: Learner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of processes that run, such as a clip that is being written, stay."""
-    monkeypatch.setattr("mqe_jax.train.runner.make_learner", lambda *_: learner)
+    monkeypatch.setattr("mqe_jax.train.start.make_learner", lambda *_: learner)
     dead = 2**22 + 1  # above the largest process number
     (tmp_path / "checkpoints").mkdir()
     gone = [f".policy.{n}.tmp.safetensors" for n in (dead, os.getpid())]

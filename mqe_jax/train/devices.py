@@ -7,6 +7,7 @@ processes; anywhere else they are those of a single process: means are the ident
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import Any
@@ -23,11 +24,15 @@ from mqe_jax.train.types import PyTree
 
 AXIS = "processes"
 
+PEER = re.compile(r"[Gg]loo|NCCL|[Cc]onnection (reset|closed)|coordination|distributed service")
+"""Occurs in what JAX says where another process has ended."""
+PEER_ENDED = "another process of the training, or its host, has ended"
+
 _WHOLE = PartitionSpec()
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
 
 
-# -- inside of the learner ----------------------------------------------------------------------------------------------
+# -- inside of the learner ---------------------------------------------------------------------------------------------
 
 
 def size() -> int:
@@ -93,7 +98,18 @@ def alone() -> Iterator[None]:
         _ALONE.reset(token)
 
 
-# -- around it ----------------------------------------------------------------------------------------------------------
+# -- around it ---------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def connected() -> Iterator[None]:
+    """Turns JAX's error of a collective, where another process has ended, into a ConnectionError of one line."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1 or not PEER.search(str(error)):
+            raise
+        raise ConnectionError(f"{PEER_ENDED}; the same command with --resume goes on") from None
 
 
 def share(name: str, count: int, parts: int) -> int:
@@ -161,7 +177,6 @@ class Processes:
     def join(self, state: PyTree) -> PyTree:
         """Returns the state of all environments, on the host; called by all processes."""
 
-
         def whole(x: Any, spec: PartitionSpec) -> Any:
             if self.count == 1 or _whole(x, spec):
                 return x
@@ -204,4 +219,3 @@ class Processes:
 def _whole(x: Any, spec: PartitionSpec) -> bool:
     """Returns whether a leaf is not split, or left out (`without_shared`)."""
     return AXIS not in spec or x.shape == (0,)
-

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 
 from mqe_jax.train import devices
 from mqe_jax.train.advantage import gae
+from mqe_jax.train.batches import chunks, minibatches, take
 from mqe_jax.train.checks import check_divisible, check_environment
-from mqe_jax.train.config import PPO, TrainConfig
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
@@ -246,30 +247,16 @@ def _prepare(
     memory = transitions.memory._replace(critic=jax.tree.map(lambda x: x[::steps], transitions.memory.critic))
     batch = Batch(
         memory=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), memory),
-        is_first=_chunks(transitions.is_first, steps),
-        obs=_chunks(obs, steps),
-        privileged_obs=_chunks(privileged, steps),
-        action=_chunks(transitions.action, steps),
-        log_prob=_chunks(transitions.log_prob, steps),
-        advantage=_chunks(advantage, steps),
-        target=_chunks(target, steps),
-        old_value=_chunks(pair[0], steps),
+        is_first=chunks(transitions.is_first, steps),
+        obs=chunks(obs, steps),
+        privileged_obs=chunks(privileged, steps),
+        action=chunks(transitions.action, steps),
+        log_prob=chunks(transitions.log_prob, steps),
+        advantage=chunks(advantage, steps),
+        target=chunks(target, steps),
+        old_value=chunks(pair[0], steps),
     )
     return batch, value_normalizer, metrics
-
-
-def _chunks(x: jax.Array, length: int) -> jax.Array:
-    """Splits the time axis into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
-    parts, envs = x.shape[0] // length, x.shape[1]
-    x = x.reshape(parts, length, *x.shape[1:])
-    return jnp.swapaxes(x, 0, 1).reshape(length, parts * envs, *x.shape[3:])
-
-
-def _take(batch: Batch, index: jax.Array) -> Batch:
-    """Returns the chunks with the given indices (C',)."""
-    memory = jax.tree.map(lambda x: x[index], batch.memory)
-    rest = {name: getattr(batch, name)[:, index] for name in Batch._fields if name != "memory"}
-    return Batch(memory=memory, **rest)
 
 
 def _loss(
@@ -308,21 +295,6 @@ def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.A
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
 
 
-def _minibatches(ppo: PPO, key: jax.Array, parts: int, envs: int) -> jax.Array:
-    """Returns the chunks of every minibatch (M, C / M), of the C = parts x envs chunks of this process.
-
-    The environments of all processes are `ppo.groups` groups. The chunks of each are permuted, and every minibatch gets
-    equally many of them, so that a process with whole groups has its share of every minibatch.
-    """
-    groups = ppo.groups // devices.size()
-    keys = key[None] if ppo.groups == 1 else devices.rows(lambda n: jax.random.split(key, n), groups)
-    part, env = jnp.divmod(
-        jax.vmap(lambda key: jax.random.permutation(key, parts * envs // groups))(keys), envs // groups
-    )
-    chunk = part * envs + jnp.arange(groups)[:, None] * (envs // groups) + env
-    return jnp.swapaxes(chunk.reshape(groups, ppo.minibatches, -1), 0, 1).reshape(ppo.minibatches, -1)
-
-
 def _learn(
     network: Network,
     optimizer: Optimizer,
@@ -352,8 +324,8 @@ def _learn(
     def epoch(carry: Carry, epoch_key: jax.Array) -> tuple[Carry, Metrics]:
         if config.ppo.minibatches == 1:
             return step(carry, batch)
-        index = _minibatches(config.ppo, epoch_key, parts, batch.is_first.shape[1] // parts)
-        carry, metrics = jax.lax.scan(lambda c, i: step(c, _take(batch, i)), carry, index)
+        index = minibatches(config.ppo, epoch_key, parts, batch.is_first.shape[1] // parts)
+        carry, metrics = jax.lax.scan(lambda c, i: step(c, take(batch, i)), carry, index)
         return carry, jax.tree.map(jnp.mean, metrics)
 
     carry = (state.params, state.optimizer, state.learning_rate)

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -29,13 +28,13 @@ from mqe_jax.train.checkpoint import (
     save_checkpoint,
 )
 from mqe_jax.train.config import TrainConfig, load_config
-from mqe_jax.train.devices import Processes
-from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
-from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
+from mqe_jax.train.devices import Processes, connected
+from mqe_jax.train.learner import Learner, TrainState, env_dims
+from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
-from mqe_jax.train.start import CONFIG_FILE, first_state, initial_key, learned, without_environments
+from mqe_jax.train.start import CONFIG_FILE, first_state, learned, own_learner, without_environments
 from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -99,9 +98,9 @@ def train_seeds(
         fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
     check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
-    learner, processes = _learner(env, configs[0], recorder)
+    learner, processes = own_learner(env, configs[0], recorder)
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
-    with contextlib.ExitStack() as locks:
+    with connected(), contextlib.ExitStack() as locks:
         if processes.leads:
             for folder in folders:
                 check_alone(folder)
@@ -116,20 +115,6 @@ def train_seeds(
         checkpoints = _common_checkpoints(folders)
         training = _Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
         return training.run(on_update, stop)
-
-
-def _learner(env: VectorEnv, config: TrainConfig, recorder: Recorder | None) -> tuple[Learner, Processes]:
-    """Returns the learner of this process, which has its share of the environments, and all processes."""
-    trace, count = None if recorder is None else recorder.trace, jax.process_count()
-    whole = own = make_learner(env, config, trace)
-    if count > 1:
-        if recorder is not None:
-            raise InputError(f"recorder: not allowed in {count} processes; start the same training in one")
-        share: Any = getattr(env, "share", None)
-        if share is None:
-            raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
-        own = make_learner(share(count), config, processes=count)
-    return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
 
 
 def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
@@ -181,6 +166,7 @@ class _Training:
         self._evaluations: list[EvaluationLog] = []
         self._logs = contextlib.ExitStack()
         self._writing = threading.RLock()  # held while files are written and the state is exchanged
+        self._signal, self._ended = threading.Event(), threading.Event()  # in one of several processes
 
     def run(self, on_update: OnUpdate | None, stop: Callable[[], bool]) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
@@ -205,7 +191,7 @@ class _Training:
             logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
-                while self._env_steps < total_steps and not self._processes.gather([stop()]).any():
+                while self._env_steps < total_steps and not self._stopped(stop):
                     rows = self._step(files)
                     if self._processes.leads:
                         progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
@@ -217,23 +203,42 @@ class _Training:
                 self._save()
                 if self._env_steps >= total_steps:
                     self._measure_best()
+                self._processes.gather([0])  # the others wait for the one that evaluates
             except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+                if self._processes.count > 1:
+                    raise
                 if isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" not in str(error):
                     raise
                 self._save()
                 raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
+            finally:
+                self._ended.set()
         return [self._seeds.take(self._state, i) for i in range(len(self._configs))]
 
     def _end(self) -> None:
         """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
 
         The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
+        Several processes finish it, to save the same one.
         """
+        if self._processes.count > 1:
+            self._signal.set()
+            self._ended.wait()
         self._writing.acquire()  # for ever, so that the main thread writes nothing more
         try:
             self._save()
         finally:
             self._logs.close()
+
+    def _stopped(self, stop: Callable[[], bool]) -> bool:
+        """Returns whether the run ends here, for all processes; ends them all, after saving, for a signal to one."""
+        asked = self._processes.gather([stop(), self._signal.is_set()])
+        if asked[:, 1].any():
+            self._save()
+            self._processes.gather([0])
+            self._ended.set()
+            interrupts.end()
+        return bool(asked[:, 0].any())
 
     def _step(self, files: Sequence[Sequence[MetricsLog]]) -> list[dict[str, float]]:
         """Performs and logs one update of every seed; returns the rows of metrics.csv."""
@@ -246,7 +251,7 @@ class _Training:
         for i, folder in enumerate(self._folders):
             state = self._seeds.take(after, i)
             own = {name: value[i] for name, value in metrics.items()}
-            row = _row(state, own, self._config, self._start_time, began)
+            row = row_of(int(state.updates), own, self._config, self._start_time, began)
             row["fps"] *= len(self._folders)
             _check_finite(state, row, folder)
             rows.append(row)
@@ -340,19 +345,3 @@ def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) ->
 def load_run_config(run_dir: str | Path) -> TrainConfig:
     """Reads the settings of a run folder; raises an InputError that names the file."""
     return load_config(Path(run_dir) / CONFIG_FILE)
-
-
-def _row(
-    state: TrainState, metrics: dict[str, Any], config: TrainConfig, start_time: float, update_began: float
-) -> dict[str, float]:
-    """Returns a row of metrics.csv: steps and times first, then the update's metrics by name."""
-    now = time.perf_counter()
-    updates = int(state.updates)
-    row: dict[str, float] = {
-        "env_steps": updates * config.steps_per_update,
-        "updates": updates,
-        "seconds": now - start_time,
-        "fps": config.steps_per_update / (now - update_began),
-    }
-    row.update({name: float(np.asarray(value)) for name, value in sorted(metrics.items())})
-    return row
