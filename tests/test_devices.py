@@ -33,13 +33,16 @@ def test_statistics_are_those_of_all_processes() -> None:
         (lambda x: devices.total(jnp.sum(x)), x.sum()),
         (devices.variance, x.var()),
         (devices.median, np.median(x)),
-        (lambda x: devices.any_of(x[0, 0] == x[1, 0, 0]), True),
         (lambda x: devices.variance(x, axis=0), x.reshape(10, 7).var(axis=0)),
     ):
         found = np.asarray(together(function)(x))
         np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-5)
-        whole = function(x.reshape(10, 7))
-        np.testing.assert_allclose(whole, expected if function is not devices.any_of else whole, rtol=1e-5)
+        np.testing.assert_allclose(function(x.reshape(10, 7)), expected, rtol=1e-5)
+
+
+def test_a_flag_of_one_process_is_true_for_all() -> None:
+    for flags in ([False, True], [False, False]):
+        assert together(devices.any_of)(jnp.array(flags)).tolist() == [any(flags)] * 2
 
 
 def test_random_numbers_belong_to_the_environment() -> None:

@@ -29,6 +29,9 @@ MEMBER = "MQE_PROCESS"
 HEARTBEAT = 30
 """Time after which a process is dead whose host does not answer, s."""
 
+PROGRAM = [sys.executable, "-m", "mqe_jax.cli"]
+"""What runs a command in a process of the training."""
+
 _COMMANDS = ("train", "walk", "sweep")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _RESUME = "the same command with --resume goes on"
@@ -121,6 +124,7 @@ def join() -> None:
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     member = os.environ[MEMBER]
+    jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
     timeouts: Any = {"heartbeat_timeout_seconds": HEARTBEAT, "shutdown_timeout_seconds": HEARTBEAT}
     try:
         if member == "auto":
@@ -146,13 +150,12 @@ class _Process:
     def __init__(self, command: Sequence[str], variables: Mapping[str, str], prefix: str, shown: bool) -> None:
         self.peer, self.last, self.muted = False, "", False
         self._prefix, self._shown = prefix, shown
-        words = [sys.executable, "-m", "mqe_jax.cli", *command]
         self.popen = subprocess.Popen(
-            words,
+            [*PROGRAM, *command],
             env={**os.environ, **variables},
             stdin=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            stdout=None if shown else subprocess.DEVNULL,
+            stdout=None if prefix else subprocess.DEVNULL,  # a training writes none, but JAX does
             text=True,
             errors="replace",
         )

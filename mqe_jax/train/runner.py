@@ -219,9 +219,9 @@ class _Training:
         """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
 
         The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
-        Several processes finish it, to save the same one.
+        Several processes finish it, where the one before is not saved, to save the same one.
         """
-        if self._processes.count > 1:
+        if self._processes.count > 1 and self._saved != self._env_steps:
             self._signal.set()
             self._ended.wait()
         self._writing.acquire()  # for ever, so that the main thread writes nothing more
