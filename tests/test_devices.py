@@ -37,7 +37,7 @@ def test_statistics_are_those_of_all_processes() -> None:
     ):
         found = np.asarray(together(function)(x))
         np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-5)
-        np.testing.assert_allclose(function(x.reshape(10, 7)), expected, rtol=1e-5)
+        np.testing.assert_allclose(function(jnp.asarray(x).reshape(10, 7)), expected, rtol=1e-5)
 
 
 def test_a_flag_of_one_process_is_true_for_all() -> None:

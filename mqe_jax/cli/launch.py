@@ -35,7 +35,7 @@ PROGRAM = [sys.executable, "-m", "mqe_jax.cli"]
 _COMMANDS = ("train", "walk", "sweep")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _RESUME = "the same command with --resume goes on"
-_NOISE = re.compile(r"([IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[mpi)")
+_NOISE = re.compile(r"([IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo)")
 
 
 @record
