@@ -272,7 +272,11 @@ def test_two_hosts(vanishes: bool, hosts: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
     flags = ["launch", "--coordinator", "10.77.0.1:7777", "--processes", "2"]
     words = [*TRAIN, "--total-steps", "16000000" if vanishes else "16", "--run-dir", str(run)]
-    commands = [["ip", "netns", "exec", name, *MQE, *flags, "--index", str(i), *words] for i, name in enumerate(hosts)]
+    named = ["unshare", "-u", "sh", "-c", 'hostname $0; exec "$@"']  # gloo connects to what a host's name means
+    commands = [
+        ["ip", "netns", "exec", name, *named, f"10.77.0.{i + 1}", *MQE, *flags, "--index", str(i), *words]
+        for i, name in enumerate(hosts)
+    ]
     with started(commands[0]) as first, started(commands[1]) as second:
         if vanishes:
             wait_until(lambda: updates(run) > 5, first)
