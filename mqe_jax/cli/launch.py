@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import tyro
 
 from mqe_jax import interrupts
-from mqe_jax.cli.output import echo
+from mqe_jax.cli.options import echo
 from mqe_jax.errors import InputError
 from mqe_jax.limits import PositiveInt
 from mqe_jax.settings import fail, record
