@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, autoreset
+from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy
 from mqe_jax.train.types import PyTree
 
@@ -54,7 +55,14 @@ class Demonstrated(VectorEnv):
 
     def reset(self, key: jax.Array) -> DemonstratedState:
         """Returns N initial states of the task, with the demonstrator's states, which do not depend on the key."""
-        return DemonstratedState(**vars(super().reset(key)), demonstrations=self._record())
+        with devices.alone():
+            demonstrations = self._record()
+        return DemonstratedState(**vars(super().reset(key)), demonstrations=demonstrations)
+
+    def share(self, parts: int) -> Demonstrated:
+        """Returns the batch of one of several processes, as `VectorEnv.share`."""
+        num_envs = devices.share("num_envs", self.num_envs, parts)
+        return Demonstrated(self.env, num_envs, self.demonstrator, self.copies, backward=self.backward)
 
     def step(self, state: State, action: jax.Array) -> DemonstratedState:
         """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""

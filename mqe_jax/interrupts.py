@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from mqe_jax.errors import one_line
 
@@ -79,6 +79,14 @@ def child(command: Sequence[str], **options: Any) -> Iterator[Any]:
 def settle() -> None:
     """Does not return while a signal ends the process, so that the main thread reports no error of that."""
     if _ending.is_set():
+        threading.Event().wait()
+
+
+def end() -> NoReturn:
+    """Ends the process as SIGTERM does, and its main thread here."""
+    if not _ending.is_set():
+        os.kill(os.getpid(), signal.SIGTERM)
+    while True:
         threading.Event().wait()
 
 

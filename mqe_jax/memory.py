@@ -21,7 +21,7 @@ def bytes_of(tree: Any) -> int:
 
 def free_memory() -> float:
     """Returns the free bytes of the device that JAX uses; infinity where that is unknown."""
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         return stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)

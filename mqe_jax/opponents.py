@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.limits import Number
 from mqe_jax.policies import load_opponent, team_size
 from mqe_jax.settings import check, checked, fail
+from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.types import AnyBatch, Memory, PyTree
 
@@ -45,7 +47,7 @@ class Opponent:
 class TeamState(EnvironmentState):
     """State of M environments of one team of T agents, in N matches of A agents; metrics are those of team 0.
 
-    The first N of `step` and `assistance` are those of the matches; `key` is that of the opponents' actions.
+    Every (M / N)th of `step` and `assistance` is that of a match; `key` is that of the opponents' actions.
     """
 
     match: State
@@ -84,10 +86,17 @@ class OneTeam:
         self.privileged_observation_size = matches.privileged_observation_size
         self.action_size = matches.action_size
 
+    def share(self, parts: int) -> Self:
+        """Returns the environments of one of several processes, as `VectorEnv.share`."""
+        other = copy.copy(self)
+        other.num_envs = devices.share("num_envs", self.num_envs, parts)
+        other.matches = self.matches.share(parts)
+        return other
+
     def _stepped(self, state: TeamState, action: jax.Array) -> State:
         """Advances the matches by a step with the actions of all agents (N, A, D)."""
-        count = self.matches.num_envs
-        match = dataclasses.replace(state.match, step=state.step[:count], assistance=state.assistance[:count])
+        every = self.num_envs // self.matches.num_envs
+        match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
         return self.matches.step(match, action)
 
     def _check_action(self, action: jax.Array) -> None:
@@ -97,7 +106,10 @@ class OneTeam:
 
 
 class Versus(OneTeam):
-    """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`."""
+    """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`.
+
+    Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
+    """
 
     opponents: tuple[Policy, ...]
     """Opponent of each block at the start."""
@@ -117,7 +129,6 @@ class Versus(OneTeam):
                     f"{self.num_agents}"
                 )
         self.opponents = tuple(opponents)
-        self._size = self.num_envs // len(opponents)
 
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
@@ -146,7 +157,8 @@ class Versus(OneTeam):
             other, memory = _act(policy, opponent, obs, keys[i])
             others.append(jnp.asarray(other, jnp.float32))
             opponents.append(dataclasses.replace(opponent, memory=memory))
-        both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.concatenate(others)], axis=1)
+        theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
+        both = jnp.concatenate([jnp.asarray(action, jnp.float32), theirs], axis=1)
         match = self._stepped(state, both)
         done = match.terminated | match.truncated
         ended = jnp.stack([done & (match.metrics[f"team0/{name}"] > 0) for name in OUTCOMES], axis=-1)
@@ -183,8 +195,12 @@ class Versus(OneTeam):
         opponents = (*state.opponents[:block], changed, *state.opponents[block + 1 :])
         return dataclasses.replace(state, opponents=opponents)
 
+    @property
+    def _size(self) -> int:
+        return self.num_envs // len(self.opponents)
+
     def _block(self, index: int) -> slice:
-        return slice(index * self._size, (index + 1) * self._size)
+        return slice(index, None, len(self.opponents))
 
     def _restarted(self, index: int, opponent: Opponent, done: jax.Array, ended: jax.Array) -> Opponent:
         """Counts the outcomes `ended` (B, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
@@ -228,7 +244,7 @@ def versus(
 ) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
-    The environments come in equal blocks, one for each opponent, in their order. Trained policies act as they are
+    The environments meet the opponents in turn, equally many each. Trained policies act as they are
     loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`); others are fixed.
 
     Args:
@@ -250,10 +266,10 @@ def versus(
 
 
 class Mirror(OneTeam):
-    """N matches as 2 N environments of one team, first all teams 0, then all teams 1: one policy learns as both.
+    """N matches as 2 N environments of one team, the two of each match side by side: one policy learns as both.
 
-    The privileged observation has one more number, the index of the team. The metrics are those of team 0 in both
-    halves; `diverged` and `overflow` are counted in the first.
+    The privileged observation has one more number, the index of the team. The metrics are those of team 0 for both;
+    `diverged` and `overflow` are counted for the first.
     """
 
     def __init__(self, matches: VectorEnv) -> None:
@@ -272,23 +288,23 @@ class Mirror(OneTeam):
             InputError: for actions of another shape.
         """
         self._check_action(action)
-        both = jnp.concatenate(jnp.split(action, 2), axis=1)
+        both = action.reshape(self.matches.num_envs, 2 * self.num_agents, self.action_size)
         return self._seen(self._stepped(state, both), both)
 
     def _seen(self, match: State, action: jax.Array) -> TeamState:
         def teams(x: jax.Array) -> jax.Array:
-            return jnp.concatenate(jnp.split(x, 2, axis=1))
+            return x.reshape(self.num_envs, self.num_agents, *x.shape[2:])
 
         def twice(x: jax.Array) -> jax.Array:
-            return jnp.concatenate([x, x])
+            return jnp.repeat(x, 2, axis=0)
 
         def privileged(x: jax.Array) -> jax.Array:
-            team = jnp.repeat(jnp.arange(2.0), len(x))[:, None]
+            team = jnp.tile(jnp.arange(2.0), len(x))[:, None]
             return jnp.concatenate([twice(x), team], axis=1)
 
         metrics = {name: twice(value) for name, value in match.metrics.items() if not name.startswith("team1/")}
         for name in ("diverged", "overflow"):
-            metrics[name] = jnp.concatenate([match.metrics[name], jnp.zeros_like(match.metrics[name])])
+            metrics[name] = metrics[name] * (jnp.arange(self.num_envs) % 2 == 0)
         return TeamState(
             match=match,
             action=action,
@@ -312,7 +328,7 @@ def exchanged(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> O
     if at_once:
         waiting = jnp.zeros_like(opponent.waiting)
         return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=waiting)
-    pending = jnp.any(opponent.waiting)
+    pending = devices.any_of(jnp.any(opponent.waiting))
     before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
     waiting = jnp.where(pending, opponent.waiting, True)
     return dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)

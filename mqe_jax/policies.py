@@ -17,6 +17,7 @@ from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
 from mqe_jax.settings import PathText, checked
+from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
 from mqe_jax.train.types import AnyEnvironment, Memory
 
@@ -168,7 +169,11 @@ def _plan(name: str, env: Any) -> Callable[[jax.Array, jax.Array], jax.Array]:
         return lambda obs, key: scripted(obs)
     shape = (team_size(env), env.action_size)
     if name == "random":
-        return lambda obs, key: jax.random.uniform(key, (len(obs), *shape), minval=-1.0, maxval=1.0)
+
+        def uniform(obs: jax.Array, key: jax.Array) -> jax.Array:
+            return devices.rows(lambda n: jax.random.uniform(key, (n, *shape), minval=-1.0, maxval=1.0), len(obs))
+
+        return uniform
     first = _FORWARD if name == "forward" else 0.0
     return lambda obs, key: jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
 

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.cli import main, setup
+from mqe_jax.cli import launch, main, setup
+from mqe_jax.train import devices
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 """Flags of a training that ends within seconds."""
@@ -123,7 +124,10 @@ class FakeVectorEnv:
         self.privileged_observation_size = env.privileged_observation_size
 
     def reset(self, key: jax.Array) -> FakeState:
-        return jax.vmap(self.env.reset)(jax.random.split(key, self.num_envs))
+        return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
+
+    def share(self, parts: int) -> FakeVectorEnv:
+        return FakeVectorEnv(self.env, self.num_envs // parts)
 
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
         def one(state: FakeState, action: jax.Array) -> FakeState:
@@ -146,4 +150,5 @@ def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, cop
 
 if __name__ == "__main__":
     setattr(setup, "make_env", make_env)  # noqa: B010
+    setattr(launch, "PROGRAM", [sys.executable, __file__])  # noqa: B010
     sys.exit(main())

@@ -88,7 +88,7 @@ def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
     assert (env.num_envs, env.num_agents, env.teams, env.observation_size) == (4, 1, ((0,),), 12)
     state = jax.jit(env.step)(env.reset(KEY), jnp.full((4, 1, 12), 0.5))
     np.testing.assert_allclose(state.action[:, 0], 0.5)
-    np.testing.assert_allclose(state.action[:, 1, 0], [0.0, 0.0, 0.25, 0.25])
+    np.testing.assert_allclose(state.action[:, 1, 0], [0.0, 0.25, 0.0, 0.25])
     np.testing.assert_array_equal(state.obs, state.match.obs[:, :1])
     np.testing.assert_array_equal(state.reward, state.match.reward[:, :1])
     assert {"team0/win", "team0/loss", "success"} <= set(state.metrics) and "team1/win" not in state.metrics
@@ -105,14 +105,14 @@ def test_opponents_change_at_resets(policies: list[TrainedPolicy], door: VectorE
     state = env.change(state, 0, new)
     played = []
     for _ in range(3):
-        obs, opponent = state.match.obs[:2, 1:], state.opponents[0]
+        obs, opponent = state.match.obs[::2, 1:], state.opponents[0]
         by = [policy.act(obs, opponent.memory)[0] for policy in (old, new)]
         state = step(state, action)
-        played.append([[bool(jnp.allclose(state.action[i, 1:], x[i], atol=1e-5)) for x in by] for i in range(2)])
+        played.append([[bool(jnp.allclose(state.action[2 * i, 1:], x[i], atol=1e-5)) for x in by] for i in range(2)])
     assert played[0] == [[True, False], [True, False]]
     assert played[1] == played[2] == [[False, True], [True, False]]
     assert state.opponents[0].waiting.tolist() == [False, True]
-    np.testing.assert_allclose(state.action[2:, 1], 0.0)
+    np.testing.assert_allclose(state.action[1::2, 1], 0.0)
 
 
 def test_the_newest_policy_is_exchanged_within_an_episode(policies: list[TrainedPolicy], door: VectorEnv) -> None:
@@ -180,13 +180,13 @@ def test_a_mirrored_match_shows_both_teams() -> None:
     env = Mirror(inner)
     state = env.reset(KEY)
     assert state.obs.shape == (6, 1, 10) and env.num_envs == 6
-    np.testing.assert_array_equal(state.obs[3:], state.match.obs[:, 1:])
-    np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(state.obs[1::2], state.match.obs[:, 1:])
+    np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 1, 0, 1, 0, 1])
     assert state.privileged_obs.shape == (6, env.privileged_observation_size)
     action = jax.random.uniform(KEY, (6, 1, 12), minval=-1.0)
     state = jax.jit(env.step)(state, action)
-    np.testing.assert_array_equal(state.action, jnp.stack([action[:3, 0], action[3:, 0]], axis=1))
-    np.testing.assert_allclose(state.reward[:3], -state.reward[3:], atol=1e-6)
+    np.testing.assert_array_equal(state.action, jnp.stack([action[::2, 0], action[1::2, 0]], axis=1))
+    np.testing.assert_allclose(state.reward[::2], -state.reward[1::2], atol=1e-6)
 
 
 @pytest.mark.soak

@@ -29,6 +29,7 @@ First steps:
 COMMANDS: dict[str, Any] = {
     "tasks": commands.Tasks,
     "zoo": commands.Zoo,
+    "launch": "Train in several processes, one per device: mqe launch --processes 2 train go1gate.",
     "train": "Train a policy on a task, into a run folder.",
     "eval": commands.Eval,
     "render": render.Render,
@@ -83,7 +84,8 @@ def parse(arguments: Sequence[str]) -> Any:
         name = " ".join(arguments[:2]) if name == "walk" else name
         raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
     if isinstance(COMMANDS[name], str):
-        from mqe_jax.cli import train
+        from mqe_jax.cli import launch, train
 
-        return train.parse_train(rest) if name == "train" else train.parse_walk_train(rest)
+        parsers = {"launch": launch.parse_launch, "train": train.parse_train, "walk train": train.parse_walk_train}
+        return parsers[name](rest)
     return tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))

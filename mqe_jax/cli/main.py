@@ -36,6 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if message:
         with contextlib.suppress(OSError):  # standard error may be a file on a full disk
             print(f"mqe: {message}", file=sys.stderr, flush=True)
+    if code and "MQE_PROCESS" in os.environ:
+        sys.stdout.flush()
+        os._exit(code)  # without waiting for the other processes, which may wait for this one
     return code
 
 
@@ -52,11 +55,16 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         print(f"mqe {mqe_jax.__version__}")
         return 0, ""
     try:
-        _run(parse(arguments))
+        command = parse(arguments)
+        if "MQE_PROCESS" in os.environ:
+            from mqe_jax.cli.launch import join
+
+            join()
+        _run(command)
     except SystemExit as stop:
         if not stop.code:
             raise
-        return 2, ""  # after tyro's message
+        return int(stop.code), ""  # after tyro's message, or that of `mqe launch`
     except KeyboardInterrupt:  # where `main` was called with arguments, from Python
         return interrupts.exit_code(signal.SIGINT), "interrupted"
     except BrokenPipeError:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import pydantic
 import tyro
 
@@ -87,6 +88,8 @@ class Train(TaskOptions):
             finally:
                 if recorder is not None:
                     recorder.report()
+        if jax.process_index() > 0:  # one process writes the files
+            return
         curves.draw_curve(folders, run_dir / "curve.png", self.target)
         echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
 
@@ -116,7 +119,8 @@ class WalkTrain:
             config = override(config, {"network.weights": str(self.weights.resolve())})
         with interrupts.before_exit(lambda: _HINT.format(self.run_dir)):
             train_walk(robot, self.run_dir, config, self.task, impl=self.impl, resume=self.resume)
-        echo(f"mqe: {self.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
+        if jax.process_index() == 0:
+            echo(f"mqe: {self.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
 
 
 def parse_train(arguments: Sequence[str]) -> Train:

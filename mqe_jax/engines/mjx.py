@@ -94,7 +94,7 @@ class JaxEngine(MjxEngine):
         return True
 
     def blank(self) -> mjx.Data:
-        return private.load_mjx().make_data(self.model, impl="jax")
+        return private.load_mjx().make_data(self.model, jax.local_devices()[0], impl="jax")
 
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         """Advances by one physics step; contacts may have been dropped if the capped contact list is full."""
@@ -114,7 +114,7 @@ class WarpEngine(MjxEngine):
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
         self._mjx = private.load_mjx()
-        self.mjx_model = private.without_warnings(self._mjx.put_model(model, impl="warp"))
+        self.mjx_model = private.without_warnings(self._mjx.put_model(model, jax.local_devices()[0], impl="warp"))
 
     @classmethod
     def preferred(cls) -> bool:
@@ -133,7 +133,8 @@ class WarpEngine(MjxEngine):
 
     def blank(self) -> mjx.Data:
         naconmax = self.num_envs * self.contacts_per_env
-        return self._mjx.make_data(self.model, impl="warp", naconmax=naconmax, njmax=self.max_constraints_per_env)
+        sizes = {"naconmax": naconmax, "njmax": self.max_constraints_per_env}
+        return self._mjx.make_data(self.model, jax.local_devices()[0], impl="warp", **sizes)
 
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int

@@ -39,7 +39,7 @@ class MarginStep:
         without_margins = copy.copy(model)  # which MJX refuses beside a height field; `_collision` sets them
         without_margins.geom_margin[:] = 0.0
         without_margins.geom_rbound[:] += inflation
-        self.model = mjx.put_model(without_margins, impl="jax")
+        self.model = mjx.put_model(without_margins, jax.local_devices()[0], impl="jax")
         names = [model.numeric(i).name for i in range(model.nnumeric)]
         capped = "max_contact_points" in names
         self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1

@@ -14,6 +14,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, PositiveInt
 from mqe_jax.memory import bytes_of, check_memory
 from mqe_jax.settings import check, checked, fail
+from mqe_jax.train import devices
 from mqe_jax.train.types import RandomKey
 
 KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
@@ -55,6 +56,8 @@ class VectorEnv:
     """The task."""
     num_envs: int
     """Number of environments N."""
+    copies: int
+    """Batches for which buffers are sized."""
     teams: tuple[tuple[int, ...], ...]
     """Agents of each team."""
     max_episode_steps: int
@@ -66,10 +69,10 @@ class VectorEnv:
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
         num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
-        self.num_envs = num_envs
+        self.num_envs, self.copies = num_envs, copies
         if num_envs * copies > _SMALL:
             state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
-            check_memory("num_envs", num_envs * copies, copies * bytes_of(state))
+            check_memory("num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count())
         self.name = env.name
         self.max_episode_steps = env.max_steps
         self.num_agents = env.num_agents
@@ -81,7 +84,11 @@ class VectorEnv:
     @checked(key=RandomKey)
     def reset(self, key: jax.Array) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
-        return jax.vmap(self.env.reset)(jax.random.split(key, self.num_envs))
+        return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
+
+    def share(self, parts: int) -> VectorEnv:
+        """Returns the batch of one of several processes; raises an InputError for a fraction of an environment."""
+        return VectorEnv(self.env, devices.share("num_envs", self.num_envs, parts), self.copies)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances all environments by one step with actions (N, A, action_size); resets those that ended.

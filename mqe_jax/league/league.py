@@ -19,6 +19,7 @@ from mqe_jax.league.pool import Pool
 from mqe_jax.opponents import OUTCOMES, Versus, exchanged, versus
 from mqe_jax.policies import load_opponent
 from mqe_jax.settings import fail
+from mqe_jax.train import devices
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims
 from mqe_jax.train.normalize import running_init
@@ -117,7 +118,7 @@ class League(Versus):
 
     def _recorded(self, league: LeagueState, opponents: Sequence[Any]) -> LeagueState:
         """Adds the outcomes since the last update."""
-        counts = jnp.stack([opponent.outcomes for opponent in opponents]).astype(jnp.float32)
+        counts = devices.total(jnp.stack([opponent.outcomes for opponent in opponents])).astype(jnp.float32)
         games, score = jnp.sum(counts, axis=1), counts[:, 0] + 0.5 * counts[:, 1]
         members = jnp.where(self._moving, games, 0.0)
         rated = jnp.where(self._moving | self._scripted, games, 0.0)
@@ -147,7 +148,7 @@ class League(Versus):
 
     def _redrawn(self, league: LeagueState, opponents: Sequence[Any]) -> tuple[LeagueState, jax.Array]:
         """Draws another member for blocks that have played enough; returns which did (K,) bool."""
-        waiting = jnp.stack([jnp.any(opponent.waiting) for opponent in opponents])
+        waiting = jnp.stack([devices.any_of(jnp.any(opponent.waiting)) for opponent in opponents])
         enough = self._moving & (league.played >= self._config.league.episodes) & ~waiting
         key, *keys = jax.random.split(league.key, 1 + len(self.sources))
         drawn = [

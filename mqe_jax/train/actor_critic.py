@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from mqe_jax.limits import Horizon, Positive, Width, Widths
 from mqe_jax.settings import fail
-from mqe_jax.train import nn
+from mqe_jax.train import devices, nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
@@ -173,7 +173,7 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
         mean, log_std = mean[0], log_std[0]
         action = mean
         if key is not None:
-            action = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
+            action = mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
         return action, log_prob(action, mean, log_std), memory
 
     def value(

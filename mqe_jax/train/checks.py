@@ -12,14 +12,14 @@ from mqe_jax.train.networks import Network
 from mqe_jax.train.types import VectorEnv, teams_of
 
 
-def check_environment(env: VectorEnv, config: TrainConfig) -> None:
+def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
     if len(teams_of(env)) > 1:
         raise InputError(
             f"env: {env.name} has {len(teams_of(env))} teams; give one: versus(env, opponents) or Mirror(env)"
         )
-    if env.num_envs != config.num_envs:
-        fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs}")
+    if env.num_envs * processes != config.num_envs:
+        fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs * processes}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
     expected = {
@@ -36,7 +36,7 @@ def check_environment(env: VectorEnv, config: TrainConfig) -> None:
         if found != shape:
             raise InputError(f"env: {name} of {env.name} has shape {found}; expected {shape}")
     numbers = env.num_agents * (env.observation_size + env.action_size + 4) + privileged
-    check_memory("rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update)
+    check_memory("rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update / processes)
     assistance = config.curriculum.assistance
     if assistance and not hasattr(state, "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
@@ -46,7 +46,7 @@ def check_environment(env: VectorEnv, config: TrainConfig) -> None:
         fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
 
 
-def check_divisible(config: TrainConfig, network: Network) -> None:
+def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -> None:
     """Checks that rollouts split into chunks, and these into minibatches."""
     if config.rollout_steps % network.chunk_length:
         fail(
@@ -55,3 +55,9 @@ def check_divisible(config: TrainConfig, network: Network) -> None:
     chunks = config.steps_per_update // network.chunk_length
     if chunks % config.ppo.minibatches:
         fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")
+    groups = config.ppo.groups
+    if config.num_envs % groups or chunks // groups % config.ppo.minibatches:
+        wanted = f"a divisor of num_envs ({config.num_envs}) that leaves each a multiple of ppo.minibatches chunks"
+        fail("ppo.groups", groups, f"{wanted} ({config.ppo.minibatches}), of {chunks} in all")
+    if config.ppo.minibatches > 1 and groups % processes:
+        fail("ppo.groups", groups, f"a multiple of the number of processes, {processes}, where there are minibatches")

@@ -41,6 +41,9 @@ class PPO:
     """Epochs over each rollout."""
     minibatches: PositiveInt = 1
     """Minibatches per epoch."""
+    groups: PositiveInt = 1
+    """Groups of environments with equal shares of every minibatch: a multiple of the number of processes. Runs with
+    equally many groups are equal on any number of processes."""
     ratio: Literal["agent", "dimension", "joint"] = "agent"
     """Probability ratio that is clipped: per agent, per action dimension (OpenRL's MAPPO), or joint (JRPO)."""
     value: Literal["agent", "joint"] = "agent"

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.train import devices
 from mqe_jax.train.advantage import gae
+from mqe_jax.train.batches import chunks, minibatches, take
 from mqe_jax.train.checks import check_divisible, check_environment
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
@@ -82,18 +84,21 @@ def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     )
 
 
-def make_learner(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None = None) -> Learner:
+def make_learner(
+    env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None = None, processes: int = 1
+) -> Learner:
     """Returns the learner of an environment.
 
-    With `trace_step` (`Recorder.trace`), the metrics of an update also hold `trace`, a `Trace` of the rollout.
+    With `trace_step` (`Recorder.trace`), the metrics of an update also hold `trace`, a `Trace` of the rollout. With
+    several `processes`, `env` is the share of one, and its functions are compiled by `devices.Processes`.
 
     Raises:
         InputError: if the settings do not fit the environment.
     """
-    check_environment(env, config)
+    check_environment(env, config, processes)
     dims = env_dims(env, config)
     network = config.network.build(dims)
-    check_divisible(config, network)
+    check_divisible(config, network, processes)
     hook: LearnerHook | None = getattr(env, "learner_hook", None)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
@@ -182,7 +187,8 @@ def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
     """Sets every environment's step counter to a random value, so that the first episodes end at different steps."""
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
-    step = jax.random.randint(key, env_state.step.shape, 0, limit, env_state.step.dtype)
+    draw = lambda n: jax.random.randint(key, (n,), 0, limit, env_state.step.dtype)  # noqa: E731
+    step = devices.rows(draw, len(env_state.step))
     return replace_fields(env_state, step=step)
 
 
@@ -228,42 +234,29 @@ def _prepare(
     )
     if config.normalization.values:
         value_normalizer = value_update(value_normalizer, target, config.normalization.value_decay)
-    unexplained = jnp.var(target - value) / jnp.maximum(jnp.var(target), 1e-8)
-    metrics = {"value_mean": jnp.mean(value), "explained_variance": 1.0 - unexplained}
+    unexplained = devices.variance(target - value) / jnp.maximum(devices.variance(target), 1e-8)
+    metrics = {"value_mean": devices.mean(jnp.mean(value)), "explained_variance": 1.0 - unexplained}
     if config.ppo.advantage_clip is not None:
-        scale = jnp.median(jnp.abs(advantage)) + 1e-8
+        scale = devices.median(jnp.abs(advantage)) + 1e-8
         advantage = jnp.clip(advantage / scale, -now.advantage_clip, now.advantage_clip)
     if config.normalization.advantages:
-        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+        deviation = jnp.sqrt(devices.variance(advantage))
+        advantage = (advantage - devices.mean(jnp.mean(advantage))) / (deviation + 1e-8)
 
     steps = network.chunk_length
     memory = transitions.memory._replace(critic=jax.tree.map(lambda x: x[::steps], transitions.memory.critic))
     batch = Batch(
         memory=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), memory),
-        is_first=_chunks(transitions.is_first, steps),
-        obs=_chunks(obs, steps),
-        privileged_obs=_chunks(privileged, steps),
-        action=_chunks(transitions.action, steps),
-        log_prob=_chunks(transitions.log_prob, steps),
-        advantage=_chunks(advantage, steps),
-        target=_chunks(target, steps),
-        old_value=_chunks(pair[0], steps),
+        is_first=chunks(transitions.is_first, steps),
+        obs=chunks(obs, steps),
+        privileged_obs=chunks(privileged, steps),
+        action=chunks(transitions.action, steps),
+        log_prob=chunks(transitions.log_prob, steps),
+        advantage=chunks(advantage, steps),
+        target=chunks(target, steps),
+        old_value=chunks(pair[0], steps),
     )
     return batch, value_normalizer, metrics
-
-
-def _chunks(x: jax.Array, length: int) -> jax.Array:
-    """Splits the time axis into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
-    parts, envs = x.shape[0] // length, x.shape[1]
-    x = x.reshape(parts, length, *x.shape[1:])
-    return jnp.swapaxes(x, 0, 1).reshape(length, parts * envs, *x.shape[3:])
-
-
-def _take(batch: Batch, index: jax.Array) -> Batch:
-    """Returns the chunks with the given indices (C',)."""
-    memory = jax.tree.map(lambda x: x[index], batch.memory)
-    rest = {name: getattr(batch, name)[:, index] for name in Batch._fields if name != "memory"}
-    return Batch(memory=memory, **rest)
 
 
 def _loss(
@@ -313,11 +306,12 @@ def _learn(
     key: jax.Array,
 ) -> tuple[Params, AdamState, jax.Array, Metrics]:
     """Runs the epochs over the batch; returns parameters, optimiser state, learning rate and mean metrics."""
-    chunks = batch.is_first.shape[1]
+    parts = config.rollout_steps // batch.is_first.shape[0]
 
     def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
         params, optimizer_state, learning_rate = carry
-        gradient, metrics = jax.grad(_loss, has_aux=True)(params, network, config, now, value_normalizer, minibatch)
+        own = jax.grad(_loss, has_aux=True)(params, network, config, now, value_normalizer, minibatch)
+        gradient, metrics = devices.mean(own)
         if config.optimizer.target_kl is not None:
             adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
             falls_only = (now.learning_rate_factor < 1.0) | (jnp.float32(now.actor_coef) < 1.0)
@@ -330,8 +324,8 @@ def _learn(
     def epoch(carry: Carry, epoch_key: jax.Array) -> tuple[Carry, Metrics]:
         if config.ppo.minibatches == 1:
             return step(carry, batch)
-        index = jax.random.permutation(epoch_key, chunks).reshape(config.ppo.minibatches, -1)
-        carry, metrics = jax.lax.scan(lambda c, i: step(c, _take(batch, i)), carry, index)
+        index = minibatches(config.ppo, epoch_key, parts, batch.is_first.shape[1] // parts)
+        carry, metrics = jax.lax.scan(lambda c, i: step(c, take(batch, i)), carry, index)
         return carry, jax.tree.map(jnp.mean, metrics)
 
     carry = (state.params, state.optimizer, state.learning_rate)

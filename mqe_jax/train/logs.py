@@ -24,6 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import append, make_folder, read_rows, write_atomically
+from mqe_jax.train.config import TrainConfig
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
@@ -240,3 +241,18 @@ def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}"
+
+
+def row_of(
+    updates: int, metrics: Mapping[str, Any], config: TrainConfig, start_time: float, update_began: float
+) -> dict[str, float]:
+    """Returns a row of metrics.csv: steps and times first, then the update's metrics by name."""
+    now = time.perf_counter()
+    row: dict[str, float] = {
+        "env_steps": updates * config.steps_per_update,
+        "updates": updates,
+        "seconds": now - start_time,
+        "fps": config.steps_per_update / (now - update_began),
+    }
+    row.update({name: float(value) for name, value in sorted(metrics.items())})
+    return row

@@ -18,7 +18,7 @@ import numpy as np
 
 from mqe_jax.limits import Depth, Positive, Width
 from mqe_jax.settings import fail
-from mqe_jax.train import nn
+from mqe_jax.train import devices, nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
@@ -174,7 +174,7 @@ def _build(settings: Mat, dims: EnvDims) -> Network:
         features = encode(params["encoder"], obs, heads)
         shape = (*obs.shape[:-1], dims.action)
         log_std = jnp.broadcast_to(log_std_of(params, settings), shape)
-        noise = 0.0 if key is None else jnp.exp(log_std) * jax.random.normal(key, shape, obs.dtype)
+        noise = 0.0 if key is None else jnp.exp(log_std) * devices.normal(key, shape, obs.dtype)
 
         def act_at(agent: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             action, mean = carry

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.train import devices
+
 _OBSERVATION_MIN_STD = 1e-2
 _VALUE_MIN_STD = 1e-3  # of the root mean square
 _TINY = 1e-12
@@ -32,9 +34,9 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
     Source: Chan, Golub and LeVeque 1979, the parallel form of Welford's algorithm.
     """
     batch = batch.reshape(math.prod(batch.shape[:-1]), batch.shape[-1])
-    batch_samples = jnp.float32(batch.shape[0])
-    batch_mean = jnp.mean(batch, axis=0)
-    batch_variance = jnp.mean(jnp.square(batch - batch_mean), axis=0)
+    batch_samples = jnp.float32(batch.shape[0] * devices.size())
+    batch_mean = devices.mean(jnp.mean(batch, axis=0))
+    batch_variance = devices.variance(batch, axis=0)
     samples = statistics.samples + batch_samples
     fraction = batch_samples / samples
     shift = batch_mean - statistics.mean
@@ -77,8 +79,8 @@ def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -
 
     Source: Yu et al., arXiv 2103.01955 (there with decay 0.99999 per minibatch; here per rollout).
     """
-    mean = decay * statistics.mean + (1.0 - decay) * jnp.mean(target)
-    square = decay * statistics.square + (1.0 - decay) * jnp.mean(jnp.square(target))
+    mean = decay * statistics.mean + (1.0 - decay) * devices.mean(jnp.mean(target))
+    square = decay * statistics.square + (1.0 - decay) * devices.mean(jnp.mean(jnp.square(target)))
     weight = decay * statistics.weight + (1.0 - decay)
     return ValueStatistics(mean, square, weight)
 

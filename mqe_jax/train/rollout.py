@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.train import devices
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
 from mqe_jax.train.types import NetworkMemory, Params, TraceStep, Transition, VectorEnv, is_outcome
@@ -110,7 +111,7 @@ def rollout(
     state, (starts, steps) = jax.lax.scan(one_chunk, state, keys)
     transitions, sums, trace = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), steps)
     transitions = transitions._replace(memory=transitions.memory._replace(actor=starts))
-    metrics: dict[str, Any] = _means(sums, length * env.num_envs)
+    metrics: dict[str, Any] = _means(sums, length * env.num_envs * devices.size())
     return state, transitions, metrics if trace_step is None else {**metrics, "trace": trace}
 
 
@@ -128,7 +129,7 @@ def _sums(metrics: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array
 
 def _means(sums: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
     """Returns the metrics of a rollout from its sums per step (T,)."""
-    totals = {name: jnp.sum(value) for name, value in sums.items()}
+    totals = devices.total({name: jnp.sum(value).astype(jnp.float32) for name, value in sums.items()})
     episodes = totals["episodes"]
     means = {}
     for name, total in totals.items():

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -29,12 +28,13 @@ from mqe_jax.train.checkpoint import (
     save_checkpoint,
 )
 from mqe_jax.train.config import TrainConfig, load_config
-from mqe_jax.train.learner import Learner, TrainState, env_dims, make_learner
-from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers
+from mqe_jax.train.devices import Processes, connected
+from mqe_jax.train.learner import Learner, TrainState, env_dims
+from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
-from mqe_jax.train.start import CONFIG_FILE, first_state, learned, without_environments
+from mqe_jax.train.start import CONFIG_FILE, first_state, learned, own_learner, without_environments
 from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -98,20 +98,23 @@ def train_seeds(
         fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
     check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
-    learner = make_learner(env, configs[0], None if recorder is None else recorder.trace)
+    learner, processes = own_learner(env, configs[0], recorder)
     run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
-    with contextlib.ExitStack() as locks:
-        for folder in folders:
-            check_alone(folder)
-        for folder in folders:
-            check_folder(folder)
-            locks.enter_context(locked(folder))
-            for inner in (folder, *folder.glob("*/")):
-                remove_temporaries(inner)
-        for folder in folders:
-            check_run(folder, resume, run_files)
+    with connected(), contextlib.ExitStack() as locks:
+        if processes.leads:
+            for folder in folders:
+                check_alone(folder)
+            for folder in folders:
+                check_folder(folder)
+                locks.enter_context(locked(folder))
+                for inner in (folder, *folder.glob("*/")):
+                    remove_temporaries(inner)
+            for folder in folders:
+                check_run(folder, resume, run_files)
+        processes.gather([0])  # the others wait for these checks
         checkpoints = _common_checkpoints(folders)
-        return _Training(env, learner, configs, folders, checkpoints, eval_env, recorder).run(on_update, stop)
+        training = _Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
+        return training.run(on_update, stop)
 
 
 def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
@@ -138,6 +141,7 @@ class _Training:
         self,
         env: VectorEnv,
         learner: Learner,
+        processes: Processes,
         configs: Sequence[TrainConfig],
         folders: Sequence[Path],
         checkpoints: Sequence[Path | None],
@@ -145,20 +149,24 @@ class _Training:
         recorder: Recorder | None,
     ) -> None:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
-        self._config = configs[0]
+        self._config, self._processes = configs[0], processes
         self._seeds = seeds = Seeds(learner.init, len(configs))
-        first = [first_state(env, learner, c, path, seeds.shared) for c, path in zip(configs, checkpoints, strict=True)]
+        first = [
+            first_state(env, learner, processes, own, path, seeds.shared)
+            for own, path in zip(configs, checkpoints, strict=True)
+        ]
         self._state = seeds.stack([state for state, _ in first])
-        self._update = seeds.map(learner.update)
+        self._update = processes.stacked(seeds.shared).compile(seeds.map(learner.update), more=True)
         self._env_steps = int(first[0][0].updates) * self._config.steps_per_update
         self._saved = -1 if checkpoints[0] is None else self._env_steps
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
-        if self._config.evaluation.every is not None and eval_env is not None:
+        if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
             self._monitor = Monitor(eval_env, self._config)
         self._evaluations: list[EvaluationLog] = []
         self._logs = contextlib.ExitStack()
         self._writing = threading.RLock()  # held while files are written and the state is exchanged
+        self._signal, self._ended = threading.Event(), threading.Event()  # in one of several processes
 
     def run(self, on_update: OnUpdate | None, stop: Callable[[], bool]) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
@@ -166,7 +174,7 @@ class _Training:
         if self._saved == self._env_steps:
             self._save_policies()  # a run that ended between checkpoint and policy has an older one
         self._save()  # so that a run killed before its first regular checkpoint can be resumed too
-        for own, folder in zip(self._configs, self._folders, strict=True):
+        for own, folder in zip(self._configs, self._folders, strict=True) if self._processes.leads else ():
             write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
         self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
         total_steps = config.num_updates * config.steps_per_update
@@ -174,16 +182,19 @@ class _Training:
             makers = (CsvLog, *(LOGGERS[name] for name in config.loggers))
             files: list[list[MetricsLog]] = [[] for _ in self._folders]
             for folder, own_logs in zip(self._folders, files, strict=True):
-                for make_log in makers:
+                for make_log in makers if self._processes.leads else ():
                     own_logs.append(make_log(folder, self._env_steps))
                     logs.callback(own_logs[-1].close)
-            progress_log = logs.enter_context(ProgressLog(config.task or self._env.name, self._env_steps, total_steps))
+            progress_log = ProgressLog(config.task or self._env.name, self._env_steps, total_steps)
+            if self._processes.leads:
+                logs.enter_context(progress_log)
             logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
-                while self._env_steps < total_steps and not stop():
+                while self._env_steps < total_steps and not self._stopped(stop):
                     rows = self._step(files)
-                    progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                    if self._processes.leads:
+                        progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                     if on_update is not None:
                         for i, row in enumerate(rows):
                             on_update(self._seeds.take(self._state, i), row)
@@ -192,23 +203,42 @@ class _Training:
                 self._save()
                 if self._env_steps >= total_steps:
                     self._measure_best()
+                self._processes.gather([0])  # the others wait for the one that evaluates
             except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+                if self._processes.count > 1:
+                    raise
                 if isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" not in str(error):
                     raise
                 self._save()
                 raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
+            finally:
+                self._ended.set()
         return [self._seeds.take(self._state, i) for i in range(len(self._configs))]
 
     def _end(self) -> None:
         """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
 
         The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
+        Several processes finish it, where the one before is not saved, to save the same one.
         """
+        if self._processes.count > 1 and self._saved != self._env_steps:
+            self._signal.set()
+            self._ended.wait()
         self._writing.acquire()  # for ever, so that the main thread writes nothing more
         try:
             self._save()
         finally:
             self._logs.close()
+
+    def _stopped(self, stop: Callable[[], bool]) -> bool:
+        """Returns whether the run ends here, for all processes; ends them all, after saving, for a signal to one."""
+        asked = self._processes.gather([stop(), self._signal.is_set()])
+        if asked[:, 1].any():
+            self._save()
+            self._processes.gather([0])
+            self._ended.set()
+            interrupts.end()
+        return bool(asked[:, 0].any())
 
     def _step(self, files: Sequence[Sequence[MetricsLog]]) -> list[dict[str, float]]:
         """Performs and logs one update of every seed; returns the rows of metrics.csv."""
@@ -221,7 +251,7 @@ class _Training:
         for i, folder in enumerate(self._folders):
             state = self._seeds.take(after, i)
             own = {name: value[i] for name, value in metrics.items()}
-            row = _row(state, own, self._config, self._start_time, began)
+            row = row_of(int(state.updates), own, self._config, self._start_time, began)
             row["fps"] *= len(self._folders)
             _check_finite(state, row, folder)
             rows.append(row)
@@ -252,22 +282,28 @@ class _Training:
                 metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
                 metadata["environments"] = config.checkpoint.environments
                 state = self._seeds.take(self._state, i)
-                whole = config.checkpoint.environments
-                tree = without_shared(state, self._seeds.shared) if whole else without_environments(state)
-                save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+                if config.checkpoint.environments:
+                    tree = self._processes.join(without_shared(state, self._seeds.shared))
+                else:
+                    tree = without_environments(state)
+                if self._processes.leads:
+                    save_checkpoint(folder, tree, self._env_steps, metadata, kept)
             self._save_policies()
             self._saved = self._env_steps
             for log in self._evaluations:
                 log.prune()
 
     def _save_policies(self) -> None:
+        if not self._processes.leads:
+            return
         for folder, policy in zip(self._folders, self._policies(), strict=True):
             save_policy(folder, policy)
 
     def _evaluate_if_due(self) -> bool:
         """Evaluates after every `evaluation.every` updates and after the last one; returns whether it was due."""
         updates, last = self._env_steps // self._config.steps_per_update, self._config.num_updates
-        due = self._monitor is not None and updates > 0 and updates % (self._config.evaluation.every or 1) == 0
+        every = self._config.evaluation.every
+        due = every is not None and updates > 0 and updates % every == 0
         if due or updates >= last:
             self._evaluate()
         return due
@@ -309,19 +345,3 @@ def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) ->
 def load_run_config(run_dir: str | Path) -> TrainConfig:
     """Reads the settings of a run folder; raises an InputError that names the file."""
     return load_config(Path(run_dir) / CONFIG_FILE)
-
-
-def _row(
-    state: TrainState, metrics: dict[str, Any], config: TrainConfig, start_time: float, update_began: float
-) -> dict[str, float]:
-    """Returns a row of metrics.csv: steps and times first, then the update's metrics by name."""
-    now = time.perf_counter()
-    updates = int(state.updates)
-    row: dict[str, float] = {
-        "env_steps": updates * config.steps_per_update,
-        "updates": updates,
-        "seconds": now - start_time,
-        "fps": config.steps_per_update / (now - update_began),
-    }
-    row.update({name: float(np.asarray(value)) for name, value in sorted(metrics.items())})
-    return row

@@ -28,7 +28,7 @@ class Seeds:
         self._take = jax.jit(self._at)
 
     def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
-        """Returns the compiled `update(state) -> (state, metrics)` of all seeds; metrics gain a leading axis S.
+        """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a leading axis S.
 
         A single seed is computed without a batch axis, and thus bit for bit as outside of `Seeds`.
         """
@@ -37,7 +37,7 @@ class Seeds:
             state, metrics = update(self._at(states, 0))
             return self.stack([state]), jax.tree.map(lambda x: x[None], metrics)
 
-        return jax.jit(alone if self.count == 1 else jax.vmap(update))
+        return alone if self.count == 1 else jax.vmap(update)
 
     def stack(self, states: Sequence[Any]) -> Any:
         """Returns the states of all seeds as one."""

@@ -14,10 +14,11 @@ from mqe_jax.errors import InputError
 from mqe_jax.settings import to_mapping
 from mqe_jax.train.checkpoint import load_checkpoint, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import Learner, TrainState
+from mqe_jax.train.devices import Processes
+from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.types import PyTree, VectorEnv
+from mqe_jax.train.types import PyTree, Recorder, VectorEnv
 
 CONFIG_FILE = "config.yaml"
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -28,12 +29,30 @@ def initial_key(config: TrainConfig) -> jax.Array:
     return jax.random.PRNGKey(config.seed)
 
 
+def own_learner(env: VectorEnv, config: TrainConfig, recorder: Recorder | None) -> tuple[Learner, Processes]:
+    """Returns the learner of this process, which has its share of the environments, and all processes."""
+    trace, count = None if recorder is None else recorder.trace, jax.process_count()
+    whole = own = make_learner(env, config, trace)
+    if count > 1:
+        if recorder is not None:
+            raise InputError(f"recorder: not allowed in {count} processes; start the same training in one")
+        share: Any = getattr(env, "share", None)
+        if share is None:
+            raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
+        own = make_learner(share(count), config, processes=count)
+    return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
+
+
 def first_state(
-    env: VectorEnv, learner: Learner, config: TrainConfig, checkpoint: Path | None, shared: PyTree
+    env: VectorEnv, learner: Learner, processes: Processes, config: TrainConfig, checkpoint: Path | None, shared: PyTree
 ) -> tuple[TrainState, float]:
-    """Returns the initial or restored state and the seconds already spent; `shared` as in `Seeds`."""
+    """Returns this process's initial or restored state and the seconds already spent.
+
+    `env` has the environments of all processes, `learner` the share of one; `shared` as in `Seeds`.
+    """
+    init = processes.compile(learner.init, start=True)
     if checkpoint is None:
-        return _from_policy(env, jax.jit(learner.init)(initial_key(config)), config), 0.0
+        return _from_policy(env, init(initial_key(config)), config), 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
@@ -42,16 +61,17 @@ def first_state(
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
     _check_same(checkpoint.parent.parent, before, config)
     whole = metadata.get("environments", True)
-    template = jax.eval_shape(learner.init, initial_key(config))
+    template = processes.whole
     saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
     tree = load_checkpoint(checkpoint, saved).tree
     if wrong := nonfinite(learned(tree) if whole else {name: tree[name] for name in learned(template)}):
         raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
     if not whole:
-        fresh = jax.jit(learner.init)(jax.random.fold_in(tree["key"], tree["updates"]))
-        tree = dataclasses.replace(fresh, **tree)
-    elif any(jax.tree.leaves(shared)):
-        tree = with_shared(tree, shared, jax.jit(learner.init)(initial_key(config)))
+        fresh = init(jax.random.fold_in(tree["key"], tree["updates"]))
+        return jax.tree.map(jnp.asarray, dataclasses.replace(fresh, **tree)), float(seconds)
+    tree = processes.part(tree)
+    if any(jax.tree.leaves(shared)):
+        tree = with_shared(tree, shared, init(initial_key(config)))
     return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
@@ -89,7 +109,7 @@ def learned(state: TrainState) -> dict[str, Any]:
 
 def _check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
     """Raises an InputError naming the first setting in which the run to resume differs."""
-    old = dict(_leaves(before))
+    old = {**dict(_leaves(to_mapping(TrainConfig()))), **dict(_leaves(before))}  # a new setting had its default
     for name, value in _leaves(to_mapping(config)):
         if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
             raise InputError(

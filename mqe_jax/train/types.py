@@ -61,7 +61,8 @@ class VectorEnv(Protocol):
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
-    which `curriculum.assistance` sets (see `replace_fields`); `learner_hook` (a `LearnerHook`).
+    which `curriculum.assistance` sets (see `replace_fields`); `learner_hook` (a `LearnerHook`). In several processes,
+    `share(parts)` returns the batch of one, whose states are consecutive rows of those of all (`devices.rows`).
     """
 
     @property

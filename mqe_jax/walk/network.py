@@ -21,7 +21,7 @@ from mqe_jax import robots, walk_policy
 from mqe_jax.limits import Horizon, NonNegative
 from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 from mqe_jax.settings import FileName, fail
-from mqe_jax.train import nn
+from mqe_jax.train import devices, nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
@@ -144,7 +144,7 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         window = jnp.concatenate([memory, obs], axis=-2)
         mean, _ = mean_of(params, window.reshape(*window.shape[:-2], -1))
         log_std = settings.bounded_log_std(params["log_std"])
-        action = mean if key is None else mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        action = mean if key is None else mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
         return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], window[..., 1:, :]
 
     def value(

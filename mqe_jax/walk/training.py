@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from mqe_jax import walk_policy
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.robots.robot import Robot
@@ -51,6 +53,8 @@ def train_walk(
 
     def save(state: TrainState, row: dict[str, float]) -> None:
         updates = int(row["updates"])
+        if jax.process_index() > 0:
+            return
         if updates % config.checkpoint.every == 0 or updates == config.num_updates:
             about = {"robot": robot.name, "env_steps": int(row["env_steps"])}
             walk_policy.save_params(state.params["policy"], run_dir / "walk.safetensors", about, half=True)

@@ -1,0 +1,231 @@
+"""The command `launch`: a training in several processes, one for each device of one or many hosts."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+from typing import Annotated, Any
+
+import tyro
+
+from mqe_jax import interrupts
+from mqe_jax.cli.options import echo
+from mqe_jax.errors import InputError
+from mqe_jax.limits import PositiveInt
+from mqe_jax.settings import fail, record
+from mqe_jax.train.devices import PEER, PEER_ENDED
+
+MEMBER = "MQE_PROCESS"
+"""Environment variable of a process of a training: INDEX/COUNT@HOST:PORT, or `auto` where SLURM or MPI knows."""
+HEARTBEAT = 30
+"""Time after which a process is dead whose host does not answer, s."""
+
+PROGRAM = [sys.executable, "-m", "mqe_jax.cli"]
+"""What runs a command in a process of the training."""
+
+_COMMANDS = ("train", "walk", "sweep")
+_GRACE = 10.0  # s, in which the others end after one has ended
+_RESUME = "the same command with --resume goes on"
+_NOISE = re.compile(r"([IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo)")
+
+
+@record
+class Launch:
+    """Train in several processes, one per device, on one host or many: `mqe launch --processes 2 train go1gate`.
+
+    Flags of `launch` come before the command, which is train, walk train or sweep. A sweep's processes train different
+    cells. Started by SLURM's srun or Open MPI's mpirun, it needs no flags and is one process of the training.
+    """
+
+    processes: PositiveInt | None = None
+    """Number of processes; on several hosts without SLURM or MPI, of all of them."""
+    devices: Annotated[list[int], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
+    """GPUs of this host, one per process. Default: the first ones."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Address of process 0 with a free port, the same in the commands on all hosts; needs --index."""
+    index: int | None = None
+    """Which process this is, from 0, with --coordinator."""
+    command: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
+    """Arguments of the command."""
+
+    def run(self) -> None:
+        """Runs the processes of this host and ends with their exit code.
+
+        Raises:
+            InputError: for flags that do not fit together.
+            SystemExit: with the exit code of the first process that failed.
+        """
+        code = _supervise(self.command, self._members(), together=self.command[0] != "sweep")
+        if code:
+            raise SystemExit(code)
+
+    def _members(self) -> list[dict[str, str]]:
+        """Returns the environment variables that each process of this host has in addition."""
+        if (self.coordinator is None) != (self.index is None):
+            raise InputError("coordinator and index are given together, or neither of them")
+        if self.coordinator is not None and self.index is not None:
+            if self.processes is None or not 0 <= self.index < self.processes:
+                fail("index", self.index, f"from 0 to --processes - 1; --processes is {self.processes}")
+            return [{MEMBER: f"{self.index}/{self.processes}@{self.coordinator}"}]
+        if self.processes is None:
+            if not {"SLURM_PROCID", "OMPI_COMM_WORLD_RANK"}.intersection(os.environ):
+                raise InputError("processes: missing; give --processes N, or start with srun or mpirun")
+            return [{MEMBER: "auto"}]
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+        given = list(map(str, self.devices)) or [word for word in visible.split(",") if word]
+        devices = given or list(map(str, range(self.processes)))
+        if len(devices) < self.processes or (self.devices and len(devices) > self.processes):
+            fail("devices", ", ".join(devices), f"as many as processes, {self.processes}")
+        own = [{"CUDA_VISIBLE_DEVICES": device} for device in devices[: self.processes]]
+        if self.command[0] == "sweep" or self.processes == 1:
+            return own
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        return [{**variables, MEMBER: f"{i}/{self.processes}@127.0.0.1:{port}"} for i, variables in enumerate(own)]
+
+
+def parse_launch(arguments: Sequence[str]) -> Launch:
+    """Parses the arguments of `mqe launch`, those of its command included.
+
+    Raises:
+        InputError: without a command that can be launched, or for its arguments.
+        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
+    """
+    from mqe_jax.cli.arguments import parse
+
+    start = next((i for i, word in enumerate(arguments) if word in _COMMANDS), len(arguments))
+    launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
+    command = tuple(arguments[start:])
+    if not command or command[:2] in (("walk", "eval"), ("walk", "convert")):
+        fail("command", " ".join(command[:2]), "train, walk train or sweep: mqe launch --processes 2 train go1gate")
+    parse(command)
+    return dataclasses.replace(launch, command=command)
+
+
+def join() -> None:
+    """Joins the other processes of a training where `launch` has started this one; ends when `launch` does.
+
+    Raises:
+        InputError: if they cannot be reached.
+    """
+    if MEMBER not in os.environ:
+        return
+    import jax
+
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    member = os.environ[MEMBER]
+    jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
+    timeouts: Any = {"heartbeat_timeout_seconds": HEARTBEAT, "shutdown_timeout_seconds": HEARTBEAT}
+    try:
+        if member == "auto":
+            jax.distributed.initialize(**timeouts)
+        else:
+            place, address = member.split("@")
+            index, count = map(int, place.split("/"))
+            jax.distributed.initialize(address, count, index, **timeouts)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"coordinator: the other processes cannot be reached ({error})") from None
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its standard input, a pipe from `launch`, is closed."""
+    while os.read(0, 1024):
+        pass
+    os._exit(interrupts.exit_code(signal.SIGKILL))
+
+
+class _Process:
+    """A process of the training; its standard error is shown where it is the first of its host, but for JAX's noise."""
+
+    def __init__(self, command: Sequence[str], variables: Mapping[str, str], prefix: str, shown: bool) -> None:
+        self.peer, self.last, self.muted = False, "", False
+        self._prefix, self._shown = prefix, shown
+        self.popen = subprocess.Popen(
+            [*PROGRAM, *command],
+            env={**os.environ, **variables},
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            stdout=None if prefix else subprocess.DEVNULL,  # a training writes none, but JAX does
+            text=True,
+            errors="replace",
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.popen.stderr is not None
+        for line in self.popen.stderr:
+            aborts = line[0] in "EF" and PEER.search(line)  # JAX then writes a trace
+            if aborts or PEER_ENDED in line:
+                self.peer = self.muted = True
+            if _NOISE.match(line) or self.muted:
+                continue
+            self.last = line.strip() or self.last
+            if self._shown:
+                print(self._prefix + line, end="", file=sys.stderr, flush=True)
+
+    def verdict(self) -> str:
+        """Returns why the process has failed, in one line, or nothing where it said so itself."""
+        self._reader.join(1.0)
+        code = self.popen.returncode
+        if self.peer:
+            return f"mqe: {PEER_ENDED}; {_RESUME}"
+        if code < 0:
+            return f"mqe: a process of the training was killed by {signal.Signals(-code).name}; {_RESUME}"
+        return "" if self._shown else self.last
+
+
+def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, together: bool) -> int:
+    """Runs the processes of this host, which end when one fails if they are `together`; returns the exit code."""
+    processes: list[_Process] = []
+
+    def forward() -> str:
+        for process in processes:
+            process.muted = True
+            process.popen.send_signal(signal.SIGTERM)
+        for process in processes:
+            process.popen.wait()
+        return _RESUME
+
+    with interrupts.before_exit(forward):
+        try:
+            for i, variables in enumerate(members):
+                prefix = "" if together else f"[{i}] "
+                processes.append(_Process(command, variables, prefix, not together or i == 0))
+            return _wait(processes) if together else max(abs(process.popen.wait()) for process in processes)
+        finally:
+            for process in processes:
+                if process.popen.poll() is None:
+                    process.popen.kill()
+
+
+def _wait(processes: Sequence[_Process]) -> int:
+    """Waits until all processes have ended, or the others `_GRACE` after one that failed."""
+    failed, since = None, 0.0
+    while any(process.popen.poll() is None for process in processes):
+        ended = [process for process in processes if process.popen.poll()]
+        if ended and failed is None:
+            failed, since = min(ended, key=lambda process: process.peer), time.monotonic()
+            for process in processes:
+                process.muted |= failed.popen.returncode < 0
+        if failed is not None and (failed.popen.returncode < 0 or time.monotonic() - since > _GRACE):
+            break
+        time.sleep(0.05)
+    failed = failed or next((process for process in processes if process.popen.returncode), None)
+    if failed is None:
+        return 0
+    interrupts.settle()
+    if message := failed.verdict():
+        echo(message)
+    code = failed.popen.returncode
+    return code if code > 0 else interrupts.exit_code(-code)

@@ -1,0 +1,128 @@
+"""The functions that span the processes of a training, with the processes as an axis of `vmap`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import fake_env
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.errors import InputError
+from mqe_jax.settings import build
+from mqe_jax.train import devices
+from mqe_jax.train.batches import minibatches
+from mqe_jax.train.config import PPO, TrainConfig
+from mqe_jax.train.learner import make_learner
+
+KEY = jax.random.PRNGKey(3)
+
+
+def together(function: Callable[[Any], Any], count: int = 2) -> Callable[[Any], Any]:
+    """Returns the function as `count` processes compute it, with the processes as leading axis."""
+    return jax.vmap(function, axis_name=devices.AXIS, axis_size=count)
+
+
+def test_statistics_are_those_of_all_processes() -> None:
+    x = np.random.default_rng(0).normal(2.0, 3.0, (2, 5, 7)).astype(np.float32)
+    for function, expected in (
+        (lambda x: devices.mean({"a": jnp.mean(x)})["a"], x.mean()),
+        (lambda x: devices.total(jnp.sum(x)), x.sum()),
+        (devices.variance, x.var()),
+        (devices.median, np.median(x)),
+        (lambda x: devices.variance(x, axis=0), x.reshape(10, 7).var(axis=0)),
+    ):
+        found = np.asarray(together(function)(x))
+        np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-5)
+        np.testing.assert_allclose(function(jnp.asarray(x).reshape(10, 7)), expected, rtol=1e-5)
+
+
+def test_a_flag_of_one_process_is_true_for_all() -> None:
+    for flags in ([False, True], [False, False]):
+        assert together(devices.any_of)(jnp.array(flags)).tolist() == [any(flags)] * 2
+
+
+def test_random_numbers_belong_to_the_environment() -> None:
+    """Of 6 environments on 1, 2 and 3 processes; `alone` draws the same in all."""
+    whole = jax.random.normal(KEY, (6, 2))
+    for count in (1, 2, 3):
+        own = together(lambda key: devices.normal(key, (6 // count, 2), jnp.float32), count)  # noqa: B023
+        np.testing.assert_array_equal(own(jnp.tile(KEY, (count, 1))).reshape(6, 2), whole)
+
+    def same(key: jax.Array) -> jax.Array:
+        with devices.alone():
+            return devices.normal(key, (3, 2), jnp.float32)
+
+    drawn = together(same)(jnp.tile(KEY, (2, 1)))
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_minibatches_are_the_same_sets(count: int) -> None:
+    """Chunks (part, environment) of 8 environments in 4 groups; every chunk is in one minibatch."""
+    ppo, parts, envs = PPO(minibatches=3, groups=4), 6, 8
+
+    def chunk_sets(count: int) -> list[set[tuple[int, int]]]:
+        own = envs // count
+        index = np.asarray(together(lambda key: minibatches(ppo, key, parts, own), count)(jnp.tile(KEY, (count, 1))))
+        return [
+            {(c // own, p * own + c % own) for p in range(count) for c in index[p, m].tolist()}
+            for m in range(ppo.minibatches)
+        ]
+
+    sets = chunk_sets(count)
+    assert [len(own) for own in sets] == [16, 16, 16]
+    assert set.union(*sets) == {(part, env) for part in range(parts) for env in range(envs)}
+    assert sets == chunk_sets(1)
+
+
+def test_one_group_is_one_permutation() -> None:
+    index = minibatches(PPO(minibatches=2), KEY, 3, 4)
+    np.testing.assert_array_equal(index, jax.random.permutation(KEY, 12).reshape(2, 6))
+
+
+@pytest.mark.parametrize("network", ["actor_critic", pytest.param("mat", marks=pytest.mark.soak)])
+def test_two_shares_are_one_batch(network: str) -> None:
+    """The learner's states and metrics after two updates, with every setting that looks at more than one sample."""
+    values: dict[str, Any] = {
+        "num_envs": 8,
+        "rollout_steps": 8,
+        "total_steps": 640,
+        "ppo": {"epochs": 2, "minibatches": 2, "groups": 2, "advantage_clip": 3.0},
+        "normalization": {"observations": True},
+        "optimizer": {"target_kl": 0.01},
+        "network": {"name": network}
+        | ({"hidden_sizes": (8,), "chunk_length": 4} if network != "mat" else {"width": 8}),
+    }
+    config = build(TrainConfig, values)
+    whole = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 8), config)
+    share = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
+
+    def run(init: Callable[[Any], Any], update: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        def both(key: jax.Array) -> Any:
+            first, _ = update(init(key))
+            return update(first)
+
+        return jax.jit(both)
+
+    expected, metrics = run(whole.init, whole.update)(KEY)
+    found, found_metrics = run(together(share.init), together(share.update))(jnp.tile(KEY, (2, 1)))
+    learned = ("params", "optimizer", "obs_normalizer", "value_normalizer", "learning_rate", "key")
+    for name in learned:
+        for one, two in zip(*(jax.tree.leaves(getattr(s, name)) for s in (expected, found)), strict=True):
+            np.testing.assert_allclose(two, np.broadcast_to(one, two.shape), rtol=1e-4, atol=1e-5, err_msg=name)
+    for name, one in metrics.items():
+        np.testing.assert_allclose(found_metrics[name], np.full(2, one), rtol=1e-4, atol=1e-5, err_msg=name)
+    qpos, own = expected.rollout.env_state.data.qpos, found.rollout.env_state.data.qpos
+    np.testing.assert_allclose(own.reshape(qpos.shape), qpos, atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "groups", "said"), [(3, 3, "ppo.groups: 3"), (2, 1, "ppo.groups: 1")])
+def test_groups_that_do_not_fit(count: int, groups: int, said: str) -> None:
+    config = build(TrainConfig, {"num_envs": 4, "rollout_steps": 4, "ppo": {"minibatches": 2, "groups": groups}})
+    env = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4 // count if count == 2 else 4)
+    with pytest.raises(InputError, match=said):
+        make_learner(env, config, processes=2 if count == 2 else 1)

@@ -1,0 +1,309 @@
+"""`mqe launch`: several processes equal one, end together, and resume on another number; on one host and on two."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from mqe_jax import cli
+from mqe_jax.cli import launch
+from mqe_jax.train import devices
+from mqe_jax.train.checkpoint import list_checkpoints
+
+MQE = [sys.executable, "-m", "mqe_jax.cli"]
+TRAIN = ["train", "go1gate", "--impl", "c", "--control", "position", "--num-envs", "4", "--rollout-steps", "4"]
+TRAIN += ["--ppo.minibatches", "2", "--ppo.epochs", "2", "--ppo.groups", "2", "--network.hidden-sizes", "8"]
+TRAIN += ["--network.no-recurrent", "--checkpoint.every", "1", "--normalization.observations"]
+
+
+def differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, float]:
+    """Returns the largest difference of each array, relative to 1 or its largest number."""
+    assert one.keys() == other.keys()
+    assert all(one[name].shape == other[name].shape for name in one)
+    size = {name: max(1.0, float(np.max(np.abs(x.astype(float)), initial=0.0))) for name, x in one.items()}
+    wide = {name: (x.astype(float), other[name].astype(float)) for name, x in one.items()}
+    return {name: float(np.max(np.abs(a - b), initial=0.0)) / size[name] for name, (a, b) in wide.items()}
+
+
+# -- bad settings ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ([], "processes: missing; give --processes N, or start with srun or mpirun"),
+        (["--processes", "2", "--devices", "0"], "devices: '0' is not allowed; it must be as many as processes, 2"),
+        (["--coordinator", "host:1"], "coordinator and index are given together"),
+        (["--coordinator", "host:1", "--index", "2", "--processes", "2"], "index: 2 is not allowed"),
+    ],
+)
+def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["launch", *flags, *TRAIN]) == 2
+    assert said in capfd.readouterr().err
+
+
+def test_a_command_that_cannot_be_launched(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["launch", "--processes", "2"]) == 2
+    assert "command: '' is not allowed; it must be train, walk train or sweep" in capfd.readouterr().err
+
+
+# -- processes ---------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def started(words: list[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, **options)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def children(process: subprocess.Popen[str]) -> list[int]:
+    """Returns the process ids of what `launch` has started, in their order."""
+    return list(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
+
+
+def updates(run_dir: Path) -> int:
+    path = run_dir / "metrics.csv"
+    return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < end, "took too long"
+        time.sleep(0.02)
+
+
+def mqe(*words: str) -> None:
+    subprocess.run([*MQE, *words], check=True, capture_output=True, timeout=300)
+
+
+def lines(said: str) -> list[str]:
+    """Returns what was said, without progress."""
+    return [line for line in said.splitlines() if " steps/s, " not in line]
+
+
+def content(run_dir: Path) -> dict[str, np.ndarray]:
+    return load_file(list_checkpoints(run_dir)[-1])
+
+
+def metrics(run_dir: Path) -> list[dict[str, float]]:
+    with (run_dir / "metrics.csv").open() as file:
+        rows = [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
+    return [{name: x for name, x in row.items() if name not in ("seconds", "fps")} for row in rows]
+
+
+def assert_equal_runs(one: Path, other: Path, tolerance: float) -> None:
+    """Learned arrays and metrics within the tolerance; at 0 everything, states of environments too."""
+    wrong = differences(content(one), content(other))
+    wrong = {name: x for name, x in wrong.items() if tolerance == 0.0 or not name.startswith("rollout/")}
+    assert max(wrong.values()) <= tolerance, sorted(wrong.items(), key=lambda item: -item[1])[:5]
+    for a, b in zip(metrics(one), metrics(other), strict=True):
+        assert a == pytest.approx(b, abs=max(tolerance, 0.0), rel=tolerance, nan_ok=True)
+
+
+def test_two_processes_equal_one(tmp_path: Path) -> None:
+    """One update on the C engine, and that files are written once."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    steps = ["--total-steps", "16"]
+    mqe("launch", "--processes", "2", *TRAIN, *steps, "--run-dir", str(two))
+    assert cli.main([*TRAIN, *steps, "--run-dir", str(one)]) == 0
+    assert_equal_runs(one, two, 1e-5)
+    assert sorted(path.name for path in one.rglob("*")) == sorted(
+        path.name if "tfevents" not in path.name else next(one.rglob("*tfevents*")).name for path in two.rglob("*")
+    )
+
+
+@pytest.mark.soak
+def test_a_run_resumes_on_another_number_of_processes(tmp_path: Path) -> None:
+    """Three updates: 1, 1 + 2 processes, 2 + 1; whole states are resumed."""
+    runs = {"1": ("1", "1"), "12": ("1", "2"), "21": ("2", "1")}
+    for name, (first, second) in runs.items():
+        for count, steps in ((first, "16"), (second, "48")):
+            words = [*TRAIN, "--total-steps", steps, "--run-dir", str(tmp_path / name), "--resume"]
+            mqe("launch", "--processes", count, *words)
+    for name in ("12", "21"):
+        assert_equal_runs(tmp_path / "1", tmp_path / name, 1e-4)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Path) -> None:
+    """With one line; after SIGTERM everything is saved."""
+    run = tmp_path / "run"
+    words = [*MQE, "launch", "--processes", "2", *TRAIN, "--total-steps", "1600000", "--checkpoint.every", "100000"]
+    with started([*words, "--run-dir", str(run)]) as process:
+        wait_until(lambda: updates(run) > 5, process)
+        both = children(process)
+        began = time.monotonic()
+        os.kill(both[which], number)
+        _, said = process.communicate(timeout=60)
+        assert time.monotonic() - began < 15
+    (line,) = lines(said)
+    if number == signal.SIGKILL:
+        assert line.startswith("mqe: a process of the training was killed by SIGKILL; the same command with --resume")
+        assert process.returncode == 137
+    else:
+        assert line == f"mqe: terminated; resume with the same command and --resume; the run is in {run}"
+        assert process.returncode == 143
+        assert f"step_{updates(run) * 16:012d}" == list_checkpoints(run)[-1].stem
+    assert not any(Path(f"/proc/{child}").exists() for child in both)
+
+
+@pytest.mark.soak
+def test_processes_end_with_the_launcher(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with started([*MQE, "launch", "--processes", "2", *TRAIN, "--run-dir", str(run)]) as process:
+        wait_until(lambda: updates(run) > 2, process)
+        both = children(process)
+        process.kill()
+        end = time.monotonic() + 10
+        while any(Path(f"/proc/{child}").exists() for child in both):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
+
+@pytest.mark.soak
+def test_ten_kills_change_nothing(tmp_path: Path) -> None:
+    """Killed at random moments, resumed, the run equals an uninterrupted one of two processes bit for bit."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    words = ["launch", "--processes", "2", *TRAIN, "--total-steps", str(16 * 4000), "--checkpoint.every", "20"]
+    mqe(*words, "--run-dir", str(whole))
+    chance = random.Random(0)
+    for _ in range(10):
+        with started([*MQE, *words, "--run-dir", str(killed), "--resume"]) as process:
+            before = updates(killed)
+            wait_until(lambda: updates(killed) != before and len(children(process)) == 2, process)  # noqa: B023
+            time.sleep(chance.uniform(0.0, 1.0))
+            os.kill(children(process)[chance.randrange(2)], signal.SIGKILL)
+            _, said = process.communicate(timeout=60)
+            assert process.returncode == 137, said
+            assert sum(line.startswith("mqe: a process of the training was killed") for line in lines(said)) == 1
+    mqe(*words, "--run-dir", str(killed), "--resume")
+    assert_equal_runs(whole, killed, 0.0)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("flags", [[], ["--opponent", "scripted", "--opponent", "older"]])
+def test_matches_on_two_processes_equal_one(flags: list[str], tmp_path: Path) -> None:
+    """Both teams learn; a league: both meet every opponent in both processes."""
+    words = ["train", "go1wrestling", "--impl", "c", "--num-envs", "8", "--rollout-steps", "4", "--total-steps", "32"]
+    words += ["--ppo.groups", "2", "--ppo.minibatches", "2", "--ppo.epochs", "2", "--network.hidden-sizes", "8", *flags]
+    words += ["--checkpoint.every", "1"]
+    mqe(*words, "--run-dir", str(tmp_path / "one"))
+    mqe("launch", "--processes", "2", *words, "--run-dir", str(tmp_path / "two"))
+    assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-4)
+
+
+# -- several hosts -----------------------------------------------------------------------------------------------------
+
+SRUN = """#!/bin/sh
+# Two tasks with the variables of SLURM; a task that fails ends both.
+export SLURM_JOB_ID=4242 SLURM_STEP_NODELIST=127.0.0.1 SLURM_NTASKS=2 SLURM_STEP_NUM_NODES=1
+while [ "${1#--}" != "$1" ]; do shift; done
+SLURM_PROCID=0 SLURM_LOCALID=0 "$@" & first=$!
+SLURM_PROCID=1 SLURM_LOCALID=1 "$@" & second=$!
+wait $first && wait $second
+"""
+
+
+@pytest.mark.soak
+def test_the_slurm_file_of_the_documentation(tmp_path: Path) -> None:
+    """With a stand-in for srun; it equals one process."""
+    page = (Path(__file__).parents[1] / "docs" / "several_gpus.md").read_text(encoding="utf-8")
+    batch = page.split("```sh\n#!/bin/bash\n#SBATCH")[1].split("```")[0]
+    (command,) = [line for line in batch.splitlines() if line.startswith("srun ")]
+    srun = tmp_path / "srun"
+    srun.write_text(SRUN)
+    srun.chmod(0o755)
+    words = [*command.split("mqe launch ")[0].split(), *MQE, "launch", *TRAIN, "--total-steps", "16"]
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    subprocess.run([*words, "--run-dir", str(tmp_path / "two")], check=True, env=environment, timeout=300)
+    assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
+    assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-5)
+
+
+@pytest.fixture
+def hosts() -> Iterator[list[str]]:
+    """Two network namespaces, joined by a virtual cable; their addresses are 10.77.0.1 and 10.77.0.2."""
+    names = [f"mqe{os.getpid()}{side}" for side in "ab"]
+    make = [f"ip netns add {name}" for name in names]
+    make += [f"ip link add {names[0]} netns {names[0]} type veth peer name {names[1]} netns {names[1]}"]
+    for i, name in enumerate(names):
+        inside = f"ip -n {name}"
+        make += [f"{inside} addr add 10.77.0.{i + 1}/24 dev {name}", f"{inside} link set {name} up"]
+        make += [f"{inside} link set lo up"]
+    try:
+        for command in make:
+            if (
+                shutil.which("ip") is None
+                or subprocess.run(command.split(), capture_output=True, check=False).returncode
+            ):
+                pytest.skip(f"not permitted here: {command}")
+        yield names
+    finally:
+        for name in names if shutil.which("ip") else ():
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("vanishes", [False, True])
+def test_two_hosts(vanishes: bool, hosts: list[str], tmp_path: Path) -> None:
+    """They train together over TCP; where the cable is cut, both end within a minute with one line each."""
+    run = tmp_path / "run"
+    flags = ["launch", "--coordinator", "10.77.0.1:7777", "--processes", "2"]
+    words = [*TRAIN, "--total-steps", "16000000" if vanishes else "16", "--run-dir", str(run)]
+    named = ["unshare", "-u", "sh", "-c", 'hostname $0; exec "$@"']  # gloo connects to what a host's name means
+    commands = [
+        ["ip", "netns", "exec", name, *named, f"10.77.0.{i + 1}", *MQE, *flags, "--index", str(i), *words]
+        for i, name in enumerate(hosts)
+    ]
+    with started(commands[0]) as first, started(commands[1]) as second:
+        if vanishes:
+            wait_until(lambda: updates(run) > 5, first)
+            subprocess.run(["ip", "-n", hosts[1], "link", "set", hosts[1], "down"], check=True)
+        said = [process.communicate(timeout=90 if vanishes else 300)[1] for process in (first, second)]
+    if vanishes:
+        assert all(f"mqe: {devices.PEER_ENDED}" in text and len(lines(text)) == 1 for text in said), said
+        assert first.returncode and second.returncode
+        return
+    assert first.returncode == second.returncode == 0, said
+    assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
+    assert_equal_runs(tmp_path / "one", run, 1e-5)
+
+
+def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which devices processes have, and how they find each other."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,6")
+    monkeypatch.delenv("SLURM_PROCID", raising=False)
+
+    def members(*flags: str) -> list[dict[str, str]]:
+        return launch.parse_launch([*flags, *TRAIN])._members()
+
+    first, second = members("--processes", "2")
+    assert (first["CUDA_VISIBLE_DEVICES"], second["CUDA_VISIBLE_DEVICES"]) == ("4", "5")
+    assert first[launch.MEMBER].startswith("0/2@127.0.0.1:")
+    assert second[launch.MEMBER] == first[launch.MEMBER].replace("0/2", "1/2")
+    assert [own["CUDA_VISIBLE_DEVICES"] for own in members("--processes", "2", "--devices", "7", "1")] == ["7", "1"]
+    assert members("--processes", "4", "--coordinator", "h:1", "--index", "3") == [{launch.MEMBER: "3/4@h:1"}]
+    monkeypatch.setenv("SLURM_PROCID", "1")
+    assert members() == [{launch.MEMBER: "auto"}]
