@@ -137,18 +137,13 @@ class Versus(OneTeam):
         opponents = []
         for policy in self.opponents:
             arrays = _arrays(policy)
-            waiting = jnp.zeros((self._size,), bool)
-            memory = policy.initial_memory(self._size)
+            waiting, memory = jnp.zeros((self._size,), bool), policy.initial_memory(self._size)
             opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
         action = jnp.zeros((self.num_envs, self.matches.num_agents, self.action_size))
         return self._seen(match, action, tuple(opponents), key, match.step)
 
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
-        """Advances all environments by one step with the actions of team 0 (N, T, D); resets those that ended.
-
-        Raises:
-            InputError: for actions of another shape.
-        """
+        """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
         self._check_action(action)
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
         others, opponents = [], []
@@ -244,8 +239,8 @@ def versus(
 ) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
-    The environments meet the opponents in turn, equally many each. Trained policies act as they are
-    loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`); others are fixed.
+    The environments meet the opponents in turn, equally many each. Trained policies act as they are loaded (sampled,
+    unless deterministic) and can be exchanged (`Versus.change`); others are fixed.
 
     Args:
         env: the matches.
@@ -282,11 +277,7 @@ class Mirror(OneTeam):
         return self._seen(self.matches.reset(key), action)
 
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
-        """Advances all environments by one step with actions (2 N, T, D); resets those that ended.
-
-        Raises:
-            InputError: for actions of another shape.
-        """
+        """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
         self._check_action(action)
         both = action.reshape(self.matches.num_envs, 2 * self.num_agents, self.action_size)
         return self._seen(self._stepped(state, both), both)

@@ -15,8 +15,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SITE_GROUP
-from mqe_jax.appearance.shapes import Ground
-from mqe_jax.appearance.walls import WALL_COLOR, WALL_GROUP, Style, gate_wall, side_wall
+from mqe_jax.appearance.shapes import WALL_COLOR, WALL_GROUP, Ground, Style, gate_wall, side_wall
 from mqe_jax.collision import GROUND_BIT, WALL_BIT
 from mqe_jax.errors import InputError
 

@@ -81,21 +81,21 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def shared_programs() -> Iterator[None]:
     """Trainings of one environment with the same settings share their learner and its compiled programs."""
-    from mqe_jax.train import runner
+    from mqe_jax.train import runner, start
     from mqe_jax.train.seeds import Seeds
 
-    learners, make_learner = {}, runner.make_learner
+    learners, make_learner = {}, start.make_learner
 
-    def shared_learner(env: Any, config: Any, trace: Any = None) -> Any:
-        key = env, repr(config), trace
+    def shared_learner(env: Any, config: Any, trace: Any = None, processes: int = 1) -> Any:
+        key = env, repr(config), trace, processes
         if key not in learners:
-            learners[key] = make_learner(env, config, trace)
+            learners[key] = make_learner(env, config, trace, processes)
         return learners[key]
 
     class SharedSeeds(Seeds):
         map = functools.cache(Seeds.map)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "make_learner", shared_learner)
+        patch.setattr(start, "make_learner", shared_learner)
         patch.setattr(runner, "Seeds", functools.cache(SharedSeeds))
         yield

@@ -87,8 +87,8 @@ class FakeEnv:
     def reset(self, key: jax.Array) -> FakeState:
         model, false = self.mj_model, jnp.zeros((), bool)
         mocap = np.flatnonzero(model.body_mocapid >= 0)
-        start = (jnp.asarray(x, jnp.float32) for x in (model.qpos0, model.body_pos[mocap], model.body_quat[mocap]))
-        data = FakeData(*start, jnp.zeros(model.nu), jnp.zeros(model.nv))
+        start = model.qpos0, model.body_pos[mocap], model.body_quat[mocap], np.zeros(model.nu), np.zeros(model.nv)
+        data: FakeData = FakeData(*(jnp.asarray(x, jnp.float32) for x in start))
         zero = jnp.zeros(())
         metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
         metrics["overflow"] = zero

@@ -14,9 +14,9 @@ import pytest
 from mqe_jax.errors import InputError
 from mqe_jax.settings import build
 from mqe_jax.train import devices
-from mqe_jax.train.batches import minibatches
 from mqe_jax.train.config import PPO, TrainConfig
 from mqe_jax.train.learner import make_learner
+from mqe_jax.train.rollout import minibatches
 
 KEY = jax.random.PRNGKey(3)
 

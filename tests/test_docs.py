@@ -227,13 +227,9 @@ def script_folder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def example() -> Any:
+def example(script_folder: None) -> Any:
     """The module of the guide to a new task; its registrations are removed afterwards."""
-    spec = importlib.util.spec_from_file_location("new_task", EXAMPLES / "new_task.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["new_task"] = module
-    spec.loader.exec_module(module)
+    module = importlib.import_module("new_task")
     yield module
     del sys.modules["new_task"], TASKS["go1catch"], PLANNERS["go1catch"]
 

@@ -259,7 +259,7 @@ def test_objects_are_indexed_by_name() -> None:
 
 def pushed(robots: int) -> float:
     """Mean way of the box, m, in 3 s at 0.8 m/s in eight environments; with one robot the other is idle."""
-    wide = {"track_width": 8.0, "gate_width": 7.0, "box_noise": 0.0, "spawn_velocity": 0.0}
+    wide: Any = {"track_width": 8.0, "gate_width": 7.0, "box_noise": 0.0, "spawn_velocity": 0.0}
     env: Any = make("go1pushbox", impl="c", num_envs=8, **wide)
     lane = jnp.array([-0.3, 0.3] if robots == 2 else [0.0, -3.0])
     place = jnp.stack([jnp.full(2, 1.5), lane], axis=-1)

@@ -19,7 +19,7 @@ from mqe_jax.appearance import GOAL_SITE
 from mqe_jax.envs import TASKS
 from mqe_jax.errors import InputError
 from mqe_jax.policies import all_agents, load_policy
-from mqe_jax.viz import cameras, clips, framing, geometry, legend, recording, render, visibility
+from mqe_jax.viz import cameras, clips, framing, geometry, recording, render
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.recording import Episode, record
 from tests.states import made, placed
@@ -58,16 +58,16 @@ def test_success_is_settled_from_its_last_change_on(env: FakeEnv, episode: recor
 
 def test_the_legend_names_teams_and_scripted_robots() -> None:
     env = made("go1football-defender")
-    (team, own), (other, scripted) = legend.entries(env)
+    (team, own), (other, scripted) = framing.entries(env)
     assert (team, len(own), other, len(scripted)) == ("team", 2, "scripted", 1)
     assert own[0][2] > 200 and own[1][1] > 150 and scripted[0][0] > 200  # blue, green and red
     frame = np.zeros((360, 640, 3), np.uint8)
-    shown = legend.legend(env, (640, 360))(frame)
+    shown = framing.legend(env, (640, 360))(frame)
     for color in (*own, *scripted):
         found = np.argwhere((shown == color).all(axis=-1))
         assert len(found) > 20 and found[:, 0].min() > 300 and found[:, 1].max() < 320  # lower left
     assert not frame.any() and not shown[:300].any()
-    assert legend.legend(env, (40, 20))(frame[:20, :40]).shape == (20, 40, 3)  # larger than the frame
+    assert framing.legend(env, (40, 20))(frame[:20, :40]).shape == (20, 40, 3)  # larger than the frame
 
 
 def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: recording.Episode) -> None:
@@ -255,8 +255,8 @@ def test_team_colours_are_those_of_the_agents(task: str) -> None:
 
 def in_frame(model: mujoco.MjModel, episode: Episode, views: list[Camera]) -> np.ndarray:
     """Which targets' centres, then which goal points, are in the image of each frame (T, targets + P) bool."""
-    data, bodies, rows = mujoco.MjData(model), visibility.targets(model, episode), []
-    boxes, goals = geometry.body_boxes(model, bodies), visibility.goal_points(model, episode)
+    data, bodies, rows = mujoco.MjData(model), framing.targets(model, episode), []
+    boxes, goals = geometry.body_boxes(model, bodies), framing.goal_points(model, episode)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     for index, camera in enumerate(views):
         geometry.pose(model, data, episode, index)
@@ -279,7 +279,7 @@ def check(env: Any, episode: Episode) -> None:
     model = geometry.rendering_model(env.mj_model, episode)
     views = cameras.cameras(model, episode, "follow", ASPECT)
     assert in_frame(model, episode, views).all(axis=1).mean() >= 0.95
-    assert longest(visibility.hidden(model, episode, views) == 1.0) * episode.dt <= 1.0
+    assert longest(framing.hidden(model, episode, views) == 1.0) * episode.dt <= 1.0
     eyes = np.array([view.position for view in views])
     assert np.linalg.norm(np.diff(eyes, axis=0), axis=1).max(initial=0.0) < 4.0 * episode.dt  # m, at most 4 m/s
 
@@ -319,10 +319,10 @@ def test_a_robot_behind_a_wall_is_hidden_and_one_beside_another_is_not() -> None
     episode = walking("go1gate", lambda t: [[3.9, 1.2, 0.3], [1.0, 1.2, 0.3]], frames=2)
     model = geometry.rendering_model(env.mj_model, episode)
     low = Camera((3.0, 1.2, 0.3), 5.0, azimuth=0.0, elevation=-2.0)  # from the start, along the track
-    assert visibility.hidden(model, episode, [low] * 2)[:, 0].tolist() == [1.0, 1.0]
-    assert visibility.hidden(model, episode, [low] * 2)[:, 1].tolist() == [0.0, 0.0]
+    assert framing.hidden(model, episode, [low] * 2)[:, 0].tolist() == [1.0, 1.0]
+    assert framing.hidden(model, episode, [low] * 2)[:, 1].tolist() == [0.0, 0.0]
     above = Camera((3.0, 1.2, 0.3), 5.0, azimuth=0.0, elevation=-80.0)
-    assert visibility.hidden(model, episode, [above] * 2).max() == 0.0
+    assert framing.hidden(model, episode, [above] * 2).max() == 0.0
     near = Camera((1.0, 1.2, 0.3), 1.5, azimuth=90.0, elevation=-80.0)
     inside = in_frame(model, episode, [near] * 2)
     assert inside[:, 1].all() and not inside[:, 0].any()  # the other robot is beyond the image's edge
@@ -332,7 +332,7 @@ def test_gates_and_goals_are_marked_for_the_cameras() -> None:
     """The sites of a gate are at the edges of its gap."""
     env = made("go1gate")
     episode = walking("go1gate", lambda t: [[1, -0.7, 0.3], [1, 0.7, 0.3]], frames=1)
-    points = visibility.goal_points(env.mj_model, episode)
+    points = framing.goal_points(env.mj_model, episode)
     gate, half = np.asarray(placed(env, np.zeros((2, 3))).anchors[0]), env.params.gate_width / 2
     np.testing.assert_allclose(np.unique(points[:, 1].round(4)), [gate[1] - half, gate[1] + half], atol=1e-3)
     assert all(env.mj_model.site(i).name.startswith(GOAL_SITE) for i in range(env.mj_model.nsite))

@@ -11,8 +11,8 @@ import pytest
 
 from mqe_jax.train import loss, nn
 from mqe_jax.train.actor_critic import ActorCritic
-from mqe_jax.train.advantage import gae
 from mqe_jax.train.config import PPO, Curriculum, OptimizerSettings, TrainConfig
+from mqe_jax.train.loss import gae
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import (
     running_init,

@@ -145,7 +145,7 @@ def test_contact_forces_carry_the_robots() -> None:
     """Of two Go1s that stand on their feet; robots are named by colour."""
     pytest.importorskip("mjviser")
     from mqe_jax.view.overlay import _METRES_PER_NEWTON, contact_arrows
-    from mqe_jax.view.readout import robot_labels
+    from mqe_jax.view.panel import robot_labels
     from mqe_jax.viz.recording import Episode
 
     env = make("go1plane", impl="c", control="position", num_envs=1)
@@ -190,7 +190,7 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
 
 
 def test_bars_point_to_the_side_of_their_sign_and_observations_come_in_blocks() -> None:
-    from mqe_jax.view.readout import bars, observation_table
+    from mqe_jax.view.panel import bars, observation_table
 
     page = bars(["up & on", "down", "none"], [0.2, -0.1, 0.0])
     assert "up &amp; on" in page and "left:50%;width:50.0%" in page and "right:50%;width:25.0%" in page

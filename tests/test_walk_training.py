@@ -57,7 +57,7 @@ def probe(num_envs: int = 4) -> Any:
     def pay(hidden: jax.Array, action: jax.Array) -> jax.Array:
         return -jnp.mean(jnp.square(action), axis=-1)
 
-    sizes = {"num_agents": 1, "action_size": 12, "features": 69}
+    sizes: Any = {"num_agents": 1, "action_size": 12, "features": 69}
     return Probe(waves, pay, num_envs, **sizes, max_episode_steps=5, odd_episode_steps=31, teams=((0,),))
 
 

@@ -87,7 +87,7 @@ class Probe:
         obs, privileged = self._observe(hidden, step)
         zero, reward = jnp.zeros((n,)), jnp.zeros((n, self.num_agents))
         names = ("reward/pay", "average_step_reward", "success", "team0/win", "diverged", "overflow")
-        metrics = dict.fromkeys(names, zero)
+        metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
         seen = hidden, obs, privileged, obs, privileged
         return ProbeState(*seen, reward, terminated=zero > 0, truncated=zero > 0, metrics=metrics, key=key, step=step)
 

@@ -16,8 +16,8 @@ from mqe_jax.envs import TASKS
 from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import write_clip
+from mqe_jax.viz.framing import legend
 from mqe_jax.viz.geometry import rendering_model
-from mqe_jax.viz.legend import legend
 from mqe_jax.viz.recording import record, typical
 from mqe_jax.viz.render import render_frames
 

@@ -94,7 +94,7 @@ class Eval(PolicyOptions):
         """Evaluates a policy; prints a table, or returns the object for `--json`."""
         import jax
 
-        from mqe_jax.cli.recorder import DivergenceRecorder
+        from mqe_jax.cli.train import DivergenceRecorder
         from mqe_jax.train import evaluate as evaluation
 
         num_envs = min(self.num_envs, self.episodes)

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from types import SimpleNamespace
+from typing import Annotated, Any
 
 import jax
+import numpy as np
 import pydantic
 import tyro
 
 from mqe_jax import interrupts, robots, walk_policy
 from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
-from mqe_jax.cli.recorder import DivergenceRecorder
 from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS
+from mqe_jax.envs.replay import content, save_recording
+from mqe_jax.files import check_folder
 from mqe_jax.limits import Seeds
+from mqe_jax.opponents import TeamState
 from mqe_jax.settings import override, record
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.types import Trace
 from mqe_jax.viz import curves
 from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import WALK, train_walk
@@ -146,3 +151,54 @@ def parse_walk_train(arguments: Sequence[str]) -> WalkTrain:
     """Parses the arguments of `mqe walk train`; SystemExit as in `parse_train`."""
     default = WalkTrain(settings=WALK)
     return tyro.cli(WalkTrain, prog="mqe walk train", args=list(arguments), default=default, config=_MARKERS)
+
+
+STEPS = 64
+"""Maximum number of steps in a recording, the last of which diverges."""
+LIMIT = 100
+"""Maximum number of recordings per command."""
+
+
+class DivergenceRecorder:
+    """Writes the last steps of environments that diverge to `FOLDER/diverged_0000.npz`, ..."""
+
+    written: list[Path]
+    """Files written."""
+
+    def __init__(self, env: Any, folder: Path) -> None:
+        check_folder(folder, "dump_diverged")
+        self.written: list[Path] = []
+        self._env, self._folder = env, folder
+        self._previous: Trace | None = None
+
+    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace:
+        """Returns the fields on which a step of all environments depends, and all agents' actions."""
+        if isinstance(after, TeamState):
+            before, action, after = before.match, after.action, after.match
+        return Trace(content(before), action, after.metrics["diverged"])
+
+    def add(self, trace: Trace) -> None:
+        """Writes a recording of each environment that diverged in a trace, with steps of the previous one if needed."""
+        for step, index in np.argwhere(np.asarray(trace.diverged) > 0.0)[: LIMIT - len(self.written)]:
+            parts = [trace] if self._previous is None else [self._previous, trace]
+            steps, actions = jax.tree.map(
+                lambda *leaves, i=index: np.concatenate([np.asarray(leaf[:, i]) for leaf in leaves]),
+                *[(part.snapshot, part.action) for part in parts],
+            )
+            end = len(actions) - len(trace.diverged) + step + 1
+            last = slice(max(0, end - STEPS), end)
+            steps: Any = jax.tree.map(lambda leaf, last=last: leaf[last], steps)
+            states: Any = SimpleNamespace(data=SimpleNamespace(**steps.pop("data")), **steps)
+            save_recording(self._next_file(), self._env, states, actions[last])
+        self._previous = trace
+
+    def report(self) -> None:
+        """Prints how many recordings there are, if any, and how to replay one."""
+        if self.written:
+            echo(f"mqe: recorded {len(self.written)} divergences; replay the first with: mqe replay {self.written[0]}")
+
+    def _next_file(self) -> Path:
+        taken = {file.name for file in self._folder.glob("diverged_*.npz")}
+        name = next(name for i in range(len(taken) + 1) if (name := f"diverged_{i:04d}.npz") not in taken)
+        self.written.append(self._folder / name)
+        return self.written[-1]

@@ -15,11 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.train import devices
-from mqe_jax.train.advantage import gae
-from mqe_jax.train.batches import chunks, minibatches, take
 from mqe_jax.train.checks import check_divisible, check_environment
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, clipped_surrogate, value_loss
+from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss
 from mqe_jax.train.networks import EnvDims, Network
 from mqe_jax.train.normalize import (
     ValueStatistics,
@@ -31,7 +29,7 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam
-from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, normalize_obs, rollout
+from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, minibatches, normalize_obs, rollout, take
 from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
 from mqe_jax.train.types import Batch, LearnerHook, Params, PyTree, TraceStep, Transition, VectorEnv, replace_fields
 

@@ -13,8 +13,7 @@ import viser
 from mqe_jax.errors import InputError
 from mqe_jax.view.menu import Menu
 from mqe_jax.view.overlay import Overlay
-from mqe_jax.view.panel import FREE, Panel
-from mqe_jax.view.readout import robot_labels
+from mqe_jax.view.panel import FREE, Panel, robot_labels
 from mqe_jax.view.server import open_server
 from mqe_jax.view.session import Session
 from mqe_jax.view.stage import Stage, seen, start_frame

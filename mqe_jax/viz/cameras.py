@@ -6,10 +6,9 @@ import mujoco
 import numpy as np
 
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.viz.framing import Camera, fitted, smoothed
+from mqe_jax.viz.framing import Camera, fitted, goal_points, hidden, smoothed, targets
 from mqe_jax.viz.geometry import body_boxes, extent, pose, posed, robot_bases
 from mqe_jax.viz.recording import Episode
-from mqe_jax.viz.visibility import goal_points, hidden, targets
 
 VIEWS = ("follow", "near", "scene", "side")
 """Names of the views. follow: tracks robots, objects and the goal from the direction in which they are seen best; near:

@@ -1,12 +1,19 @@
-"""Free cameras, and the one of a given direction whose image contains some points."""
+"""Free cameras whose image contains some points; what an image contains; the legend of a clip."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mqe_jax.appearance import GOAL_SITE, HIDDEN_GROUP
+from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, posed, robot_bases, robot_color
+from mqe_jax.viz.recording import Episode
 
 _ROOM = 1.07  # factor of the distance at which the points would reach the image's edges
 
@@ -66,3 +73,105 @@ def smoothed(views: Sequence[Camera], width: int) -> list[Camera]:
     means = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
     rows = zip(views, means.tolist(), strict=True)
     return [replace(camera, lookat=(x, y, z), distance=distance) for camera, (x, y, z, distance) in rows]
+
+
+_INK, _PAPER = (28, 32, 40), (246, 246, 242)
+
+
+def entries(env: Any) -> list[tuple[str, list[tuple[int, ...]]]]:
+    """Returns labels and the colours, 0 to 255, of their robots: teams in the order of `env.teams`, then others."""
+    bases = robot_bases(env.mj_model)
+    colors = [tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases]
+    names = ("team",) if len(env.teams) == 1 else ("team 0", "team 1")
+    rows = [(name, [colors[agent] for agent in team]) for name, team in zip(names, env.teams, strict=True)]
+    scripted = colors[sum(map(len, env.teams)) :]
+    return [*rows, ("scripted", scripted)] if scripted else rows
+
+
+def legend(env: Any, size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8.
+
+    One robot alone needs none.
+    """
+    labels = entries(env)
+    if sum(len(dots) for _, dots in labels) < 2:
+        return lambda frame: frame
+    unit = max(size[1] / 360, 0.6)
+    font = ImageFont.load_default(13 * unit)
+    width = sum(font.getlength(label) + unit * (14 * len(dots) + 16) for label, dots in labels)
+    plate = Image.new("RGB", (round(width + 4 * unit), round(22 * unit)), _PAPER)
+    draw, x, middle = ImageDraw.Draw(plate), 8 * unit, 11 * unit
+    for label, dots in labels:
+        for color in dots:
+            draw.ellipse((x, middle - 5 * unit, x + 10 * unit, middle + 5 * unit), fill=color)
+            x += 14 * unit
+        draw.text((x, middle), label, fill=_INK, font=font, anchor="lm")
+        x += font.getlength(label) + 16 * unit
+    picture, gap = np.asarray(plate), round(8 * unit)
+
+    def drawn(frame: np.ndarray) -> np.ndarray:
+        height, width = (min(a, b - gap) for a, b in zip(picture.shape[:2], frame.shape[:2], strict=True))
+        frame = frame.copy()
+        frame[-gap - height : len(frame) - gap, gap : gap + width] = picture[:height, :width]
+        return frame
+
+    return drawn
+
+
+_SPAN = 0.18  # distance from a trunk's centre of the points that are looked for in front and behind, m
+_NEAR_GOAL = 3.0  # distance from the goal that the objects reach within which sites belong to it, m
+_CLEAR = 0.5  # opacity below which a geom hides nothing
+
+
+def targets(model: mujoco.MjModel, episode: Episode) -> list[int]:
+    """Returns the ids of the bodies that a clip shows: robots, then moving objects and NPCs."""
+    return [*robot_bases(model), *moving_bodies(model, episode)]
+
+
+def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
+    """Returns the goals' points (P, 3), m; of several goals those of the one next to the objects at the end."""
+    data = mujoco.MjData(model)
+    pose(model, data, episode, len(episode) - 1)
+    sites = [site for site in range(model.nsite) if model.site(site).name.startswith(f"{GOAL_SITE}/")]
+    points, objects = data.site_xpos[sites].reshape(-1, 3), moving_bodies(model, episode)
+    if not len(points) or not objects:
+        return points
+    place = data.xpos[objects].mean(axis=0)
+    closest = points[np.linalg.norm(points - place, axis=1).argmin()]
+    return points[np.linalg.norm(points - closest, axis=1) < _NEAR_GOAL]
+
+
+def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> np.ndarray:
+    """Returns the part of each target that walls and objects hide from the camera of each frame (T, targets).
+
+    Three points are looked for: along a robot's trunk, and one above the other in an object. Robots hide nothing.
+    """
+    model = copy.deepcopy(model)
+    model.geom_group[model.geom_rgba[:, 3] < _CLEAR] = HIDDEN_GROUP
+    data, bodies = mujoco.MjData(model), targets(model, episode)
+    trunks, local = len(robot_bases(model)), body_boxes(model, bodies)
+    groups = np.array([group != HIDDEN_GROUP for group in range(mujoco.mjNGROUP)], np.uint8)
+    rows = []
+    for index, camera in enumerate(views):
+        pose(model, data, episode, index)
+        boxes = posed(data, bodies, local)
+        span = 0.35 * np.ptp(boxes, axis=1) * (0, 0, 1)
+        span[:trunks] = _SPAN * data.xmat[bodies[:trunks]].reshape(-1, 3, 3)[:, :, 0]
+        points = boxes.mean(axis=1) + np.array([-1, 0, 1])[:, None, None] * span  # (3, targets, 3)
+        struck = _struck(model, data, camera.position, points.reshape(-1, 3), groups).reshape(3, -1)
+        owner = model.body_rootid[model.geom_bodyid[struck]]
+        seen = (struck < 0) | (owner == model.body_rootid[bodies]) | np.isin(owner, bodies[:trunks])
+        rows.append(1.0 - seen.mean(axis=0))
+    return np.array(rows)
+
+
+def _struck(
+    model: mujoco.MjModel, data: mujoco.MjData, eye: np.ndarray, points: np.ndarray, groups: np.ndarray
+) -> np.ndarray:
+    """Returns the first geom on each way from `eye` (3,) to `points` (P, 3); -1 if there is none."""
+    ways = points - eye
+    lengths = np.linalg.norm(ways, axis=1)
+    geoms, distances = np.full(len(points), -1, np.int32), np.zeros(len(points))
+    units = (ways / lengths[:, None]).ravel()
+    mujoco.mj_multiRay(model, data, eye, units, groups, 1, -1, geoms, distances, None, len(points), mujoco.mjMAXVAL)
+    return np.where(distances < lengths, geoms, -1)

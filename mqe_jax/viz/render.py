@@ -22,11 +22,10 @@ from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
 from mqe_jax.settings import PathText, checked
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
-from mqe_jax.viz.framing import Camera
+from mqe_jax.viz.curves import draw_top
+from mqe_jax.viz.framing import Camera, legend
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
-from mqe_jax.viz.legend import legend
 from mqe_jax.viz.recording import Episode
-from mqe_jax.viz.top_view import draw_top
 
 GL_PACKAGES = "libegl1 libgl1-mesa-dri (Debian, Ubuntu)"
 _PROBE = """
