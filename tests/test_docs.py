@@ -325,7 +325,7 @@ def test_notebooks_are_committed_without_outputs_and_the_tour_with_those_of_one_
         return
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     check([output.get("data", {}) for cell in code for output in cell.outputs], path.stem)
-    assert path.stat().st_size < 800_000
+    assert path.stat().st_size < 400_000
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
