@@ -261,6 +261,15 @@ def test_parameters_that_the_skill_does_not_know_are_named(params: dict[str, Any
         make("go1plane", **{"impl": "c", **params})
 
 
+def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "go1gate").mkdir()
+    monkeypatch.chdir(tmp_path)
+    env, _, policy = Eval(target="go1gate", impl="c").environments(1)
+    assert env.name == "go1gate" and isinstance(policy, TrainedPolicy)
+    with pytest.raises(InputError, match="go1gate"):
+        Eval(target="./go1gate", impl="c").environments(1)
+
+
 def test_a_name_is_registered_once() -> None:
     class Other(StandAndLean):
         name = "walk"

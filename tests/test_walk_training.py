@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pathlib
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mqe_jax import cli, walk_policy
+from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import Proprioception
@@ -20,6 +21,7 @@ from mqe_jax.settings import override
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.types import NetworkMemory
+from mqe_jax.walk.env import WalkEnv
 from mqe_jax.walk.network import WalkNetwork, mirror_action, mirror_history, symmetry_loss, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
@@ -121,6 +123,12 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, params["policy"], start)
     with pytest.raises(InputError, match=r"network.name: 'walk' is not allowed"):
         WalkNetwork().build(DIMS._replace(agents=2))
+
+
+def test_walking_is_a_batch_of_one_agent() -> None:
+    batch = VectorEnv(cast(Any, WalkEnv(GO1, impl="c", num_envs=2)), 2)
+    state = jax.eval_shape(batch.reset, jax.random.PRNGKey(0))
+    assert state.obs.shape == (2, 1, walk_policy.OBSERVATION_SIZE) and state.reward.shape == (2, 1)
 
 
 @pytest.mark.soak

@@ -83,13 +83,13 @@ class PolicyOptions(TaskOptions):
         """
         from mqe_jax import zoo
         from mqe_jax.cli import setup
-        from mqe_jax.envs import ALIASES, PLANNERS
+        from mqe_jax.envs import ALIASES, PLANNERS, TASKS
         from mqe_jax.policies import all_agents, load_opponent, load_policy
 
         task, params = ALIASES.get(self.target, self.target), self.overrides()
         shipped = task in zoo.names() and not params and self.policy is None
         name = task if shipped else self.policy or ("scripted" if task in PLANNERS else "forward")
-        if os.sep in self.target or Path(self.target).exists():
+        if task not in (*TASKS, *zoo.names()) and (os.sep in self.target or Path(self.target).exists()):
             config = setup.run_config(self.target)
             task, params, name = config.task, {**config.env, **params}, self.policy or self.target
         env, vector_env = setup.make_env(task, self.impl, params, num_envs)

@@ -18,7 +18,7 @@ from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import MOVING, League
 from mqe_jax.opponents import Mirror, versus
-from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.policies import all_agents, load_opponent, load_policy
 from mqe_jax.settings import fail, load_yaml, override
 from mqe_jax.train import runner
 from mqe_jax.train.config import TrainConfig, load_config
@@ -106,8 +106,10 @@ def check_start(config: TrainConfig) -> None:
     if config.train_env:
         make_env(config.task or "", "auto", config.env, 1)
     _check_teams(env, config)
-    for name in {*config.opponents, config.curriculum.demonstrator} - {*MOVING, None}:
-        load_policy(str(name), env)
+    for name in {*config.opponents} - {*MOVING}:
+        load_opponent(name, env)
+    if config.curriculum.demonstrator is not None:
+        load_policy(config.curriculum.demonstrator, env)
 
 
 def _check_teams(env: Any, config: TrainConfig) -> None:

@@ -37,6 +37,7 @@ class View(PolicyOptions):
         _check_address(self.host, self.port)
         env, vector_env, policy = self.environments(self.num_envs)
 
+        from mqe_jax.envs import ALIASES
         from mqe_jax.view.menu import DEFAULT, Choice, Menu, find_runs
         from mqe_jax.view.session import Session
         from mqe_jax.view.viewer import Viewer
@@ -49,7 +50,7 @@ class View(PolicyOptions):
             return Session(*options.environments(self.num_envs), self.seed)
 
         runs = find_runs([Path("runs"), Path(self.target).parent])
-        own = self.policy or (self.target if Path(self.target).exists() else DEFAULT)
+        own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
         menu = Menu(open_choice, Choice(env.name, own, self.opponent or DEFAULT), runs)
         viewer = Viewer(self.host, self.port, menu)
         viewer.announce(env, self.num_envs)

@@ -65,7 +65,7 @@ class VectorEnv:
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
         """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
-        if not isinstance(env, QuadrupedEnv):
+        if not hasattr(env, "with_num_envs"):  # of tasks and of `walk.env.WalkEnv`
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
         num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
