@@ -207,6 +207,7 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
             for process in processes:
                 if process.popen.poll() is None:
                     process.popen.kill()
+                    process.popen.wait()
 
 
 def _wait(processes: Sequence[_Process]) -> int:
