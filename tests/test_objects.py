@@ -228,6 +228,19 @@ def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
     assert float(herd.outcome(state, herd.read(state.data), jnp.array(False))["success"]) == pytest.approx(2 / 9)
 
 
+def test_shaping_terms_of_sheep_dog(herd: Any) -> None:
+    """Of two sheep that move, one passes the gate from 0.5 m before it, the other comes 1 m nearer to its centre."""
+    before = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.0]]))
+    for number in range(9):
+        before = with_object(herd, before, f"sheep{number}", [5.5, 4.0])  # 5 m away
+    before = with_object(herd, before, "sheep0", [8.0, 0.0])
+    after = with_object(herd, with_object(herd, before, "sheep0", [8.6, 0.0]), "sheep1", [6.1, 3.2])
+    forth, back = terms_of(herd, before, after)[0], terms_of(herd, after, before)[0]
+    assert float(forth["crossing"]) == 1 and float(forth["gathering"]) == pytest.approx(1.5, abs=1e-5)
+    assert float(back["crossing"]) == -1 and float(back["gathering"]) == pytest.approx(-1.5, abs=1e-5)
+    assert herd.params.rewards.crossing == herd.params.rewards.gathering == 0
+
+
 def test_the_herd_starts_as_listed(herd: Any) -> None:
     states = jax.jit(jax.vmap(herd.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
     sheep = np.asarray(jax.vmap(herd.sheep)(states.data))

@@ -35,6 +35,10 @@ class SheepRewards:
     """Per m of the sheep's summed displacement along x."""
     nearness: float = 0.0
     """Sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the gate."""
+    crossing: float = 0.0
+    """Per sheep that passes the gate in a step, less those that come back. For training alone."""
+    gathering: float = 0.0
+    """Per m of decrease of the sheep's summed distances to the gate's centre, 0 past it. For training alone."""
 
 
 @record
@@ -175,13 +179,20 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        sheep, through = self.sheep(after.state.data), self.through(after.state)
-        distance = jnp.linalg.norm(sheep - after.state.anchors[0], axis=-1)
+        (through_before, distance_before), (through, distance) = self._flock(before.state), self._flock(after.state)
+        passed = jnp.sum(through).astype(jnp.float32)
+        left = lambda through, distance: jnp.sum(jnp.where(through, 0.0, distance))  # noqa: E731
         return {
-            "success": jnp.sum(through).astype(jnp.float32),
-            "progress": jnp.sum(sheep[:, 0] - self.sheep(before.state.data)[:, 0]),
+            "success": passed,
+            "progress": jnp.sum(self.sheep(after.state.data)[:, 0] - self.sheep(before.state.data)[:, 0]),
             "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-distance / 2.0))),
+            "crossing": passed - jnp.sum(through_before),
+            "gathering": left(through_before, distance_before) - left(through, distance),
         }
+
+    def _flock(self, state: State) -> tuple[jax.Array, jax.Array]:
+        """Returns which sheep are past the gate (S,) bool and their distances to its centre (S,), m."""
+        return self.through(state), jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1)
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the fraction of the sheep that are past the gate, however the episode ended."""
