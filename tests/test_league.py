@@ -24,11 +24,15 @@ from mqe_jax.league import pool, tournament
 from mqe_jax.league.league import League
 from mqe_jax.opponents import versus
 from mqe_jax.settings import build
-from mqe_jax.train.checkpoint import list_checkpoints
+from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
+from mqe_jax.train.policy import policy_of, read_policy, save_policy
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+import pool_member  # noqa: E402
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}
@@ -100,6 +104,22 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
             assert int(state.extra.pool.born[member]) >= 0
             of_pool = jax.tree.map(lambda x: x[member], state.extra.pool.arrays)  # noqa: B023
             jax.tree.map(np.testing.assert_array_equal, opponent.arrays, of_pool)
+
+
+@pytest.mark.parametrize(("share", "nearest"), [(0.45, 4), (1.0, 9)])
+def test_a_member_of_a_pool_becomes_a_policy_file(
+    history: list[TrainState], tmp_path: Path, share: float, nearest: int
+) -> None:
+    config, state = config_of(), history[9]
+    dims, born = env_dims(versus(matches(), ["idle"]), config), np.asarray(state.extra.pool.born)
+    save_policy(tmp_path, policy_of(state, dims, config, task="go1tug", env_steps=9 * config.steps_per_update))
+    save_checkpoint(tmp_path, state, 9, {}, keep=1)
+    place = int(np.abs(born - share * 9).argmin())
+    assert abs(born[place] - nearest) <= 1
+    save_policy(tmp_path, pool_member.member(tmp_path, share), "member.safetensors")
+    member = read_policy(tmp_path / "member.safetensors")
+    assert member.metadata["env_steps"] == born[place] * config.steps_per_update
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[place]), member.params, state.extra.pool.arrays.params)
 
 
 def test_a_block_plays_another_member_after_its_episodes(history: list[TrainState]) -> None:

@@ -109,15 +109,17 @@ def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
     return _read(Path(path), kind)[1]
 
 
-def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False) -> Checkpoint:
+def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = "") -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
-    With `half`, float16 leaves are allowed where the template has float32, and are converted to it. InputError in one
-    line naming the file, for a missing, damaged or truncated file, another format or format version, and leaves that
-    are missing, unknown or of another shape or dtype.
+    With `half`, float16 leaves are allowed where the template has float32, and are converted to it. With `part`, the
+    leaves below this path name alone are read, such as "extra/pool/". InputError in one line naming the file, for a
+    missing, damaged or truncated file, another format or format version, and leaves that are missing, unknown or of
+    another shape or dtype.
     """
     path = Path(path)
     arrays, metadata = _read(path, kind)
+    arrays = {name.removeprefix(part): array for name, array in arrays.items() if name.startswith(part)}
     expected, structure = _flatten(template)
     for name in expected:
         if name not in arrays:

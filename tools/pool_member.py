@@ -1,0 +1,47 @@
+"""Writes an earlier policy of a league's run, a member of its pool, as a policy file.
+
+`python tools/pool_member.py RUN SHARE FILE` takes the member whose steps are nearest to this share of the run's steps,
+and prints them; `mqe eval RUN --opponent FILE` then plays against it. The pool is that of the newest checkpoint, in
+which the members that the learner beat most are missing.
+"""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from mqe_jax.errors import InputError
+from mqe_jax.league import pool
+from mqe_jax.train.checkpoint import latest, load_tree
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
+
+
+def member(run: Path, share: float) -> TrainedPolicy:
+    """Returns the member of a run's pool nearest to a share of its steps; InputError for a run without a pool."""
+    policy, checkpoint = read_policy(run), latest(run)
+    if checkpoint is None:
+        raise InputError(f"{run}: has no checkpoint")
+    template = jax.eval_shape(lambda: pool.new_pool(policy.arrays, policy.config.league.members))
+    members = load_tree(checkpoint, template, kind="checkpoint", part="extra/pool/").tree
+    steps = np.asarray(members.born, np.int64) * policy.config.steps_per_update
+    apart = np.abs(steps - share * policy.metadata["env_steps"])
+    place = int(np.where(steps < 0, np.inf, apart).argmin())
+    arrays = jax.tree.map(lambda x: x[place], members.arrays)
+    metadata = {**policy.metadata, "env_steps": int(steps[place])}
+    return dataclasses.replace(policy, params=arrays.params, normalizer=arrays.normalizer, metadata=metadata)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("share", type=float)
+    parser.add_argument("file", type=Path)
+    arguments = parser.parse_args()
+    try:
+        policy = member(arguments.run, arguments.share)
+        save_policy(arguments.file.parent, policy, arguments.file.name)
+    except InputError as error:
+        parser.exit(2, f"error: {error}\n")
+    print(f"{arguments.file}: after {policy.metadata['env_steps']} steps")
