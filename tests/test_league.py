@@ -32,7 +32,7 @@ from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-import pool_member  # noqa: E402
+import pool_member
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}

@@ -14,7 +14,7 @@ import pytest
 from fake_env import FakeEnv
 from PIL import Image, ImageSequence
 
-from mqe_jax import make, zoo
+from mqe_jax import make
 from mqe_jax.appearance import GOAL_SITE
 from mqe_jax.envs import TASKS
 from mqe_jax.errors import InputError
@@ -342,7 +342,7 @@ def test_gates_and_goals_are_marked_for_the_cameras() -> None:
 @pytest.mark.parametrize("task", TWELVE)
 def test_the_camera_of_every_task_shows_an_episode_of_its_policy(task: str) -> None:
     env = make(task, impl="c")
-    own = load_policy(task if task in zoo.names() else "scripted", env)
+    own = load_policy(task, env)
     policy = all_agents(env, own, own if len(env.teams) > 1 else None)
     for episode in record(env, policy.act, policy.initial_memory(4), jax.random.PRNGKey(1), episodes=4):
         check(env, episode.cut(slice(None, None, 4)))

@@ -1,4 +1,4 @@
-"""Renders the clips of the documentation: typical episodes of the shipped, or else the scripted, policies.
+"""Renders the clips of the documentation: typical episodes of the shipped policies.
 
 `python tools/clips.py [TASK ...]` writes docs/clips/TASK.webp of each task; without tasks of all, and docs/teams.webp,
 in which they play side by side. Each shows how the median successful one of 48 episodes succeeds.
@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mqe_jax import make, zoo
+from mqe_jax import make
 from mqe_jax.envs import TASKS
 from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.viz.cameras import cameras
@@ -29,7 +29,7 @@ SIZE, TILE, COLUMNS = (640, 360), (240, 135), 4
 def write(task: str) -> list[np.ndarray]:
     """Writes a task's clip, from a fixed camera, and returns its frames as tiles with a title."""
     env = make(task, impl="c", num_envs=EPISODES)
-    own = load_policy(task if task in zoo.names() else "scripted", env)
+    own = load_policy(task, env)
     policy = all_agents(env, own, own if len(env.teams) > 1 else None)
     memory = policy.initial_memory(EPISODES)
     episode = typical(record(env, policy.act, memory, jax.random.PRNGKey(0), episodes=EPISODES))
