@@ -104,6 +104,21 @@ def test_the_release_tries_every_command_of_the_readme() -> None:
         release.readme_commands("```bash\nmqe nothing  # a new command\n```\n")
 
 
+def test_package_sites_get_a_readme_with_the_repositorys_address() -> None:
+    import release
+
+    here = "https://github.com/someone/mqe_jax"
+    assert release.repository(f'[project]\nurls.Repository = "{here}/"') == here
+    assert release.repository("[project]") == ""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    made = release.absolute(text, here)
+    paths = re.findall(rf"\]\({here}/(raw|blob)/main/([^)#]+)", made)
+    assert {"docs/teams.webp", "docs/faq.md"} <= {path for _, path in paths}
+    assert all((kind == "raw") == (Path(path).suffix in (".webp", ".png", ".svg")) for kind, path in paths)
+    assert all((ROOT / path).exists() for _, path in paths)
+    assert not re.search(r"\]\((?!https?:|#)", made) and release.absolute(text, "") == text
+
+
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Every task has a page with its clip, observation and rewards; formulas and links need no other host."""
     pytest.importorskip("mkdocs")
@@ -160,8 +175,6 @@ def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:
     assert docs_pages.links("[a](../../b.py)", here, "results") == f"[a]({here}/blob/main/b.py)"
     colab = "https://colab.research.google.com/github/someone/mqe_jax/blob/main/n.ipynb"
     assert docs_pages.links("[a](../n.ipynb)", here).endswith(f"([open in Colab]({colab}))")
-    assert docs_pages.repository(f'[project]\nurls.Repository = "{here}/"') == here
-    assert docs_pages.repository("[project]") == ""
     assert docs_pages.formulas("`$HOME` and $x^2$").startswith("`$HOME` and <math")
 
 

@@ -15,7 +15,6 @@ import inspect
 import io
 import posixpath
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
+from release import repository
 
 from mqe_jax import zoo
 
@@ -48,12 +48,6 @@ def on_config(config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Converts links and formulas of a page."""
     return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
-
-
-def repository(text: str | None = None) -> str:
-    """Returns `Repository` of `[project.urls]` in pyproject.toml (or in the given text); empty where it is not set."""
-    project = tomllib.loads(text or (ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return project.get("urls", {}).get("Repository", "").rstrip("/")
 
 
 def links(markdown: str, address: str = "", folder: str = "") -> str:
