@@ -1,8 +1,8 @@
 """Builds the wheel and its bill of materials, and tries the README's commands with it, in an empty environment.
 
 `python tools/release.py [--audit]` writes into dist/; with `--audit` it only looks up known vulnerabilities of the
-packages in constraints.txt. The commands run in another folder, which the source tree cannot be imported from. The wheel's
-README, which package sites show, has the repository's address in its links and pictures: `[project.urls]` in pyproject.toml.
+packages in constraints.txt. The commands run in another folder, which the source tree cannot be imported from. Links
+and pictures of the wheel's README, for package sites, lead to the repository: `[project.urls]` in pyproject.toml.
 """
 
 from __future__ import annotations
