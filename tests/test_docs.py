@@ -142,7 +142,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
         for term in vars(env.params.rewards):
             assert f"<code>{term}</code>" in page
         if name != "go1plane":
-            assert f'src="../clips/{name}.webp"' in page
+            assert f'src="../clips/{name}.webp"' in page and 'href="../results/settings.html"' in page
             assert f'src="../clips/{name}.webp"' in overview
     assert "<math" in (tmp_path / "algorithms.html").read_text(encoding="utf-8")
     for page, name in (("state", "final_obs"), ("base", "QuadrupedEnv.step")):
@@ -169,6 +169,7 @@ def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:
     assert docs_pages.links("[the task](../mqe_jax/npc.py), [b](b.md)") == "the task (`mqe_jax/npc.py`), [b](b.md)"
     assert docs_pages.links("[mqe_jax/npc.py](../mqe_jax/npc.py)") == "mqe_jax/npc.py"
     assert docs_pages.links("[![a](../a.png)](a.md)") == "[![a](../a.png)](a.md)"
+    assert docs_pages.links("[a](../b.md) [c](../../d.py)", folder="results") == "[a](../b.md) c (`d.py`)"
     here = "https://github.com/someone/mqe_jax"
     assert docs_pages.links("[a](../b.py) [c](d.md)", here) == f"[a]({here}/blob/main/b.py) [c](d.md)"
     assert docs_pages.links("[a](../b.md)", here, "results") == "[a](../b.md)"
@@ -329,16 +330,13 @@ def check(outputs: list[dict[str, Any]], name: str) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_committed_without_outputs_and_the_tour_with_those_of_one_run(path: Path) -> None:
+def test_notebooks_are_committed_with_the_outputs_of_one_run(path: Path) -> None:
     """`jupyter execute --inplace FILE` stores them."""
     notebook = pytest.importorskip("nbformat").read(path, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    if path.stem != "tour":
-        assert code and all(not cell.outputs and cell.execution_count is None for cell in code)
-        return
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     check([output.get("data", {}) for cell in code for output in cell.outputs], path.stem)
-    assert path.stat().st_size < 400_000
+    assert path.stat().st_size < 150_000
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -57,21 +57,19 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
     name and path.
     """
 
-    def plain(match: re.Match[str]) -> str:
-        text, path = match.groups()
-        return text if path.rstrip("/").endswith(text.replace("\\", "")) else f"{text} (`{path}`)"
-
-    def linked(match: re.Match[str]) -> str:
+    def led(match: re.Match[str]) -> str:
         text, path = match.groups()
         path = posixpath.normpath(posixpath.join("docs", folder, "..", path))
         if path.startswith("docs/"):
             return match.group(0)
+        if not address:
+            return text if path.endswith(text.replace("\\", "").rstrip("/")) else f"{text} (`{path}`)"
         link = f"[{text}]({address}/blob/main/{path})"
         hub = address.partition("https://github.com/")[2]
         colab = f"https://colab.research.google.com/github/{hub}/blob/main/{path}"
         return f"{link} ([open in Colab]({colab}))" if hub and path.endswith(".ipynb") else link
 
-    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", linked if address else plain, markdown)
+    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", led, markdown)
 
 
 def formulas(markdown: str) -> str:
