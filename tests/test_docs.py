@@ -133,6 +133,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     )
     assert built.returncode == 0, built.stderr[-3000:]
     assert "WARNING" not in built.stderr
+    first = (tmp_path / "index.html").read_text(encoding="utf-8")
     overview = (tmp_path / "tasks" / "index.html").read_text(encoding="utf-8")
     for name in TASKS:
         page = (tmp_path / "tasks" / f"{name}.html").read_text(encoding="utf-8")
@@ -143,7 +144,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
             assert f"<code>{term}</code>" in page
         if name != "go1plane":
             assert f'src="../clips/{name}.webp"' in page and 'href="../results/settings.html"' in page
-            assert f'src="../clips/{name}.webp"' in overview
+            assert f'src="../clips/{name}.webp"' in overview and f'href="tasks/{name}.html"><code>' in first
     assert "<math" in (tmp_path / "algorithms.html").read_text(encoding="utf-8")
     for page, name in (("state", "final_obs"), ("base", "QuadrupedEnv.step")):
         assert name in (tmp_path / "reference" / f"envs.{page}.html").read_text(encoding="utf-8")

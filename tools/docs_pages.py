@@ -99,8 +99,9 @@ def pages() -> dict[str, str]:
 
 
 def front(readme: str) -> str:
-    """Returns the README as the site's first page, with its links as from docs/."""
-    return re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
+    """Returns the README as the site's first page: its links as from docs/, tasks linked to their pages."""
+    page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
+    return re.sub(r"^\| `(go1[\w-]+)` \|", r"| [`\1`](tasks/\1.md) |", page, flags=re.MULTILINE)
 
 
 def overview(tasks: Mapping[str, Any]) -> str:
