@@ -1,10 +1,9 @@
-"""Trains Narrow Gate with Stable-Baselines3's PPO, one policy for all agents, through PettingZoo and SuperSuit.
+"""Trains Climb on Seesaw with Stable-Baselines3's PPO, one policy for all agents, through PettingZoo and SuperSuit.
 
     pip install 'mqe-jax[pettingzoo]' stable-baselines3 supersuit
     python examples/sb3_pettingzoo.py --csv sb3.csv
 
-Evaluates the returns of agents on the unmodified task during training. SuperSuit steps environments sequentially: the
-example demonstrates compatibility, not speed.
+SuperSuit steps environments sequentially: the example demonstrates compatibility, not speed.
 """
 
 import argparse
@@ -17,9 +16,9 @@ import numpy as np
 
 from mqe_jax.adapters import pettingzoo
 
-AGENTS, NUM_ENVS, EPISODES, EVALUATIONS = 2, 8, 32, 6
-# In training the approach reward has a larger weight, as in configs/demo.yaml.
-TRAINING_REWARDS = {"approach": 10.0}
+NUM_ENVS, ROLLOUT = 8, 256
+COLUMNS = {"return": "r", "episode_length": "l"}
+"""Columns of the curve and their names in Stable-Baselines3's records of episodes."""
 
 
 def vectorised(task: str, **settings: Any) -> Any:
@@ -32,59 +31,46 @@ def vectorised(task: str, **settings: Any) -> Any:
     return wrappers.VecNormalize(wrappers.VecMonitor(env))
 
 
-def main() -> None:
-    """Runs the example."""
+def train(env: Any, steps: int, rollout: int = ROLLOUT) -> list[dict[str, Any]]:
+    """Trains; returns rows of environment steps, and return and length of the last 100 episodes of agents.
+
+    Args:
+        env: of `vectorised`.
+        steps: environment steps.
+        rollout: steps of each environment between updates.
+    """
     ppo: Any = import_module("stable_baselines3").PPO
-    evaluate: Any = import_module("stable_baselines3.common.evaluation").evaluate_policy
     # PPO's argument `seed` would call a method that SuperSuit's environments lack.
     import_module("stable_baselines3.common.utils").set_random_seed(0)
+    settings: dict[str, Any] = {"batch_size": rollout * 2, "n_epochs": 4, "learning_rate": 1e-3}
+    policy = {"log_std_init": -0.7}
+    model = ppo("MlpPolicy", env, n_steps=rollout, policy_kwargs=policy, device="cpu", **settings)
+    rows = []
+    agents = env.num_envs // NUM_ENVS
+    while model.num_timesteps < steps * agents:
+        model.learn(rollout * env.num_envs, reset_num_timesteps=False)
+        episodes = model.ep_info_buffer
+        if episodes:
+            row: dict[str, Any] = {"env_steps": model.num_timesteps // agents}
+            row |= {name: round(float(np.mean([x[key] for x in episodes])), 3) for name, key in COLUMNS.items()}
+            rows.append(row)
+            print(rows[-1], flush=True)
+    return rows
+
+
+def main() -> None:
+    """Runs the example."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--steps", type=int, default=100_000, help="steps of agents")
+    parser.add_argument("--task", default="go1seesaw")
+    parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--csv", type=Path)
     arguments = parser.parse_args()
-    env, eval_env = vectorised("go1gate", rewards=TRAINING_REWARDS), vectorised("go1gate")
-    eval_env.training, eval_env.norm_reward, eval_env.obs_rms = False, False, env.obs_rms
-    policy = {"log_std_init": -0.7}
-    model = ppo(
-        "MlpPolicy",
-        env,
-        n_steps=256,
-        batch_size=512,
-        n_epochs=4,
-        learning_rate=1e-3,
-        policy_kwargs=policy,
-        device="cpu",
-    )
-    rows = []
-    for number in range(EVALUATIONS + 1):
-        if number:
-            model.learn(arguments.steps // EVALUATIONS, reset_num_timesteps=False)
-        returns, lengths = evaluate(
-            model, eval_env, n_eval_episodes=AGENTS * EPISODES, deterministic=False, return_episode_rewards=True
-        )
-        # Agents of one environment have equal rewards and come one after the other: an episode counts once.
-        returns = np.reshape(returns, (-1, AGENTS)).mean(axis=1)
-        rows.append(
-            {
-                "agent_steps": model.num_timesteps,
-                "return": round(float(np.mean(returns)), 4),
-                "return_standard_error": round(float(np.std(returns, ddof=1) / len(returns) ** 0.5), 4),
-                "episode_length": round(float(np.mean(lengths)), 1),
-            }
-        )
-        print(rows[-1], flush=True)
-        write(arguments.csv, rows)
-
-
-def write(path: Path | None, rows: list[dict[str, Any]]) -> None:
-    """Writes the rows to a CSV file, where there is a path."""
-    if path is None:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = train(vectorised(arguments.task), arguments.steps)
+    if arguments.csv is not None and rows:
+        with arguments.csv.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters, through PettingZoo.
 
     pip install 'mqe-jax[pettingzoo]' torchrl
-    python examples/torchrl_mappo.py --steps 20000
+    python examples/torchrl_mappo.py --csv torchrl.csv
     python examples/torchrl_mappo.py --task go1tug --opponent idle
 
 TorchRL steps one environment on the host: the example demonstrates compatibility, not speed.
@@ -9,18 +9,17 @@ TorchRL steps one environment on the host: the example demonstrates compatibilit
 
 import argparse
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from mqe_jax.adapters import pettingzoo
 
 BATCH, EPOCHS, MINIBATCHES = 2000, 8, 4
-# In training the approach reward has a larger weight, as in configs/demo.yaml.
-TRAINING_REWARDS = {"approach": 10.0}
 GROUP = "robot"
 """TorchRL's group of the agents robot_0, robot_1, ..."""
 
 
-def train(task: str = "go1gate", steps: int = 20_000, batch: int = BATCH, **settings: Any) -> list[float]:
+def train(task: str = "go1seesaw", steps: int = 26_000, batch: int = BATCH, **settings: Any) -> list[float]:
     """Trains; returns the mean return of an agent over the episodes that ended in each batch, NaN without any.
 
     Args:
@@ -96,12 +95,15 @@ def networks(env: Any) -> tuple[Any, Any]:
 def main() -> None:
     """Runs the example."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--task", default="go1gate")
+    parser.add_argument("--task", default="go1seesaw")
     parser.add_argument("--opponent", help="policy of team 1 of a match")
-    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--steps", type=int, default=26_000)
+    parser.add_argument("--csv", type=Path)
     arguments = parser.parse_args()
-    settings: dict[str, Any] = {"rewards": TRAINING_REWARDS} if arguments.task == "go1gate" else {}
-    train(arguments.task, arguments.steps, opponent=arguments.opponent, **settings)
+    returns = train(arguments.task, arguments.steps, opponent=arguments.opponent)
+    if arguments.csv is not None:
+        rows = [f"{BATCH * (i + 1)},{value:.3f}\n" for i, value in enumerate(returns)]
+        arguments.csv.write_text("".join(["env_steps,return\n", *rows]), encoding="utf-8")
 
 
 if __name__ == "__main__":

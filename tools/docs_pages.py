@@ -15,7 +15,6 @@ import inspect
 import io
 import posixpath
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
+from release import repository
 
 from mqe_jax import zoo
 
@@ -50,12 +50,6 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
 
 
-def repository(text: str | None = None) -> str:
-    """Returns `Repository` of `[project.urls]` in pyproject.toml (or in the given text); empty where it is not set."""
-    project = tomllib.loads(text or (ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return project.get("urls", {}).get("Repository", "").rstrip("/")
-
-
 def links(markdown: str, address: str = "", folder: str = "") -> str:
     """Leads links to files outside docs/, from a page in a folder of it, to the repository's address.
 
@@ -63,21 +57,19 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
     name and path.
     """
 
-    def plain(match: re.Match[str]) -> str:
-        text, path = match.groups()
-        return text if path.rstrip("/").endswith(text.replace("\\", "")) else f"{text} (`{path}`)"
-
-    def linked(match: re.Match[str]) -> str:
+    def led(match: re.Match[str]) -> str:
         text, path = match.groups()
         path = posixpath.normpath(posixpath.join("docs", folder, "..", path))
         if path.startswith("docs/"):
             return match.group(0)
+        if not address:
+            return text if path.endswith(text.replace("\\", "").rstrip("/")) else f"{text} (`{path}`)"
         link = f"[{text}]({address}/blob/main/{path})"
         hub = address.partition("https://github.com/")[2]
         colab = f"https://colab.research.google.com/github/{hub}/blob/main/{path}"
         return f"{link} ([open in Colab]({colab}))" if hub and path.endswith(".ipynb") else link
 
-    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", linked if address else plain, markdown)
+    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", led, markdown)
 
 
 def formulas(markdown: str) -> str:
@@ -107,8 +99,9 @@ def pages() -> dict[str, str]:
 
 
 def front(readme: str) -> str:
-    """Returns the README as the site's first page, with its links as from docs/."""
-    return re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
+    """Returns the README as the site's first page: its links as from docs/, tasks linked to their pages."""
+    page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
+    return re.sub(r"^\| `(go1[\w-]+)` \|", r"| [`\1`](tasks/\1.md) |", page, flags=re.MULTILINE)
 
 
 def overview(tasks: Mapping[str, Any]) -> str:
@@ -136,7 +129,9 @@ def task_page(task: Any) -> str:
     command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
     against = " against itself" if len(env.teams) > 1 else ""
     clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{task.title}]({_clip(name)})"
-    media = [clip] if _clip(name) else []
+    watch = f"`mqe view {name}` shows the {policy} policy live ([how strong](../results/strength.md) it is)."
+    training = f"`mqe train {name}` trains one: [settings, and what to expect](../results/settings.md)."
+    media = [clip, f"{watch} {training}"] if _clip(name) else []
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
         "- action per agent: command 3 (velocities for the walk policy), position 12, torque 12",

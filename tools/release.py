@@ -1,7 +1,8 @@
 """Builds the wheel and its bill of materials, and tries the README's commands with it, in an empty environment.
 
 `python tools/release.py [--audit]` writes into dist/; with `--audit` it only looks up known vulnerabilities of the
-packages in constraints.txt. The commands run in another folder, which the source tree cannot be imported from.
+packages in constraints.txt. The commands run in another folder, which the source tree cannot be imported from. Links
+and pictures of the wheel's README, for package sites, lead to the repository: `[project.urls]` in pyproject.toml.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import sys
 import tempfile
 import tomllib
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
@@ -29,6 +31,8 @@ SHORTER = {
 }
 """Flags added to the README's command of each name, so that it takes seconds."""
 SECONDS = 600
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "mqe_jax")
+"""What the wheel is built from."""
 
 
 def readme_commands(text: str) -> list[list[str]]:
@@ -85,11 +89,32 @@ def audit(tools: Path) -> int:
     return int(any(package["vulns"] for package in looked_up))
 
 
-def build() -> Path:
-    """Builds the wheel into dist/; returns it."""
-    for leftover in (DIST, ROOT / "build" / "lib"):  # of an earlier build, which would become part of the wheel
-        shutil.rmtree(leftover, ignore_errors=True)
-    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", DIST, ROOT)
+def repository(text: str | None = None) -> str:
+    """Returns `Repository` of `[project.urls]` in pyproject.toml (or in the given text); empty where it is not set."""
+    project = tomllib.loads(text or (ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return project.get("urls", {}).get("Repository", "").rstrip("/")
+
+
+def absolute(readme: str, address: str) -> str:
+    """Returns the README with relative links and pictures led to the repository's address; unchanged without one."""
+    if not address:
+        return readme
+    readme = re.sub(r"(!\[[^\]\n]*\]\()(?![a-z]+:|#)", rf"\1{address}/raw/main/", readme)
+    return re.sub(r"(\]\()(?![a-z]+:|#)", rf"\1{address}/blob/main/", readme)
+
+
+def build(folder: Path) -> Path:
+    """Builds the wheel into dist/, from a copy of the sources in a new folder; returns it."""
+    shutil.rmtree(DIST, ignore_errors=True)
+    folder.mkdir()
+    for name in SOURCES:
+        copy: Any = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, folder / name)
+    readme, address = folder / "README.md", repository()
+    readme.write_text(absolute(readme.read_text(encoding="utf-8"), address), encoding="utf-8")
+    if not address:
+        print("release: [project.urls] has no Repository: package sites show the README without pictures")
+    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", DIST, folder)
     (wheel,) = DIST.glob("*.whl")
     return wheel
 
@@ -116,7 +141,7 @@ def main() -> int:
         found = audit(tools)
         if arguments.audit:
             return found
-        wheel = build()
+        wheel = build(folder / "sources")
         programs = new_environment(folder / "venv", f"{wheel}[{EXTRAS}]")
         bill = wheel.with_suffix(".cdx.json")
         run(tools / "cyclonedx-py", "environment", programs / "python", "--output-file", bill)

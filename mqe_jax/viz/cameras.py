@@ -18,9 +18,8 @@ _MARGIN = np.array([0.4, 0.4, 0.25])  # around a robot's trunk, m
 _SMOOTHING = 0.6  # duration over which a following camera is averaged, s
 _SAMPLES = 24  # frames of an episode by which directions are compared
 _DISTANCES = (2.0, 16.0)  # of a following camera, m
-_DIRECTIONS = [
-    (azimuth, elevation) for azimuth in (90.0, 60.0, 30.0, 0.0, 120.0) for elevation in (-30.0, -38.0, -48.0)
-]
+_ELEVATIONS = (-30.0, -38.0, -48.0, -60.0)
+_DIRECTIONS = [(azimuth, elevation) for azimuth in (90.0, 60.0, 30.0, 0.0, -30.0, 120.0) for elevation in _ELEVATIONS]
 _BEHIND = 2.0  # m of distance that a camera may add to see the robots beside each other
 _HIDDEN = 12.0  # m of distance that a camera may add to see the targets all the time
 
