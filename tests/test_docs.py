@@ -91,32 +91,6 @@ def test_a_wrong_command_would_be_found() -> None:
             parse(wrong)
 
 
-def test_the_release_tries_every_command_of_the_readme() -> None:
-    import release
-
-    tried = release.readme_commands((ROOT / "README.md").read_text(encoding="utf-8"))
-    assert {words[0] for words in tried} >= {"train", "eval", "render"}
-    for words in tried:
-        assert parse(words), words
-    with pytest.raises(KeyError):
-        release.readme_commands("```bash\nmqe nothing  # a new command\n```\n")
-
-
-def test_package_sites_get_a_readme_with_the_repositorys_address() -> None:
-    import release
-
-    here = "https://github.com/someone/mqe_jax"
-    assert release.repository(f'[project]\nurls.Repository = "{here}/"') == here
-    assert release.repository("[project]") == ""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    made = release.absolute(text, here)
-    paths = re.findall(rf"\]\({here}/(raw|blob)/main/([^)#]+)", made)
-    assert {"docs/teams.webp", "docs/faq.md"} <= {path for _, path in paths}
-    assert all((kind == "raw") == (Path(path).suffix in (".webp", ".png", ".svg")) for kind, path in paths)
-    assert all((ROOT / path).exists() for _, path in paths)
-    assert not re.search(r"\]\((?!https?:|#)", made) and release.absolute(text, "") == text
-
-
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Every task has a page with its clip, observation and rewards; formulas and links need no other host."""
     pytest.importorskip("mkdocs")

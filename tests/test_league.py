@@ -132,6 +132,24 @@ def test_a_block_plays_another_member_after_its_episodes(history: list[TrainStat
     assert all(not bool(o.outcomes.any()) for state in history[1:] for o in state.rollout.env_state.opponents)
 
 
+def test_a_block_keeps_its_member_while_episodes_against_the_last_one_run(history: list[TrainState]) -> None:
+    env = League(matches(num_envs=8), SOURCES, config_of())
+
+    @jax.jit
+    def members(state: TrainState) -> jax.Array:
+        """Members of the blocks after an update, for 16 random keys (16, K); all have played enough."""
+
+        def one(key: jax.Array) -> jax.Array:
+            league = state.extra._replace(key=key, played=jnp.full_like(state.extra.played, 5))
+            return env.after(dataclasses.replace(state, extra=league))[0].extra.member
+
+        return jax.vmap(one)(jax.random.split(KEY, 16))
+
+    waiting, free = members(history[3]), members(history[5])
+    np.testing.assert_array_equal(waiting, np.tile(history[3].extra.member, (16, 1)))
+    assert [len(set(of_block.tolist())) > 1 for of_block in free.T] == [False, True, True, False]
+
+
 def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
     env = versus(matches(), ["idle", "forward"], draw_reward=-2.0)
     step, still = jax.jit(env.step), jnp.zeros((4, 1, 12))

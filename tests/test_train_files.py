@@ -19,7 +19,7 @@ from safetensors.numpy import save_file
 from mqe_jax.errors import InputError
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
-from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
+from mqe_jax.train.checkpoint import latest, load_tree, read_metadata, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.monitor import read_evaluations
 from tests.training import assert_same
@@ -163,6 +163,17 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
         save_tree(tmp_path / "x", TREE, {"b": 1, "a": [2]}, kind="policy")
         contents.add((tmp_path / "x").read_bytes())
     assert len(contents) == 1
+
+
+@pytest.mark.parametrize(("old", "new"), [(b'"I8"', b'"U8"'), (b"[2,3]", b"[3,2]")])
+def test_the_same_bytes_as_other_arrays_do_not_match_their_checksum(old: bytes, new: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    save_tree(path, TREE, {}, kind="policy")
+    whole = path.read_bytes()
+    assert whole.count(old) == 1
+    path.write_bytes(whole.replace(old, new))
+    with pytest.raises(InputError, match="does not match its checksum"):
+        read_metadata(path, kind="policy")
 
 
 def test_old_checkpoints_go(tmp_path: Path) -> None:

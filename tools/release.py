@@ -1,8 +1,9 @@
 """Builds the wheel and its bill of materials, and tries the README's commands with it, in an empty environment.
 
-`python tools/release.py [--audit]` writes into dist/; with `--audit` it only looks up known vulnerabilities of the
-packages in constraints.txt. The commands run in another folder, which the source tree cannot be imported from. Links
-and pictures of the wheel's README, for package sites, lead to the repository: `[project.urls]` in pyproject.toml.
+`python tools/release.py [--tag TAG] [--audit]` writes into dist/; with `--audit` it only looks up known vulnerabilities
+of the packages in constraints.txt. All files must name the same version, and with a tag that of the tag. The commands
+run in another folder, which the source tree cannot be imported from. Links and pictures of the wheel's README, for
+package sites, lead to the repository: `[project.urls]` in pyproject.toml.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,29 @@ SHORTER = {
 SECONDS = 600
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "mqe_jax")
 """What the wheel is built from."""
+VERSIONS = {"mqe_jax/__init__.py": r'^__version__ = "(.+)"$', "CITATION.cff": r"^version: (.+)$"}
+"""Where the version of pyproject.toml is repeated."""
+
+
+def disagreements(tag: str, files: Mapping[str, str]) -> list[str]:
+    """Returns in what the version in pyproject.toml differs from the other files, and from the tag if there is one.
+
+    `files` holds the texts of pyproject.toml, CHANGELOG.md and those of `VERSIONS`, by name. The newest section of the
+    changelog must be that of the version, with the date of CITATION.cff; with a tag it must have all changes.
+    """
+    version = tomllib.loads(files["pyproject.toml"])["project"]["version"]
+    unreleased, *sections = re.split(r"^## \[(?=\d)", files["CHANGELOG.md"], flags=re.MULTILINE)
+    heading = sections[0].splitlines()[0] if sections else "no section"
+    found = {name: re.findall(pattern, files[name], re.MULTILINE) for name, pattern in VERSIONS.items()}
+    wrong = [f"{name}: {text}; {version} is needed" for name, text in found.items() if text != [version]]
+    date = re.findall(r"^date-released: (.+)$", files["CITATION.cff"], re.MULTILINE)
+    if [heading] != [f"{version}] - {day}" for day in date]:
+        wrong.append(f"CHANGELOG.md: [{heading}; [{version}] with the date of CITATION.cff, {date}, is needed")
+    if tag and tag != f"v{version}":
+        wrong.append(f"tag: {tag}; v{version} is needed")
+    if tag and re.search(r"^- ", unreleased, re.MULTILINE):
+        wrong.append(f"CHANGELOG.md: has unreleased changes; all of them are needed in the section [{version}]")
+    return wrong
 
 
 def readme_commands(text: str) -> list[list[str]]:
@@ -81,6 +106,9 @@ def audit(tools: Path) -> int:
         print(f"audit: NOT DONE, the database cannot be reached: {(done.stderr.splitlines() or ['?'])[-1][:200]}")
         return 0
     looked_up = [package for package in packages if "vulns" in package]
+    if not looked_up:
+        print(f"audit: NOT DONE, the database knows none of {len(packages)} packages")
+        return 0
     for package in looked_up:
         for found in package["vulns"]:
             print(f"audit: {package['name']} {package['version']}: {found['id']}, fixed in {found['fix_versions']}")
@@ -134,7 +162,13 @@ def main() -> int:
     """Builds and tries a release; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--audit", action="store_true", help="only look up known vulnerabilities")
+    parser.add_argument("--tag", default="", help="tag of the release, such as v1.2.3; none if empty")
     arguments = parser.parse_args()
+    names = ("pyproject.toml", "CHANGELOG.md", *VERSIONS)
+    wrong = disagreements(arguments.tag, {name: (ROOT / name).read_text(encoding="utf-8") for name in names})
+    if wrong and not arguments.audit:
+        print(*(f"release: {text}" for text in wrong), sep="\n", file=sys.stderr)
+        return 1
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tools = release_tools(folder / "tools")

@@ -33,7 +33,7 @@ from mqe_jax.envs import TASKS
 from mqe_jax.files import write_atomically
 from mqe_jax.robots import ROBOTS
 from tests.engines import agreement, pairs
-from tests.soak.fuzz import fuzz
+from tests.soak.fuzz import KINDS, fuzz
 from tests.soak.kills import disk, kills
 from tests.soak.play import PLAYS, play
 from tests.soak.processes import memory
@@ -57,6 +57,8 @@ class Options:
     """Parallel environments of play."""
     kills: int = 30
     """SIGKILLs; a third as many signals are SIGINT or SIGTERM."""
+    kinds: tuple[str, ...] = ()
+    """Kinds of bad inputs of the fuzzer; all if empty."""
     cases: int = 400
     """Bad inputs of the fuzzer."""
     seed: int = 0
@@ -148,6 +150,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--task", action="append", dest="tasks", choices=list(TASKS), default=[], help="may be repeated")
     made.add_argument("--robot", action="append", dest="robots", choices=list(ROBOTS), default=[], help="of play")
     made.add_argument("--mode", action="append", dest="modes", choices=PLAYS, default=[], help="of play")
+    made.add_argument("--kind", action="append", dest="kinds", choices=KINDS, default=[], help="of fuzz")
     for name in ("steps", "num_envs", "kills", "cases", "seed"):
         made.add_argument(f"--{name.replace('_', '-')}", type=int, default=getattr(defaults, name))
     return made
@@ -158,7 +161,7 @@ def main() -> int:
     given = vars(parser().parse_args())
     hours, minutes, folder = given.pop("hours"), given.pop("minutes"), given.pop("folder")
     parts = given.pop("parts") or list(PARTS)
-    given |= {name: tuple(given[name]) for name in ("tasks", "robots", "modes")}
+    given |= {name: tuple(given[name]) for name in ("tasks", "robots", "modes", "kinds")}
     report = Report(folder, Options(**given), 60.0 * hours if minutes is None else minutes)
     for number, part in enumerate(parts):
         report.begin(len(parts) - number)

@@ -27,6 +27,8 @@ from tests.soak.processes import contained
 if TYPE_CHECKING:
     from tests.soak.__main__ import Report
 
+KINDS = ("flag", "file", "call", "run")
+"""Kinds of bad input: command lines, files, records and tasks, damaged runs."""
 CHUNK = 25
 """Cases of one row."""
 DRAWING = settings(
@@ -42,7 +44,8 @@ SMALL = [*fake_env.SMALL, "--network.hidden-sizes", "4"]
 def fuzz(report: Report) -> None:
     """Draws inputs of every kind, until there are as many as wanted or the time is over."""
     setup.make_env = with_fake(setup.make_env)
-    kinds = {kind.__name__.removesuffix("_cases"): kind for kind in (flag_cases, file_cases, call_cases, run_cases)}
+    cases = {"flag": flag_cases, "file": file_cases, "call": call_cases, "run": run_cases}
+    kinds = {kind: cases[kind] for kind in report.options.kinds or KINDS}
     count = -(-report.options.cases // CHUNK)
     rows = [f"{kind} {number}" for number in range(-(-count // len(kinds))) for kind in kinds][:count]
     for name in report.pending("fuzz", rows):
