@@ -103,6 +103,9 @@ def test_the_law_of_the_flock_by_hand() -> None:
     np.testing.assert_allclose(velocity, [[0.2 * 0.5 / 0.25**1.4 - 0.0981, 0.0]], atol=1e-4)
     fast = flock(key, sheep, still, jnp.array([[0.9, 0.0]]), restlessness=0.0, step=STEP)
     np.testing.assert_allclose(fast, [[2.0 - 0.0981, 0.0]], atol=1e-4)  # the top speed
+    law = functools.partial(flock, key, sheep, still, restlessness=0.0, step=STEP, friction=0.0)
+    seen, beyond = (float(law(jnp.array([[1.0 - apart, 0.0]]))[0, 0]) for apart in (2.9, 3.1))
+    assert seen == pytest.approx(0.2 * 2.9 / 2.9**2.8, rel=1e-4) and beyond == 0.0
 
 
 def test_a_sheep_by_itself_wanders() -> None:

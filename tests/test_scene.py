@@ -185,6 +185,16 @@ def test_a_gate_is_as_wide_as_its_gap() -> None:
         Track((Gate(width=3.5),)).layout()
 
 
+def test_the_walls_of_a_gate_reach_the_side_walls_wherever_it_stands() -> None:
+    gate = Gate(length=4.0, width=0.8, offset=(0.0, 0.3), random=(0.0, 0.5))
+    layout = Track((gate,), width=3.0).layout()
+    right, left = layout.walls
+    (middle, aside), reach = (layout.anchors[0].position[1], layout.anchors[0].spread[1]), 1.5 - 1e-6
+    for center in (middle - aside, middle + aside):
+        assert center + right.center[1] - right.size[1] / 2 <= -reach
+        assert center + left.center[1] + left.size[1] / 2 >= reach
+
+
 def test_walls_around_a_track_face_inward_at_its_edges() -> None:
     track = Track(blocks=(SpawnArea(2.0), Gate(length=2.0, width=0.6), EndWall()), width=3.0)
     walls = {wall.name: (wall.point, wall.normal) for wall in track.layout().barriers}

@@ -251,6 +251,9 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     path.write_bytes(whole)
     assert "a has shape (2, 3); (2, 4) is needed" in error_of({**TREE, "a": jnp.zeros((2, 4))})
     assert "a has dtype float32; int32" in error_of({**TREE, "a": jnp.zeros((2, 3), jnp.int32)})
+    save_tree(path, {**TREE, "a": TREE["a"].astype(np.float16)}, {}, kind="checkpoint")
+    assert "a has dtype float16; float32 is needed" in error_of()
+    path.write_bytes(whole)
     assert "d is missing" in error_of({**TREE, "d": jnp.zeros(())})
     assert "unexpected entry c/0" in error_of({k: v for k, v in TREE.items() if k != "c"})
 

@@ -162,6 +162,9 @@ def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:
     assert float(norm) == pytest.approx(50.0)
     np.testing.assert_allclose(params["a"], [-0.1, 0.0, 0.1], rtol=1e-4)
     np.testing.assert_allclose(state.mean["a"], [0.1 * 0.6, 0.0, -0.1 * 0.8], rtol=1e-5)
+    small = {"a": jnp.array([0.3, 0.0, -0.4]), "b": {"c": jnp.array(0.0)}}
+    state = optimizer.update(small, optimizer.init(params), params, 0.1)[1]
+    np.testing.assert_allclose(state.mean["a"], [0.03, 0.0, -0.04], rtol=1e-5)  # a small gradient stays as it is
 
 
 @pytest.mark.parametrize("shape", [(8, 3), (3, 8)])
