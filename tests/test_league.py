@@ -150,6 +150,31 @@ def test_a_block_keeps_its_member_while_episodes_against_the_last_one_run(histor
     assert [len(set(of_block.tolist())) > 1 for of_block in free.T] == [False, True, True, False]
 
 
+@pytest.mark.parametrize(("win_rate", "snapshots"), [(1.0, [0, 0, 0, 8]), (0.4, [0, 2, 7, 8])])
+def test_a_winning_policy_joins_early_but_not_at_once(
+    history: list[TrainState], win_rate: float, snapshots: list[int]
+) -> None:
+    """A snapshot is due every eight updates, after two of them where the policy wins often: here half of its games."""
+    league = {**SMALL, "snapshot_steps": 256, "snapshot_win_rate": win_rate}
+    env, state = League(matches(num_envs=8), SOURCES, config_of(league=league)), history[1]
+    state = dataclasses.replace(state, extra=state.extra._replace(snapshot=jnp.int32(0)))
+
+    def last(updates: jax.Array) -> jax.Array:
+        return env.after(dataclasses.replace(state, updates=updates))[0].extra.snapshot
+
+    assert jax.jit(jax.vmap(last))(jnp.array([1, 2, 7, 8], jnp.int32)).tolist() == snapshots
+
+
+def test_blocks_with_other_opponents_protect_no_member(history: list[TrainState]) -> None:
+    env, state = League(matches(num_envs=8), SOURCES, config_of()), history[5]
+    beaten = state.extra.pool._replace(score=jnp.array([9.0, 8.0, 7.0, 0.0]), games=jnp.full(4, 9.0))
+    after = jax.jit(env.after)
+    for member, replaced in (([0, 2, 3, 0], 0), ([0, 0, 3, 0], 1), ([0, 0, 1, 0], 2)):
+        league = state.extra._replace(pool=beaten, member=jnp.array(member, jnp.int32), played=jnp.zeros(4, jnp.int32))
+        born = after(dataclasses.replace(state, updates=jnp.int32(99), extra=league))[0].extra.pool.born
+        assert jnp.argmax(born) == replaced and int(born[replaced]) == 99
+
+
 def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
     env = versus(matches(), ["idle", "forward"], draw_reward=-2.0)
     step, still = jax.jit(env.step), jnp.zeros((4, 1, 12))

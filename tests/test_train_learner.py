@@ -157,6 +157,22 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
         np.testing.assert_array_equal(value, one_pass.first_again[name])
 
 
+@pytest.mark.parametrize("schedule", ["constant", "linear"])
+def test_an_adapted_learning_rate_only_falls_while_its_schedule_falls(schedule: str) -> None:
+    """With a target that every update is far below."""
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
+    config = small(num_envs=4, total_steps=320, optimizer__target_kl=100.0, optimizer__schedule=schedule)
+    learner = make_learner(env, override(config, {"optimizer.learning_rate": 1e-5}))
+    state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
+    rates = []
+    for _ in range(3):
+        state, _ = update(state)
+        rates.append(float(state.learning_rate))
+    assert rates[0] == pytest.approx(1e-5 * 1.5**8)  # eight gradient steps before the schedule begins
+    assert (rates[2] > rates[1] > rates[0]) == (schedule == "constant")
+    assert (rates[2] == rates[1] == rates[0]) == (schedule == "linear")
+
+
 def test_a_bonus_for_entropy_widens_the_policy() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
     learner = make_learner(env, small(num_envs=4, ppo={"epochs": 2, "minibatches": 1, "entropy_coef": 1.0}))

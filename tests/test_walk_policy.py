@@ -238,6 +238,25 @@ def test_memory_shifts_and_advances() -> None:
     np.testing.assert_array_equal(memory.previous_action, first)
 
 
+def test_actions_are_clipped_and_remembered_as_such() -> None:
+    params = walk_policy.init_params(jax.random.PRNGKey(0))
+    params["body"]["6"]["bias"] = jnp.tile(jnp.array([50.0, -50.0]), 6)
+    still = Proprioception(DOWN, jnp.asarray(GO1.default_joints), jnp.zeros(12))
+    target, memory = SKILL.targets(params, SKILL.init_memory(), jnp.asarray(SKILL.default_commands()), still)
+    np.testing.assert_array_equal(memory.action, np.tile([10.0, -10.0], 6))
+    np.testing.assert_allclose(target, GO1.joint_targets(memory.action))
+
+
+def test_a_new_walk_policy_begins_with_small_actions() -> None:
+    """Weights of a layer are uniform within 1 / sqrt(inputs), those of the action layer within a tenth of it."""
+    body = walk_policy.init_params(jax.random.PRNGKey(0))["body"]
+    largest = {
+        name: float(jnp.abs(layer["weight"]).max()) * layer["weight"].shape[1] ** 0.5 for name, layer in body.items()
+    }
+    assert largest == pytest.approx({"0": 1.0, "2": 1.0, "4": 1.0, "6": 0.1}, rel=0.02)
+    assert not body["6"]["bias"].any() and body["4"]["bias"].any()
+
+
 def test_command_actions_are_the_papers() -> None:
     action = jnp.array([[0.25, -1.0, 0.5], [1.0, 0.0, 0.0]])
     default = SKILL.default_commands()
