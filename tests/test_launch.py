@@ -8,6 +8,7 @@ import os
 import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -289,6 +290,21 @@ def test_two_hosts(vanishes: bool, hosts: list[str], tmp_path: Path) -> None:
     assert first.returncode == second.returncode == 0, said
     assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
     assert_equal_runs(tmp_path / "one", run, 1e-5)
+
+
+def test_on_one_host_nobody_else_can_join() -> None:
+    """Every address of 127.0.0.0/8 is this machine's, as its addresses in a network are."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    connected = [f"socket.socket().connect_ex(('{host}', {port})) == 0" for host in ("127.0.0.1", "127.0.0.2")]
+    program = f"import socket; from mqe_jax.cli.launch import join; join(); print({', '.join(connected)}, flush=True)"
+    environment = {**os.environ, launch.MEMBER: f"0/1@127.0.0.1:{port}"}
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().decode().split() == ["True", "False"]
 
 
 def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:

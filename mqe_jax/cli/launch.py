@@ -132,7 +132,9 @@ def join() -> None:
         else:
             place, address = member.split("@")
             index, count = map(int, place.split("/"))
-            jax.distributed.initialize(address, count, index, **timeouts)
+            # JAX binds the coordinator's port to all addresses of the machine unless told otherwise.
+            bind = address if address.startswith("127.0.0.1:") else None
+            jax.distributed.initialize(address, count, index, coordinator_bind_address=bind, **timeouts)
     except (RuntimeError, ValueError) as error:
         raise InputError(f"coordinator: the other processes cannot be reached ({error})") from None
 
