@@ -121,14 +121,16 @@ class Versus(OneTeam):
         self.draw_reward, self.time_limit_ends = draw_reward, time_limit_ends
         self.privileged_observation_size += time_limit_ends
         if not opponents or self.num_envs % len(opponents):
-            fail("opponents", len(opponents), f"a number that divides the number of environments, {self.num_envs}")
+            fail("opponents", len(opponents), f"a divisor of the environments of a process, {self.num_envs}")
         for policy in opponents:
-            if policy.task != self.name or policy.agents != self.num_agents:
-                raise InputError(
-                    f"opponents: a policy of {policy.agents} agents on {policy.task}; {self.name} needs one of "
-                    f"{self.num_agents}"
-                )
+            if (policy.agents, policy.task) != (self.num_agents, self.name):
+                given = f"a policy of {policy.agents} agents on {policy.task}"
+                raise InputError(f"opponents: {given}; {self.name} needs one of {self.num_agents}")
         self.opponents = tuple(opponents)
+
+    def share(self, parts: int) -> Versus:
+        """Returns the environments of one of several processes; each process meets all opponents."""
+        return Versus(super().share(parts).matches, self.opponents, self.draw_reward, self.time_limit_ends)
 
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
@@ -183,9 +185,8 @@ class Versus(OneTeam):
         if not isinstance(first, TrainedPolicy):
             raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
         if policy.architecture != first.architecture:
-            raise InputError(
-                f"policy: of another architecture than block {block}: {policy.architecture}, not {first.architecture}"
-            )
+            other = f"{policy.architecture}, not {first.architecture}"
+            raise InputError(f"policy: of another architecture than block {block}: {other}")
         changed = exchanged(opponent, _arrays(policy), at_once=at_once)
         opponents = (*state.opponents[:block], changed, *state.opponents[block + 1 :])
         return dataclasses.replace(state, opponents=opponents)
@@ -317,8 +318,7 @@ class Mirror(OneTeam):
 def exchanged(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:
     """Returns the opponent of a block with other arrays; see `Versus.change`."""
     if at_once:
-        waiting = jnp.zeros_like(opponent.waiting)
-        return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=waiting)
+        return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting))
     pending = devices.any_of(jnp.any(opponent.waiting))
     before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
     waiting = jnp.where(pending, opponent.waiting, True)

@@ -187,7 +187,7 @@ def test_processes_end_with_the_launcher(tmp_path: Path) -> None:
 def test_ten_kills_change_nothing(tmp_path: Path) -> None:
     """Killed at random moments, resumed, the run equals an uninterrupted one of two processes bit for bit."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    words = ["launch", "--processes", "2", *TRAIN, "--total-steps", str(16 * 4000), "--checkpoint.every", "20"]
+    words = ["launch", "--processes", "2", *TRAIN, "--total-steps", str(16 * 1500), "--checkpoint.every", "20"]
     mqe(*words, "--run-dir", str(whole))
     chance = random.Random(0)
     for _ in range(10):
@@ -204,7 +204,7 @@ def test_ten_kills_change_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("flags", [[], ["--opponent", "scripted", "--opponent", "older"]])
+@pytest.mark.parametrize("flags", [["--algorithm", "mappo"], ["--opponent", "scripted", "--opponent", "older"]])
 def test_matches_on_two_processes_equal_one(flags: list[str], tmp_path: Path) -> None:
     """Both teams learn; a league: both meet every opponent in both processes."""
     words = ["train", "go1wrestling", "--impl", "c", "--num-envs", "8", "--rollout-steps", "4", "--total-steps", "32"]

@@ -146,6 +146,8 @@ def test_an_opponents_memory_starts_anew_with_its_episode(policies: list[Trained
 def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: VectorEnv) -> None:
     with pytest.raises(InputError, match="opponents: 3 is not allowed"):
         versus(door, ["idle"] * 3)
+    with pytest.raises(InputError, match=r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2"):
+        versus(door, ["idle"] * 4).share(2)
     with pytest.raises(InputError, match="go1plane is not a match"):
         versus(matches("go1plane"), ["idle"])
     with pytest.raises(InputError, match="on go1revolvingdoor; go1tug needs"):

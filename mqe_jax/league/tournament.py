@@ -37,7 +37,7 @@ class Ratings(NamedTuple):
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `OUTCOMES`.
 
-    The environments are in K equal blocks, with one of the K opponents as team 1 each.
+    Every Kth environment has the same one of the K opponents as team 1 (`Versus`).
     """
     env = Versus(matches, opponents)
 
@@ -59,7 +59,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
         (_, _, _, outcome), _ = jax.lax.scan(advance, start, jax.random.split(key, matches.max_episode_steps))
         return outcome
 
-    return np.asarray(run(key)).reshape(len(opponents), -1, 3).sum(axis=1)
+    return np.asarray(run(key)).reshape(-1, len(opponents), 3).sum(axis=0)
 
 
 def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
