@@ -77,8 +77,7 @@ class OneTeam:
     def __init__(self, matches: VectorEnv, num_envs: int) -> None:
         if len(check("env", matches, AnyBatch).teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
-        self.env, self.matches, self.num_envs = matches.env, matches, num_envs
-        self.name = matches.name
+        self.env, self.matches, self.name, self.num_envs = matches.env, matches, matches.name, num_envs
         self.num_agents = team_size(matches)
         self.teams = (tuple(range(self.num_agents)),)
         self.max_episode_steps = matches.max_episode_steps
@@ -120,17 +119,21 @@ class Versus(OneTeam):
         super().__init__(matches, matches.num_envs)
         self.draw_reward, self.time_limit_ends = draw_reward, time_limit_ends
         self.privileged_observation_size += time_limit_ends
-        if not opponents or self.num_envs % len(opponents):
-            fail("opponents", len(opponents), f"a divisor of the environments of a process, {self.num_envs}")
         for policy in opponents:
             if (policy.agents, policy.task) != (self.num_agents, self.name):
                 given = f"a policy of {policy.agents} agents on {policy.task}"
                 raise InputError(f"opponents: {given}; {self.name} needs one of {self.num_agents}")
         self.opponents = tuple(opponents)
+        self._check_blocks(self.num_envs)
 
-    def share(self, parts: int) -> Versus:
+    def share(self, parts: int) -> Self:
         """Returns the environments of one of several processes; each process meets all opponents."""
-        return Versus(super().share(parts).matches, self.opponents, self.draw_reward, self.time_limit_ends)
+        self._check_blocks(self.num_envs // parts)
+        return super().share(parts)
+
+    def _check_blocks(self, num_envs: int) -> None:
+        if not self.opponents or num_envs % len(self.opponents):
+            fail("opponents", len(self.opponents), f"a divisor of the environments of a process, {num_envs}")
 
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
@@ -160,9 +163,7 @@ class Versus(OneTeam):
         done = match.terminated | match.truncated
         ended = jnp.stack([done & (match.metrics[f"team0/{name}"] > 0) for name in OUTCOMES], axis=-1)
         match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2])
-        started = tuple(
-            self._restarted(i, o, done[self._block(i)], ended[self._block(i)]) for i, o in enumerate(opponents)
-        )
+        started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
         return self._seen(match, both, started, key, state.step + 1)
 
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
@@ -188,8 +189,7 @@ class Versus(OneTeam):
             other = f"{policy.architecture}, not {first.architecture}"
             raise InputError(f"policy: of another architecture than block {block}: {other}")
         changed = exchanged(opponent, _arrays(policy), at_once=at_once)
-        opponents = (*state.opponents[:block], changed, *state.opponents[block + 1 :])
-        return dataclasses.replace(state, opponents=opponents)
+        return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
 
     @property
     def _size(self) -> int:
@@ -199,7 +199,8 @@ class Versus(OneTeam):
         return slice(index, None, len(self.opponents))
 
     def _restarted(self, index: int, opponent: Opponent, done: jax.Array, ended: jax.Array) -> Opponent:
-        """Counts the outcomes `ended` (B, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
+        """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
+        done, ended = done[self._block(index)], ended[self._block(index)]
         first = self.opponents[index].initial_memory(self._size)
         memory = jax.tree.map(lambda start, now: _where(done, start, now), first, opponent.memory)
         outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
@@ -291,8 +292,7 @@ class Mirror(OneTeam):
             return jnp.repeat(x, 2, axis=0)
 
         def privileged(x: jax.Array) -> jax.Array:
-            team = jnp.tile(jnp.arange(2.0), len(x))[:, None]
-            return jnp.concatenate([twice(x), team], axis=1)
+            return jnp.concatenate([twice(x), jnp.tile(jnp.arange(2.0), len(x))[:, None]], axis=1)
 
         metrics = {name: twice(value) for name, value in match.metrics.items() if not name.startswith("team1/")}
         for name in ("diverged", "overflow"):

@@ -292,6 +292,12 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
 
 
+def test_a_process_has_a_league_of_its_own_environments() -> None:
+    env = League(matches(num_envs=8), SOURCES, config_of()).share(2)
+    assert isinstance(env, League) and env.learner_hook is env
+    assert env.num_envs == env.matches.num_envs == 4
+
+
 def test_ratings_recover_the_strengths_behind_many_games() -> None:
     """Odds of 3 are 191 points; a draw counts half."""
     games = np.zeros((3, 3, 3), int)

@@ -124,7 +124,8 @@ def overview(tasks: Mapping[str, Any]) -> str:
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
     env, name = task(num_envs=1, impl="c"), task.name
-    body = inspect.cleandoc(task.__doc__ or "").partition("\n")[2].strip()
+    bodies = (inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__)
+    body = next(filter(None, bodies))  # that of a base class where the task's is one line
     policy = "shipped" if name in zoo.names() else "scripted"
     command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
     against = " against itself" if len(env.teams) > 1 else ""
@@ -145,7 +146,7 @@ def task_page(task: Any) -> str:
         body,
         "\n".join(facts),
         "## Observation of an agent\n\n| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
-        "## Reward terms\n\n" + _fields(type(env.params.rewards), "weight"),
+        "## Reward terms\n\n" + _fields(type(env.params.rewards), "weight", given=vars(env.params.rewards)),
         "A weight is set by `--set rewards.NAME=VALUE`, or `make(task, rewards={...})`.",
         "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
     ]
@@ -162,10 +163,14 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
     return {name: x.docstring.value for name, x in members.items() if x.docstring}
 
 
-def _fields(record: type[Any], column: str, skip: tuple[str, ...] = ()) -> str:
-    """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give."""
+def _fields(record: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None) -> str:
+    """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give.
+
+    Values are defaults, or those `given`.
+    """
     meanings = [_meanings(cls) for cls in record.__mro__ if cls is not object]
     values: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
+    values |= given or {}
     rows = []
     for name in sorted(values, key=lambda name: name not in meanings[0]):
         parts = {name: (values[name], next((own[name] for own in meanings if name in own), ""))}

@@ -179,20 +179,20 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        (through_before, distance_before), (through, distance) = self._flock(before.state), self._flock(after.state)
+        (through_before, way_before), (through, way) = self._flock(before.state), self._flock(after.state)
         passed = jnp.sum(through).astype(jnp.float32)
-        left = lambda through, distance: jnp.sum(jnp.where(through, 0.0, distance))  # noqa: E731
         return {
             "success": passed,
             "progress": jnp.sum(self.sheep(after.state.data)[:, 0] - self.sheep(before.state.data)[:, 0]),
-            "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-distance / 2.0))),
+            "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-way / 2.0))),
             "crossing": passed - jnp.sum(through_before),
-            "gathering": left(through_before, distance_before) - left(through, distance),
+            "gathering": jnp.sum(way_before) - jnp.sum(way),
         }
 
     def _flock(self, state: State) -> tuple[jax.Array, jax.Array]:
-        """Returns which sheep are past the gate (S,) bool and their distances to its centre (S,), m."""
-        return self.through(state), jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1)
+        """Returns which sheep are past the gate (S,) bool and the others' distances to its centre (S,), m, else 0."""
+        through = self.through(state)
+        return through, jnp.where(through, 0.0, jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1))
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the fraction of the sheep that are past the gate, however the episode ended."""
