@@ -17,6 +17,7 @@ from mqe_jax.envs.match import Match
 from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import MOVING, League
+from mqe_jax.league.sides import both_sides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
 from mqe_jax.settings import fail, load_yaml, override
@@ -69,8 +70,9 @@ def make_env(
 def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     """Returns training and evaluation environments (None without evaluation) of seeds trained together.
 
-    In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
-    environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
+    In a match the policy is team 0 against `opponents`, from both sides where these differ (`both_sides`). Without,
+    both teams of each of `num_envs` / 2 matches are environments of the policy; it is evaluated against the scripted
+    policy, or an idle team where that does not fit.
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = config.task or "", config.evaluation.episodes, config.opponents
@@ -90,10 +92,13 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     _check_teams(both, config)
     if len(both.teams) < 2:
         return batch(config.num_envs), eval_env
-    learning = League(batch(config.num_envs), opponents, config) if opponents else Mirror(batch(config.num_envs // 2))
+    if opponents:
+        learning = League(both_sides(batch(config.num_envs)), opponents, config)
+    else:
+        learning = Mirror(batch(config.num_envs // 2))
     if eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
-        eval_env = versus(eval_env, fixed or anchors(eval_env.env)[:1])
+        eval_env = versus(both_sides(eval_env), fixed or anchors(eval_env.env)[:1])
     return learning, eval_env
 
 
