@@ -14,6 +14,7 @@ from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.match import Match
+from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import MOVING, League
@@ -79,12 +80,14 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
     demonstrator = config.curriculum.demonstrator
 
-    def batch(num_envs: int) -> VectorEnv:
+    def batch(num_envs: int) -> Any:
         if demonstrator is None:
-            return env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
-        policy = load_policy(demonstrator, both)
-        everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
-        return Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
+            started = env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
+        else:
+            policy = load_policy(demonstrator, both)
+            everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
+            started = Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
+        return Deadline(started) if config.time_limit_ends else started
 
     eval_env = None
     if config.evaluation.every is not None:

@@ -17,8 +17,8 @@ from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
 from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.envs.replay import content, save_recording
+from mqe_jax.envs.wrappers import WrappedState
 from mqe_jax.files import check_folder
-from mqe_jax.league.sides import SidesState
 from mqe_jax.limits import Seeds
 from mqe_jax.opponents import TeamState
 from mqe_jax.settings import override, record
@@ -176,7 +176,7 @@ class DivergenceRecorder:
         """Returns the fields on which a step of all environments depends, and all agents' actions."""
         if isinstance(after, TeamState):
             before, action, after = before.match, after.action, after.match
-        if isinstance(after, SidesState):
+        while isinstance(after, WrappedState):
             before, action, after = before.inner, after.action, after.inner
         return Trace(content(before), action, after.metrics["diverged"])
 

@@ -68,7 +68,7 @@ class League(Versus):
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
         first = TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": matches.name})
         policies = [first if source in MOVING else load_opponent(source, matches.env) for source in opponents]
-        super().__init__(matches, policies, config.draw_reward, config.time_limit_ends)
+        super().__init__(matches, policies, config.draw_reward)
         self._members = config.league.members if drawn else 1
         self._moving = np.array([source in DRAWN for source in opponents])
         self._scripted = np.array([source == "scripted" for source in opponents])

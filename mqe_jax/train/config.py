@@ -191,8 +191,8 @@ class TrainConfig:
     draw_reward: float = 0.0
     """Added to the reward where an episode against opponents ends in a draw, during training only."""
     time_limit_ends: bool = False
-    """Whether the time limit of an episode against opponents ends it for the learner too: no value follows, and the
-    critic's privileged observation includes the time left."""
+    """Whether the time limit ends the episode for the learner too: no value follows, and the privileged observation
+    includes the time left. During training only."""
     league: LeagueSettings = LeagueSettings()
     start: str | None = None
     """Run folder or policy file whose policy the run starts from: its parameters and observation statistics; none
