@@ -184,6 +184,14 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
         outcome = env.outcome(end, env.read(end.data), jnp.array(False))
         assert bool(outcome["success"]) and bool(outcome["success/both_touched"]) == together
         assert bool(terms_of(env, first, end)[0]["both_touched"]) == together
+    for before, end, goal, joint in (
+        (first, alone, 1, 0),
+        (first, both, 1, 1),
+        (alone, late, 0, 0),
+        (both, both, 0, 0),
+    ):
+        terms = terms_of(env, before, end)[0]
+        assert (float(terms["first_goal"]), float(terms["joint_goal"])) == (goal, joint)
     both_now = dataclasses.replace(first, task=dataclasses.replace(first.task, touched=jnp.ones(2, bool)))
     steps = ((state, first, 1.0), (first, first, 0.0), (first, both_now, 1.0), (state, both_now, 2.0))
     for before, after, count in steps:
