@@ -130,7 +130,7 @@ def task_page(task: Any) -> str:
     command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
     against = " against itself" if len(env.teams) > 1 else ""
     clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{task.title}]({_clip(name)})"
-    watch = f"`mqe view {name}` shows the {policy} policy live ([how strong](../results/strength.md) it is)."
+    watch = f"`mqe view {name}` shows the {policy} policy live ([how good](../results/strength.md) it is)."
     training = f"`mqe train {name}` trains one: [settings, and what to expect](../results/settings.md)."
     media = [clip, f"{watch} {training}"] if _clip(name) else []
     facts = [
