@@ -42,7 +42,19 @@ def test_package_sites_get_a_readme_with_the_repositorys_address() -> None:
     assert {"docs/teams.webp", "docs/faq.md"} <= {path for _, path in paths}
     assert all((kind == "raw") == (Path(path).suffix in (".webp", ".png", ".svg")) for kind, path in paths)
     assert all((ROOT / path).exists() for _, path in paths)
-    assert not re.search(r"\]\((?!https?:|#)", made) and release.absolute(text, "") == text
+    assert not re.search(r"\]\((?!https?:|#)", made)
+    for readme in (made, release.absolute(text, "")):
+        assert 'pip install "mqe-jax[render]" ' in readme and '".[' not in readme and "repository, with" not in readme
+
+
+def test_badges_are_of_the_repositorys_workflows() -> None:
+    text, there = "# mqe_jax\n\nTeams", "https://github.com/someone/mqe_jax"
+    made = release.badges(text, there)
+    for name in ("tests", "release"):
+        page = f"{there}/actions/workflows/{name}.yml"
+        assert (release.WORKFLOWS / f"{name}.yml").is_file() and f"[![{name}]({page}/badge.svg)]({page})" in made
+    assert made.startswith("# mqe_jax\n\n[![") and made.endswith("\n\nTeams")
+    assert release.badges(text, "") == release.badges(text, "https://example.org/mqe_jax") == text
 
 
 def test_the_versions_of_this_tree_agree() -> None:
