@@ -17,7 +17,7 @@ import yaml
 from mqe_jax import cli
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.errors import InputError
-from mqe_jax.league.sides import BothSides, both_sides
+from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, Versus, versus
 from mqe_jax.policies import BothTeams, all_agents, load_policy
 from mqe_jax.settings import build
@@ -215,8 +215,7 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
 
 def test_a_team_wins_from_both_sides() -> None:
     inner = matches("go1revolvingdoor", 4, control="command", episode_length=3.0, line_x=1.2)
-    env = versus(both_sides(inner), ["idle"])
-    assert isinstance(env.matches, BothSides) and both_sides(matches("go1tug", 4)) is matches("go1tug", 4)
+    env = versus(BothSides(inner), ["idle"])
     result = evaluate(env, load_policy("forward", inner.env).act, 4, KEY)
     assert (result.success_rate, result.match["win_rate"]) == (1.0, 1.0)
     assert result.episode_return > 0.0 and result.average_step_reward > 0.0

@@ -18,7 +18,7 @@ from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import MOVING, League
-from mqe_jax.league.sides import both_sides
+from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
 from mqe_jax.settings import fail, load_yaml, override
@@ -71,9 +71,8 @@ def make_env(
 def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     """Returns training and evaluation environments (None without evaluation) of seeds trained together.
 
-    In a match the policy is team 0 against `opponents`, from both sides where these differ (`both_sides`). Without,
-    both teams of each of `num_envs` / 2 matches are environments of the policy; it is evaluated against the scripted
-    policy, or an idle team where that does not fit.
+    In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
+    environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = config.task or "", config.evaluation.episodes, config.opponents
@@ -96,12 +95,13 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     if len(both.teams) < 2:
         return batch(config.num_envs), eval_env
     if opponents:
-        learning = League(both_sides(batch(config.num_envs)), opponents, config)
+        matches = batch(config.num_envs)
+        learning = League(BothSides(matches) if config.both_sides else matches, opponents, config)
     else:
         learning = Mirror(batch(config.num_envs // 2))
     if eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
-        eval_env = versus(both_sides(eval_env), fixed or anchors(eval_env.env)[:1])
+        eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed or anchors(eval_env.env)[:1])
     return learning, eval_env
 
 
@@ -123,6 +123,8 @@ def check_start(config: TrainConfig) -> None:
 def _check_teams(env: Any, config: TrainConfig) -> None:
     if len(env.teams) < 2 and config.opponents:
         fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+    if config.both_sides and not config.opponents:
+        fail("both_sides", True, "false where there are no opponents")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 

@@ -17,7 +17,7 @@ class BothSides(Wrapper):
     The privileged observation has one more number: 1 where the teams have changed places, else 0. Of the metrics,
     outcomes are those of the new teams; terms of the reward, zero-sum, change sign.
 
-    A match that is symmetric under a reflection needs it: robots walk not quite as their mirror images.
+    It makes a difference where a match is symmetric under a reflection: robots walk not quite as their mirror images.
     """
 
     def __init__(self, inner: Any) -> None:
@@ -60,8 +60,3 @@ class BothSides(Wrapper):
         """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A, ...)."""
         other = jnp.roll(x, self.num_agents // 2, axis=1)
         return jnp.where(self._changed().reshape(-1, *(1,) * (x.ndim - 1)), other, x)
-
-
-def both_sides(matches: Any) -> Any:
-    """Returns matches with both sides if their symmetry is a reflection, else the matches."""
-    return BothSides(matches) if matches.env.symmetry == "reflect" else matches
