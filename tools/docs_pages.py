@@ -126,19 +126,18 @@ def front(readme: str) -> str:
 
 
 def overview(tasks: Mapping[str, Any]) -> str:
-    """Returns the page that lists all tasks."""
+    """Returns the page that shows all tasks, as a gallery."""
     kinds: dict[str, list[str]] = {"Cooperative": [], "Competitive": [], "For tests": []}
     for name, task in tasks.items():
         env = task(num_envs=1, impl="c")
         kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
-        style = '{ style="min-width: 9em" }'
-        image = f"[![{task.title}]({_clip(name)}){style}]({name}.md)" if _clip(name) else ""
-        sizes = f"{env.num_agents} | {env.observation_size} | {env.privileged_observation_size}"
-        limit = f"{env.params.episode_length:g}"
-        kinds[kind].append(f"| [`{name}`]({name}.md) | {task.title} | {sizes} | {limit} | {image} |")
-    columns = "| id | name | agents | observation | privileged | time limit, s | |\n|---|---|---|---|---|---|---|"
-    parts = [f"## {kind}\n\n{columns}\n" + "\n".join(rows) for kind, rows in kinds.items()]
-    head = "# Tasks\n\nSizes, rewards and parameters on these pages are read from the code."
+        image = f"[![{_seen(task)}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
+        robots = " vs ".join(str(len(team)) for team in env.teams)
+        sizes = f"{robots} robots, {env.observation_size} numbers observed by each, {env.params.episode_length:g} s"
+        kinds[kind].append(f"- {image}[**{task.title}**]({name}.md) `{name}`: {sizes}")
+    galleries = [(kind, "\n".join(items)) for kind, items in kinds.items()]
+    parts = [f'## {kind}\n\n<div class="gallery" markdown>\n\n{items}\n\n</div>' for kind, items in galleries]
+    head = "# Tasks\n\nEach page has a task's observation, rewards and parameters, which are read from the code."
     return "\n\n".join([head, *parts]) + "\n"
 
 
@@ -150,8 +149,7 @@ def task_page(task: Any) -> str:
     policy = "shipped" if name in zoo.names() else "scripted"
     command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
     against = " against itself" if len(env.teams) > 1 else ""
-    seen = f"{task.title}: {inspect.cleandoc(task.__doc__ or '').splitlines()[0]}"
-    clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{seen}]({_clip(name)})"
+    clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{_seen(task)}]({_clip(name)})"
     watch = f"`mqe view {name}` shows the {policy} policy live ([how good](../results/strength.md) it is)."
     training = f"`mqe train {name}` trains one: [settings, and what to expect](../results/settings.md)."
     media = [clip, f"{watch} {training}"] if _clip(name) else []
@@ -173,6 +171,10 @@ def task_page(task: Any) -> str:
         "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _seen(task: Any) -> str:
+    return f"{task.title}: {inspect.cleandoc(task.__doc__ or '').splitlines()[0]}"
 
 
 def _clip(name: str) -> str | None:
