@@ -15,6 +15,9 @@ A feed-forward network takes as input the last 30 observations of 70 numbers:
 adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives the action, clipped to +-10;
 the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32; in
 an environment's step in TF32 on an NVIDIA GPU.
+
+These 2100 numbers contain every action twice and constant commands 30 times. `RestrictedWalkPolicy` computes the same
+actions from about two thirds of them, with weights changed accordingly.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -40,6 +43,9 @@ from mqe_jax.skills import Command, Skill, register
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
+_BLOCKS = ("gravity", "commands", "joint_position", "joint_velocity", "action", "previous_action", "clock")
+_COLUMNS = dict(zip(_BLOCKS, np.split(np.arange(OBSERVATION_SIZE), [3, 18, 30, 42, 54, 66]), strict=True))
+"""Positions of each block in an observation."""
 LATENT_SIZE = 2
 ADAPTATION_SIZES = (HISTORY * OBSERVATION_SIZE, 256, 128, LATENT_SIZE)
 BODY_SIZES = (HISTORY * OBSERVATION_SIZE + LATENT_SIZE, 512, 256, 128, NUM_JOINTS)
@@ -90,7 +96,7 @@ class WalkMemory:
     """Recurrent state of one robot's walk policy."""
 
     history: jax.Array
-    """Last observations, oldest first (30, 70); zeros after a reset."""
+    """Last observations, oldest first (30, 70), or their rows (H,), see `RestrictedWalkPolicy`; zeros after a reset."""
     action: jax.Array
     """Last action (12,)."""
     previous_action: jax.Array
@@ -138,12 +144,12 @@ def _mlp(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision:
 
 
 def infer_latent(params: Params, history: jax.Array, *, precision: str = "highest") -> jax.Array:
-    """Estimates the latent (..., 2) from flattened histories (..., 2100)."""
+    """Estimates the latent (..., 2) from flattened histories (..., n)."""
     return _mlp(params["adaptation"], history, precision)
 
 
 def infer_action(params: Params, history: jax.Array, latent: jax.Array, *, precision: str = "highest") -> jax.Array:
-    """Computes unclipped actions (..., 12) from flattened histories (..., 2100) and latents (..., 2)."""
+    """Computes unclipped actions (..., 12) from flattened histories (..., n) and latents (..., 2)."""
     return _mlp(params["body"], jnp.concatenate([history, latent], axis=-1), precision)
 
 
@@ -164,12 +170,19 @@ class WalkPolicy(Skill):
         self, params: Params, memory: WalkMemory, command: jax.Array, proprioception: Proprioception
     ) -> tuple[jax.Array, WalkMemory]:
         observation = observe(self.robot, memory, command, proprioception)
-        history = jnp.concatenate([memory.history[1:], observation[None]])
+        history = self._extended(memory.history, observation)
         flat = history.reshape(-1)
         latent = infer_latent(params, flat, precision=PRECISION)
         action = jnp.clip(infer_action(params, flat, latent, precision=PRECISION), -ACTION_CLIP, ACTION_CLIP)
         gait = advance_gait(memory.gait, command)
         return self.robot.joint_targets(action), WalkMemory(history, action, memory.action, gait)
+
+    def _extended(self, history: jax.Array, observation: jax.Array) -> jax.Array:
+        """Returns the history with the newest observation and without the oldest."""
+        return jnp.concatenate([history[1:], observation[None]])
+
+    def restricted(self, varied: Sequence[str], gait: str | None) -> WalkPolicy:
+        return RestrictedWalkPolicy(self.robot, varied, gait)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
         return load_params(self.robot, path)
@@ -178,6 +191,54 @@ class WalkPolicy(Skill):
         """Returns sine and cosine of the phase of the gait cycle (2,)."""
         angle = 2 * jnp.pi * memory.gait
         return jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+
+
+class RestrictedWalkPolicy(WalkPolicy):
+    """The walk policy where only some commands vary: the same actions from a shorter history.
+
+    The history is the end of a stream of rows, one per observation: a one, and the observation without the constant
+    commands and without the action before the last one, which is the last action of the row before.
+    """
+
+    def __init__(self, robot: Robot, varied: Sequence[str], gait: str | None) -> None:
+        """Creates the skill; commands that are not in `varied` always have the gait's defaults."""
+        super().__init__(robot)
+        changing = np.sort(self.index(varied))
+        self._constant = COMMAND_SCALE * self.default_commands(gait)
+        self._constant[changing] = 0.0
+        state = [_COLUMNS[name] for name in ("gravity", "joint_position", "joint_velocity", "clock", "action")]
+        self._kept = np.concatenate([_COLUMNS["commands"][changing], *state])
+        self._width = 1 + len(self._kept)
+        least = HISTORY * self._width + NUM_JOINTS  # the rows, and the last action of the row before
+        self._size = least + -least % 16  # 64 bytes: products of aligned rows are faster
+
+    def init_memory(self) -> WalkMemory:
+        return dataclasses.replace(super().init_memory(), history=jnp.zeros(self._size))
+
+    def _extended(self, history: jax.Array, observation: jax.Array) -> jax.Array:
+        return jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
+
+    def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
+        return self.folded(super().load_params(path))
+
+    def folded(self, params: Params) -> Params:
+        """Returns weights that compute from histories of rows what `params` compute from 30 observations.
+
+        In the first layers, the weights of both occurrences of an action are added, and those of constant commands,
+        times their values, become the weight of the row's one.
+        """
+        params = {part: dict(layers) for part, layers in params.items()}
+        for layers in params.values():
+            weight = np.asarray(layers["0"]["weight"])
+            window, rest = np.split(weight, [HISTORY * OBSERVATION_SIZE], axis=1)
+            window = window.reshape(-1, HISTORY, OBSERVATION_SIZE)
+            rows = np.zeros((len(weight), HISTORY + 1, self._width), np.float32)
+            rows[:, 1:, 0] = window[..., _COLUMNS["commands"]] @ self._constant
+            rows[:, 1:, 1:] = window[..., self._kept]
+            rows[:, :-1, -NUM_JOINTS:] += window[..., _COLUMNS["previous_action"]]
+            history = rows.reshape(len(weight), -1)[:, -self._size :]
+            layers["0"] = {**layers["0"], "weight": jnp.asarray(np.concatenate([history, rest], axis=1))}
+        return params
 
 
 def init_params(key: jax.Array) -> Params:

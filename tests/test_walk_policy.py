@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import actuators, cli, skills, walk_policy
+from mqe_jax import actuators, cli, make, skills, walk_policy
 from mqe_jax.control import Controller
 from mqe_jax.errors import InputError
 from mqe_jax.robots.go1 import GO1
@@ -222,6 +222,32 @@ def test_phases_are_warped_by_the_duration() -> None:
     assert float(walk_policy.foot_phases(jnp.float32(0.9), commands)[0]) == pytest.approx(0.75)
     contact = desired_contact(jnp.array([0.25, 0.75]))
     assert contact[0] > 0.99 and contact[1] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("varied", "size"), [(("yaw_rate", "vx", "vy"), 1424), (("vx", "pitch", "gait_frequency", "stance_width"), 1456)]
+)
+def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, ...], size: int) -> None:
+    """From the zeros after a reset until the history is full, and beyond, with all weights random."""
+    params, command = walk_policy.init_params(jax.random.PRNGKey(0)), np.array(SKILL.default_commands("pace"))
+    short: Any = SKILL.restricted(varied, "pace")
+    policies = {SKILL: params, short: short.folded(params)}
+    memories = {policy: policy.init_memory() for policy in policies}
+    assert memories[short].history.shape == (size,)
+    random = np.random.default_rng(0)
+    for _ in range(33):
+        command[SKILL.index(varied)] = random.uniform(-0.5, 0.5, len(varied))
+        sensed = Proprioception(*(jnp.asarray(random.normal(size=n), jnp.float32) for n in (3, 12, 12)))
+        for policy, weights in policies.items():
+            _, memories[policy] = jax.jit(policy.targets)(weights, memories[policy], jnp.asarray(command), sensed)
+        np.testing.assert_allclose(memories[short].action, memories[SKILL].action, atol=1e-6)
+
+
+def test_environments_store_what_actions_can_change() -> None:
+    """All of an observation for NPC robots, to which a task may give any commands."""
+    gate, defender = (make(task, impl="c", num_envs=1) for task in ("go1gate", "go1football-defender"))
+    histories = [jax.eval_shape(env.controller.reset).skill.history.shape for env in (gate, defender)]
+    assert histories == [(2, 1424), (3, 30, 70)]
 
 
 def test_memory_shifts_and_advances() -> None:

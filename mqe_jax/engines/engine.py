@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from mqe_jax import threefry  # noqa: F401  (for programs on a CPU)
 from mqe_jax.robots.motors import Motors
 
 if TYPE_CHECKING:

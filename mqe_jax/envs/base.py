@@ -89,7 +89,9 @@ class QuadrupedEnv(Task[S, P]):
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         skill = skills.make(self.params.skill, self.robot)
-        uses_skill = control == "command" or scene.num_robots > self.num_agents
+        if not (npcs := scene.num_robots > self.num_agents):  # NPC robots may get any commands
+            skill = skill.restricted(self.params.commands, self.params.gait)
+        uses_skill = control == "command" or npcs
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
         self.controller = Controller(
@@ -184,8 +186,7 @@ class QuadrupedEnv(Task[S, P]):
         ctrl = self.actuators.control(jnp.asarray(self.controller.neutral))
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
         robot_state = self.read(data)
-        no = jnp.zeros((), bool)
-        empty = jnp.zeros((0,))
+        no, empty = jnp.zeros((), bool), jnp.zeros((0,))
         state = State(
             data=data,
             obs=empty,

@@ -26,10 +26,12 @@ import jax
 import onnx
 
 import mqe_jax
+from mqe_jax import skills
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.policies import check_policy
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS
+from mqe_jax.skills import Skill
 from mqe_jax.train.policy import TrainedPolicy
 
 SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
@@ -51,7 +53,7 @@ def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
-        skill = env.controller.skill
+        skill, _ = skill_of(env)
         robots |= SENSED | {name: x.shape for name, x in named(skill.name, skill.init_memory()).items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
     return shapes | {name: x.shape for name, x in named("memory", policy.initial_memory()).items()}
@@ -65,12 +67,18 @@ def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]
         return outputs | {"torque": action * env.robot.torque_limit}
     if env.control == "position":
         return outputs | {"joint_target": env.robot.joint_targets(action, env.params.position_scale)}
-    controller, skill = env.controller, env.controller.skill
-    commands = controller.skill_commands(action)
+    skill, params = skill_of(env)
+    commands = env.controller.skill_commands(action)
     sensed = Proprioception(*(inputs[name] for name in SENSED))
-    act = jax.vmap(functools.partial(skill.targets, controller.skill_params))
+    act = jax.vmap(functools.partial(skill.targets, params))
     target, memory = act(filled(skill.name, skill.init_memory(), inputs), commands, sensed)
     return outputs | {"commands": commands, "joint_target": target} | named(f"next_{skill.name}", memory)
+
+
+def skill_of(env: Any) -> tuple[Skill, Any]:
+    """Returns the skill of a task's robots for any commands, with its parameters as they are in the file."""
+    skill = skills.make(env.controller.skill.name, env.robot)
+    return skill, skill.load_params(env.params.skill_weights)
 
 
 def named(prefix: str, memory: Any) -> dict[str, Any]:

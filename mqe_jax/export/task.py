@@ -29,7 +29,7 @@ import jax.numpy as jnp
 
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.errors import InputError
-from mqe_jax.export.policy import SENSED, filled, named
+from mqe_jax.export.policy import SENSED, filled, named, skill_of
 from mqe_jax.export.translate import Function
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.train.policy import Policy
@@ -144,14 +144,14 @@ def state_arrays(state: State) -> dict[str, jax.Array]:
 
 def skill_function(env: Any) -> tuple[Function, Shapes]:
     """Returns the skill of a task's robots as a function of one robot, and the shapes of its inputs."""
-    controller, skill = env.controller, env.controller.skill
+    skill, params = skill_of(env)
     memory = named(skill.name, skill.init_memory())
     shapes = {"command": (len(skill.commands),), **SENSED, **{name: x.shape for name, x in memory.items()}}
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         sensed = Proprioception(*(inputs[name] for name in SENSED))
         state = filled(skill.name, skill.init_memory(), inputs)
-        target, state = skill.targets(controller.skill_params, state, inputs["command"], sensed)
+        target, state = skill.targets(params, state, inputs["command"], sensed)
         return {"joint_target": target} | named(f"next_{skill.name}", state)
 
     return act, shapes

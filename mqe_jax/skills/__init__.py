@@ -9,7 +9,7 @@ import abc
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +72,10 @@ class Skill(abc.ABC):
             raise InputError(f"skill_weights: {str(path)!r} is not allowed; the skill {self.name!r} has no weights")
         return ()
 
+    def restricted(self, varied: Sequence[str], gait: str | None) -> Skill:
+        """Returns the skill for commands of which only the `varied` ones ever differ from the defaults of a gait."""
+        return self
+
     def clock(self, memory: Any) -> jax.Array:
         """Returns the part of the recurrent state that critics observe, any length."""
         return jnp.zeros(0)
@@ -129,7 +133,10 @@ SKILLS: dict[str, type[Skill]] = {}
 """Skills by name."""
 
 
-def register(skill: type[Skill]) -> type[Skill]:
+S = TypeVar("S", bound=Skill)
+
+
+def register(skill: type[S]) -> type[S]:
     """Registers a class under its `name`, for `make(task, skill=name)`, and returns it.
 
     Raises:
