@@ -15,7 +15,6 @@ from mqe_jax.demonstrations import Demonstrated, _earlier, _phases
 from mqe_jax.envs import Moment, State, make
 from mqe_jax.envs.reward import faded
 from mqe_jax.errors import InputError
-from mqe_jax.policies import load_policy
 from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
 from tests.states import terms_of
@@ -216,11 +215,23 @@ def test_weights_of_shaping_terms_count_in_training_only_where_given(task: str) 
 N = 32
 
 
+class Bending:
+    """A demonstrator that bends all joints further in every step of an episode, by its recurrent state."""
+
+    task, agents = "go1plane", 1
+
+    def initial_memory(self, num_envs: int) -> jax.Array:
+        return jnp.ones(num_envs)
+
+    def act(self, obs: jax.Array, memory: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.broadcast_to(0.01 * memory[:, None, None], (*obs.shape[:2], 12)), memory + 1.0
+
+
 @pytest.fixture(scope="module")
 def rollout() -> tuple[Any, dict[str, Any]]:
-    """A batch of short episodes, and its states over two time limits for assistance 0 and 1, leading axis time."""
+    """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading axis time."""
     task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.64)
-    env = Demonstrated(task, N, load_policy("random", task))
+    env = Demonstrated(task, N, Bending())
 
     @jax.jit
     def run(assistance: jax.Array) -> Any:
@@ -235,7 +246,7 @@ def rollout() -> tuple[Any, dict[str, Any]]:
         last, seen = jax.lax.scan(advance, state, None, length=2 * env.max_episode_steps)
         return last.demonstrations, seen
 
-    return env, {name: run(jnp.asarray(level)) for name, level in (("none", 0.0), ("all", 1.0))}
+    return env, {name: run(jnp.asarray(level)) for name, level in (("none", 0.0), ("few", 0.3), ("all", 1.0))}
 
 
 def test_episodes_start_in_demonstrated_states(rollout: Any) -> None:
@@ -254,6 +265,24 @@ def test_without_assistance_episodes_start_as_the_task_does(rollout: Any) -> Non
     """With assistance 0 no episode starts in a recorded state."""
     _, (step, _, done) = rollout[1]["none"]
     assert np.asarray(done).any() and not np.asarray(step)[np.asarray(done)].any()
+
+
+def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> None:
+    """Of 64 starts 30%; 9 to 30 with a probability of 99.9%."""
+    demonstrations, (_, qpos, done) = rollout[1]["few"]
+    moments = {tuple(np.asarray(q)) for q in demonstrations["data"]["qpos"]}
+    starts = [tuple(np.asarray(qpos[t, i])) in moments for t, i in np.argwhere(np.asarray(done))]
+    assert len(starts) >= 2 * N and 0.14 < np.mean(starts) < 0.47
+
+
+def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> None:
+    """All joints are bent by as many hundredths of their range as the episode has had steps."""
+    env, runs = rollout
+    demonstrations = runs["all"][0]
+    step, ctrl = np.asarray(demonstrations["step"]), np.asarray(demonstrations["data"]["ctrl"])
+    assert len(step) == 128 * 16 and len(set(step.tolist())) > 8
+    bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(env.env.robot.action_scale, env.num_agents)
+    np.testing.assert_allclose(bent, 0.01 * np.tile(step[:, None], bent.shape[1]), atol=1e-5)
 
 
 def test_demonstrations_do_not_depend_on_the_key(rollout: Any) -> None:
