@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.league import league, pool
 from mqe_jax.opponents import Mirror, Opponent, exchanged
-from mqe_jax.policies import load_policy
+from mqe_jax.policies import BothTeams, load_policy
 from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics
@@ -242,6 +242,27 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
     np.testing.assert_allclose(any_, [1 / 3, 1 / 3, 1 / 3, 0.0], rtol=1e-5)
 
 
+def test_blocks_draw_the_members_that_their_source_says() -> None:
+    """Of two members one is always beaten, the other never; a block that has not played enough keeps its member."""
+    env: Any = object.__new__(league.League)
+    env.sources, env._moving = ("older", "uniform", "older", "idle"), np.array([True, True, True, False])
+    env._config = SimpleNamespace(league=SimpleNamespace(episodes=5))
+    now = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(born=jnp.array([0, 3, -1]), games=jnp.full(3, 1e6))
+    now, none = now._replace(score=jnp.array([1e6, 0.0, 0.0])), jnp.zeros(4, jnp.int32)
+    opponents = [SimpleNamespace(waiting=jnp.zeros(2, bool))] * 4
+
+    def drawn(key: jax.Array) -> Any:
+        played = jnp.array([5, 6, 4, 9], jnp.int32)
+        state = league.LeagueState(now, none, played, jnp.zeros(()), jnp.int32(0), jnp.zeros((4, 3)), key)
+        after, redrawn = env._redrawn(state, opponents)
+        return after.member, after.played, redrawn
+
+    member, played, redrawn = jax.jit(jax.vmap(drawn))(jax.random.split(KEY, 512))
+    share = np.asarray(member).mean(axis=0)
+    assert share[0] > 0.99 and 0.42 < share[1] < 0.58 and not share[2:].any()
+    assert played.tolist() == [[0, 0, 4, 9]] * 512 and redrawn.tolist() == [[True, True, False, False]] * 512
+
+
 def test_a_second_change_replaces_only_the_opponent_that_is_waited_for() -> None:
     waiting = jnp.array([True, False])
     one = Opponent(jnp.float32(1.0), jnp.float32(0.0), waiting, (), jnp.zeros(3, jnp.int32))
@@ -287,6 +308,8 @@ def test_policies_without_files_act_as_named() -> None:
     assert columns.shape[1] == 24 and columns.min() < -0.99 and columns.max() > 0.99
     assert np.abs(columns.mean(0)).max() < 0.08 and np.abs(columns.std(0) - 3**-0.5).max() < 0.03
     assert np.abs(np.corrcoef(columns.T) - np.eye(24)).max() < 0.13
+    teams = BothTeams(random, random).act(jnp.zeros((2000, 4, 1)), ((), ()), KEY)[0]
+    assert np.abs(np.corrcoef(np.asarray(teams).reshape(2000, -1).T) - np.eye(48)).max() < 0.13
     assert not np.asarray(idle.act(obs, (), KEY)[0]).any()
     ahead = np.asarray(forward.act(obs, (), KEY)[0])
     assert np.all(ahead[..., 0] == 0.25) and not ahead[..., 1:].any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -43,6 +44,12 @@ def test_package_sites_get_a_readme_with_the_repositorys_address() -> None:
     assert all((kind == "raw") == (Path(path).suffix in (".webp", ".png", ".svg")) for kind, path in paths)
     assert all((ROOT / path).exists() for _, path in paths)
     assert not re.search(r"\]\((?!https?:|#)", made) and release.absolute(text, "") == text
+
+
+def test_a_bill_of_materials_names_no_folder() -> None:
+    bill = '{"externalReferences": [{"url": "file:///home/me/dist/mqe_jax-1.2.0-py3-none-any.whl"}, {"url": "https://a/b"}]}'
+    found = [reference["url"] for reference in json.loads(release.without_folders(bill))["externalReferences"]]
+    assert found == ["mqe_jax-1.2.0-py3-none-any.whl", "https://a/b"]
 
 
 def test_the_versions_of_this_tree_agree() -> None:

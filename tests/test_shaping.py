@@ -163,9 +163,11 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
     state = jax.tree.map(lambda x: x[0], states)
     ball, speed = env.objects["ball"].qpos[:2], env.objects["ball"].qvel[0]
 
-    def kicked(state: State, robot: int, change: float, apart: float = 0.4, x: float = 6.0) -> State:
+    def kicked(
+        state: State, robot: int, change: float, apart: float = 0.4, x: float = 6.0, other: float = 3.0
+    ) -> State:
         qpos = state.data.qpos.at[jnp.asarray(ball)].set(jnp.array([x, 0.0]))
-        places = jnp.array([[2.5, 3.0], [2.5, -3.0], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
+        places = jnp.array([[x, other], [x, -other], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
         qpos = qpos.at[jnp.asarray(env.index.base_qpos[:, :2])].set(places)
         after = dataclasses.replace(
             state, data=state.data.replace(qpos=qpos, qvel=state.data.qvel.at[speed].add(change))
@@ -175,6 +177,7 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
 
     first = kicked(state, 0, 0.5)
     assert first.task.touched.tolist() == [True, False]
+    assert kicked(state, 1, 0.5, other=0.5).task.touched.tolist() == [False, True]  # the nearest alone
     for nothing in (kicked(state, 0, 0.05), kicked(state, 0, 0.5, apart=0.8), kicked(state, 2, 0.5)):
         assert not nothing.task.touched.any()
     alone, both = kicked(first, 0, 0.5, x=12.1), kicked(kicked(first, 1, 0.5), 2, 0.0, x=12.1)
@@ -230,7 +233,7 @@ class Bending:
 @pytest.fixture(scope="module")
 def rollout() -> tuple[Any, dict[str, Any]]:
     """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading axis time."""
-    task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.64)
+    task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.64, min_height=0.3)
     env = Demonstrated(task, N, Bending())
 
     @jax.jit
@@ -268,11 +271,11 @@ def test_without_assistance_episodes_start_as_the_task_does(rollout: Any) -> Non
 
 
 def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> None:
-    """Of 64 starts 30%; 9 to 30 with a probability of 99.9%."""
+    """30% of the starts."""
     demonstrations, (_, qpos, done) = rollout[1]["few"]
     moments = {tuple(np.asarray(q)) for q in demonstrations["data"]["qpos"]}
     starts = [tuple(np.asarray(qpos[t, i])) in moments for t, i in np.argwhere(np.asarray(done))]
-    assert len(starts) >= 2 * N and 0.14 < np.mean(starts) < 0.47
+    assert len(starts) >= 4 * N and 0.2 < np.mean(starts) < 0.4
 
 
 def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> None:
