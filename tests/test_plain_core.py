@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 
 from mqe_jax import rotation
 from mqe_jax.control import Controller
-from mqe_jax.envs import make
+from mqe_jax.envs import VectorEnv, make, replay
 from mqe_jax.envs.autoreset import KEPT, autoreset
 from mqe_jax.envs.observation import others
 from mqe_jax.envs.reward import crowding
@@ -321,3 +322,29 @@ def test_a_robot_below_the_opponents_platform_is_not_across() -> None:
     for height, across in ((1.3, True), (1.0, False)):
         state = placed(env, [[7.5, 0.0, height], [6.0, 0.0, 1.3]])
         assert env.across(env.read(state.data)).tolist() == [across, False]
+
+
+def test_time_limits_are_whole_steps() -> None:
+    """0.58 s are 28.99999 steps of 0.02 s in floating point."""
+    lengths = (0.58, 0.57, 0.05)
+    assert [make("go1plane", impl="c", num_envs=1, episode_length=x).max_steps for x in lengths] == [29, 28, 2]
+
+
+def test_a_recording_has_the_steps_of_the_last_episode(tmp_path: Path) -> None:
+    env = made("go1plane")
+    for steps, kept in (([3, 4, 0, 1, 0, 1, 2], 3), ([5, 6, 7], 3), ([0, 1], 2)):
+        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(steps), *x.shape)), initial(env))  # noqa: B023
+        states = dataclasses.replace(states, step=jnp.array(steps))
+        actions = jnp.arange(len(steps) * 24.0).reshape(len(steps), 2, 12)
+        replay.save_recording(tmp_path / "some.npz", env, states, actions[:, : env.num_agents])
+        found = replay.load_recording(tmp_path / "some.npz")
+        np.testing.assert_array_equal(found.states["step"], steps[-kept:])
+        np.testing.assert_array_equal(found.actions, actions[-kept:, : env.num_agents])
+
+
+def test_environments_of_a_batch_start_differently() -> None:
+    env = VectorEnv(made("go1plane"), 64)
+    state = jax.jit(env.reset)(KEY)
+    qpos = np.asarray(state.data.qpos)[:, env.env.index.base_qpos[0, :2]]
+    assert len(np.unique(qpos[:, 0])) == 64 and abs(np.corrcoef(qpos[:-1, 0], qpos[1:, 0])[0, 1]) < 0.45
+    assert len({tuple(key) for key in state.key.tolist()}) == 64

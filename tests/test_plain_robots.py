@@ -15,7 +15,7 @@ from mqe_jax import engines, robots, terrain
 from mqe_jax.engines import c
 from mqe_jax.envs import make
 from mqe_jax.npc import flock
-from mqe_jax.objects import GRAVITY
+from mqe_jax.objects import GRAVITY, Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
 from mqe_jax.robots import motors as motor
 from mqe_jax.robots.build import build_robot
 from mqe_jax.robots.go1 import GO1
@@ -236,3 +236,51 @@ def test_the_flock_is_that_of_a_plain_implementation() -> None:
     np.testing.assert_allclose(law(KEY, 0.0), plain(0.0, np.zeros((5, 2))), atol=1e-4)
     noise = np.asarray(jax.random.normal(KEY, (5, 2)))
     np.testing.assert_allclose(law(KEY, 0.3), plain(0.3, noise), atol=1e-4)
+
+
+def test_objects_have_the_masses_and_inertias_of_their_shapes() -> None:
+    """A full box, a thin shell, an upright cylinder that slides along y with friction, and what stops where."""
+    items = {
+        "box": Box(size=(0.6, 0.8, 1.0), mass=6.0, friction=0.3),
+        "ball": Ball(radius=0.2, mass=0.5, damping=0.2, angular_damping=0.01),
+        "can": Cylinder(x=9.0, mass=2.0, friction=0.5, reach=1.5),
+        "sheep": Sheep(mass=4.0, radius=0.3, height=0.7),
+        "plank": Seesaw(inertia=50.0, limit=0.2, damping=800.0),
+        "door": Door(inertia=1.4, damping=0.7, size=(0.1, 1.6, 0.9)),
+        "block": Platform(center=(20.0, 1.0, 1.2), size=(2.0, 1.0, 0.4)),
+    }
+    scene = compile_scene(Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects=items))
+    model, index = scene.model, scene.objects
+    mass = {name: model.body_mass[index[name].body] for name in ("box", "ball", "can", "sheep")}
+    assert mass == {"box": 6.0, "ball": 0.5, "can": 2.0, "sheep": 4.0}
+    inertia = {name: sorted(model.body_inertia[index[name].body]) for name in items}
+    np.testing.assert_allclose(inertia["box"], 0.5 * np.array([0.6**2 + 0.8**2, 0.6**2 + 1, 0.8**2 + 1]))
+    np.testing.assert_allclose(inertia["ball"], [2 / 3 * 0.5 * 0.04] * 3)
+    np.testing.assert_allclose(inertia["door"], [0.5, 1.0, 1.4])
+    np.testing.assert_allclose(model.dof_damping[index["ball"].qvel], [0.2] * 3 + [0.01] * 3)
+    assert model.dof_damping[index["plank"].qvel[0]] == 800.0 and model.dof_damping[index["door"].qvel[0]] == 0.7
+    assert model.dof_frictionloss[index["can"].qvel[0]] == pytest.approx(0.5 * 2.0 * GRAVITY)
+    for name, limit in (("can", 1.5), ("plank", 0.2)):
+        np.testing.assert_allclose(model.jnt_range[model.body_jntadr[index[name].body]], [-limit, limit])
+    sizes = {name: model.geom_size[index[name].geom] for name in items}
+    np.testing.assert_allclose(sizes["box"], [0.3, 0.4, 0.5])
+    np.testing.assert_allclose(sizes["sheep"][:2], [0.3, 0.2])
+    np.testing.assert_allclose(sizes["block"], [1.0, 0.5, 0.2])
+    np.testing.assert_allclose(model.body_pos[index["block"].body], [20.0, 1.0, 1.0])
+    assert model.geom_friction[index["box"].geom, 0] == 0.3
+    assert all(model.geom_condim[index[name].geom] == 3 for name in items)
+
+
+def test_sheep_follow_the_law_with_the_parameters_of_their_task() -> None:
+    env: Any = make(
+        "go1sheep-hard", impl="c", control="position", num_envs=1, restlessness=0.2, sheep_friction=0.3, flock=(2, 1)
+    )
+    state = initial(env)
+    speed = jax.random.normal(KEY, (2, 2))
+    columns = np.stack([env.objects[f"sheep{number}"].qvel for number in range(2)])
+    data = state.data.replace(qvel=state.data.qvel.at[columns].set(speed))
+    robots_xy = env.read(data).position_w[:, :2]
+    expected = flock(KEY, env.sheep(data), speed, robots_xy, restlessness=0.2, step=0.02, friction=0.3)
+    after = env.step_npcs(data, env.read(data), KEY)
+    np.testing.assert_allclose(after.qvel[columns], expected, rtol=1e-5)
+    assert not np.delete(np.asarray(after.qvel - data.qvel), columns.ravel()).any()
