@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax import demonstrations
 from mqe_jax.league import league, pool, tournament
 from mqe_jax.opponents import OUTCOMES
 from mqe_jax.policies import SimplePolicy
@@ -199,3 +200,25 @@ def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
     for count, expected in ((1, [[4, 4, 4]]), (2, [[2, 2, 2]] * 2), (3, [[4, 0, 0], [0, 4, 0], [0, 0, 4]])):
         matches: Any = Matches()
         assert tournament.play(matches, idle, [idle] * count, KEY).tolist() == expected
+
+
+class Decided(Matches):
+    """Episodes of eight steps; from the sixth on team 0 has won every third match, and team 1 the next ones."""
+
+    def _state(self, step: jax.Array) -> Score:
+        state, late = super()._state(step), step >= 6
+        metrics = {"success": late & (jnp.arange(12) % 3 == 0), "team1/win": late & (jnp.arange(12) % 3 == 1)}
+        metrics = {name: value.astype(jnp.float32) for name, value in metrics.items()}
+        return dataclasses.replace(state, metrics=metrics, terminated=step == 8)
+
+
+def test_phases_of_a_match_lead_to_either_teams_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "EPISODES", 12)
+    monkeypatch.setattr(demonstrations, "MOMENTS", 4)
+    monkeypatch.setattr(demonstrations, "_fields", lambda state: {"step": state.step})
+    batch: Any = object.__new__(demonstrations.Demonstrated)
+    batch._guide, batch.backward, batch.max_episode_steps = Decided(), True, 8
+    batch.demonstrator = SimplePolicy("match", 2, lambda obs, key: jnp.zeros((len(obs), 2, 1)))
+    found = batch._record()
+    np.testing.assert_allclose(found["phase"], [*[2 / 6] * 8, *[4 / 6] * 8, *[np.inf] * 32])
+    assert found["step"][:16].tolist() == [2] * 8 + [4] * 8

@@ -62,6 +62,7 @@ def test_box_and_robots_start_further_by_the_same_distance() -> None:
 def test_a_box_does_not_start_inside_the_gate() -> None:
     with pytest.raises(InputError, match=r"head_start: 1.0 .* at most 0.95"):
         make(BOX, impl="c", head_start=1.0)
+    assert make(BOX, impl="c", num_envs=1, box_x=4.5).params.head_start == 0  # where there is no room for any
 
 
 def test_ball_and_robots_start_nearer_to_the_goal() -> None:
