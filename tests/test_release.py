@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -55,6 +56,12 @@ def test_badges_are_of_the_repositorys_workflows() -> None:
         assert (release.WORKFLOWS / f"{name}.yml").is_file() and f"[![{name}]({page}/badge.svg)]({page})" in made
     assert made.startswith("# mqe_jax\n\n[![") and made.endswith("\n\nTeams")
     assert release.badges(text, "") == release.badges(text, "https://example.org/mqe_jax") == text
+
+
+def test_a_bill_of_materials_names_no_folder() -> None:
+    bill = '{"externalReferences": [{"url": "file:///home/me/dist/mqe_jax-1.2.0-py3-none-any.whl"}, {"url": "https://a/b"}]}'
+    found = [reference["url"] for reference in json.loads(release.without_folders(bill))["externalReferences"]]
+    assert found == ["mqe_jax-1.2.0-py3-none-any.whl", "https://a/b"]
 
 
 def test_the_versions_of_this_tree_agree() -> None:

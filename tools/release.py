@@ -167,6 +167,11 @@ def build(folder: Path) -> Path:
     return wheel
 
 
+def without_folders(bill: str) -> str:
+    """Returns a bill of materials in which files of this machine, such as the wheel, have their name alone."""
+    return re.sub(r'"file:[^"]*/([^"/]+)"', r'"\1"', bill)
+
+
 def try_readme(programs: Path, folder: Path) -> None:
     """Runs the README's programs and commands in a folder, and checks that the package is the installed one."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -199,6 +204,7 @@ def main() -> int:
         programs = new_environment(folder / "venv", f"{wheel}[{EXTRAS}]")
         bill = wheel.with_suffix(".cdx.json")
         run(tools / "cyclonedx-py", "environment", programs / "python", "--output-file", bill)
+        bill.write_text(without_folders(bill.read_text(encoding="utf-8")), encoding="utf-8")
         (folder / "work").mkdir()
         try_readme(programs, folder / "work")
     print(f"release: {wheel.relative_to(ROOT)} and {bill.relative_to(ROOT)}")
