@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
@@ -164,7 +165,8 @@ class Processes:
         if self.count == 1:
             return jax.jit(function)
         given, result = _WHOLE if start else self._specs, (self._specs, _WHOLE) if more else self._specs
-        spread = jax.shard_map(function, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False)
+        inner = _own_empty(function)
+        spread = jax.shard_map(inner, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False)
         compiled = jax.jit(spread)
 
         def call(argument: Any) -> Any:
@@ -214,6 +216,24 @@ class Processes:
         axis = spec.index(AXIS)
         length = x.shape[axis] // self.count
         return jax.lax.slice_in_dim(x, jax.process_index() * length, (jax.process_index() + 1) * length, axis=axis)
+
+
+def _own_empty(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Returns a function that makes the empty arrays of its argument and of what it closes over.
+
+    There are some for whatever a model does not have; in a program of several processes they crash the compiler of
+    jaxlib 0.11.2.
+    """
+
+    def own(x: Any) -> Any:
+        return x if np.size(x) else jnp.zeros(np.shape(x), x.dtype)
+
+    def call(argument: Any) -> Any:
+        closed, result = jax.make_jaxpr(function, return_shape=True)(argument)
+        evaluate = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, list(map(own, closed.consts))))
+        return jax.tree.unflatten(jax.tree.structure(result), evaluate(*map(own, jax.tree.leaves(argument))))
+
+    return call
 
 
 def _whole(x: Any, spec: PartitionSpec) -> bool:

@@ -10,11 +10,8 @@ Parts, in this order if none is named; each gets its share of the time, and rows
     agreement   trajectories of all tasks against those of the C engine
     pairs       one step of every task, robot and control mode, on the engine against the C engine
 
-The results are written after every row to FOLDER/soak.json and FOLDER/soak.md. Exit code 1 if anything was wrong.
-With a GPU, 10^7 random steps of every task take 15 minutes: 14 s each at 700,000 steps/s, and a minute to compile.
-
-    JAX_PLATFORMS=cuda,cpu python -m tests.soak play --engine warp --steps 10000000 --num-envs 4096 \\
-        --robot go1 --mode random-command --minutes 30
+The results are written after every row to FOLDER/soak.json and FOLDER/soak.md, and the same command continues from
+them. Exit code 1 if anything was wrong. docs/results/soak.md has the command for 10^7 steps of every task on a GPU.
 """
 
 from __future__ import annotations
@@ -29,7 +26,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from mqe_jax.envs import TASKS
+from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.robots import ROBOTS
 from tests.engines import agreement, pairs
@@ -74,13 +74,17 @@ class Report:
     """Folder of soak.json, soak.md and what the parts keep."""
 
     def __init__(self, folder: Path, options: Options, minutes: float) -> None:
-        """Reads earlier results of the folder; the time, min, counts from now."""
+        """Reads earlier results of the folder, InputError for another engine's; the time, min, counts from now."""
         self.folder, self.options = folder, options
         self._path = folder / "soak.json"
         self._end = self._share = time.monotonic() + 60.0 * minutes
         self.parts: dict[str, dict[str, dict[str, Any]]] = {}
         if self._path.is_file():
-            self.parts = json.loads(self._path.read_text(encoding="utf-8"))["parts"]
+            earlier = json.loads(self._path.read_text(encoding="utf-8"))
+            if earlier["about"]["engine"] != options.engine:
+                engine = earlier["about"]["engine"]
+                raise InputError(f"{self._path}: has rows of the engine {engine}; name another --folder")
+            self.parts = earlier["parts"]
 
     def begin(self, parts_left: int) -> None:
         """Gives the next part its share of the time that is left."""
@@ -91,11 +95,12 @@ class Report:
         """Returns the time that is left to the part."""
         return self._share - time.monotonic()
 
-    def pending(self, part: str, names: Sequence[str]) -> Iterator[str]:
-        """Yields the names without a row, or with one whose time was over, while there is time."""
+    def pending(self, part: str, names: Sequence[str], steps: int = 0) -> Iterator[str]:
+        """Yields the names without a row, with one whose time was over or of fewer `steps`, while there is time."""
         for name in names:
             row = self.parts.get(part, {}).get(name)
-            if (row is None or row.get("partial")) and self.seconds_left() > 0.0:
+            short = row is None or row.get("partial") or row.get("steps", steps) < steps
+            if short and self.seconds_left() > 0.0:
                 yield name
 
     def add(self, part: str, name: str, row: dict[str, Any], wrong: Sequence[str] = ()) -> None:
@@ -103,7 +108,8 @@ class Report:
         rows = self.parts.setdefault(part, {})
         rows[name] = {**row, "wrong": list(wrong)}
         print(f"{part} {name}: {json.dumps(row)}", *[f"  WRONG: {text}" for text in wrong], sep="\n", flush=True)
-        about = {"machine": f"{platform.machine()}, {platform.processor() or platform.system()}", **vars(self.options)}
+        machine = f"{platform.machine()}, {platform.processor() or platform.system()}"
+        about = {"machine": machine, "python": platform.python_version(), "jax": jax.__version__, **vars(self.options)}
         content = {"about": about, "parts": self.parts}
         self.folder.mkdir(parents=True, exist_ok=True)
         write_atomically(self._path, (json.dumps(content, indent=1) + "\n").encode())
@@ -162,7 +168,11 @@ def main() -> int:
     hours, minutes, folder = given.pop("hours"), given.pop("minutes"), given.pop("folder")
     parts = given.pop("parts") or list(PARTS)
     given |= {name: tuple(given[name]) for name in ("tasks", "robots", "modes", "kinds")}
-    report = Report(folder, Options(**given), 60.0 * hours if minutes is None else minutes)
+    try:
+        report = Report(folder, Options(**given), 60.0 * hours if minutes is None else minutes)
+    except InputError as error:
+        print(f"soak: {error}", file=sys.stderr)
+        return 2
     for number, part in enumerate(parts):
         report.begin(len(parts) - number)
         PARTS[part](report)

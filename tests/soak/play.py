@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import robots
+from mqe_jax.cli.bench import device_name
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.planners import scripted_policy
@@ -44,10 +45,10 @@ def play(report: Report) -> None:
         for task in options.tasks or TASKS
         if mode != "scripted-command" or task in PLANNERS
     }
-    count = len(list(report.pending("play", list(rows))))
+    count = len(list(report.pending("play", list(rows), options.steps)))
     seconds = count * (options.steps / RATES[options.engine] + COMPILING)
     print(f"play: {count} rows of {options.steps} steps, about {seconds / 60:.0f} min", flush=True)
-    for name in report.pending("play", list(rows)):
+    for name in report.pending("play", list(rows), options.steps):
         task, robot, mode, control = rows[name]
         row = played(task, robot, mode, control, report)
         counted = ("diverged", "outside", "overflow", "not_finite")
@@ -83,7 +84,7 @@ def played(task: str, robot: str, mode: str, control: str, report: Report) -> di
         for name, value in counts.items():
             totals[name] = totals.get(name, 0) + int(np.sum(np.asarray(value)))
         steps += BLOCK * options.num_envs
-    row = {"steps": steps, **totals, "seconds": round(time.perf_counter() - began)}
+    row = {"steps": steps, **totals, "seconds": round(time.perf_counter() - began), "device": device_name()}
     return row if steps >= options.steps else {**row, "partial": True}
 
 
