@@ -1,7 +1,8 @@
 """Renders the clips of the documentation: typical episodes of the shipped policies.
 
-`python tools/clips.py [TASK ...]` writes docs/clips/TASK.webp of each task; without tasks of all, and docs/teams.webp,
-in which they play side by side. Each shows how the median successful one of 48 episodes succeeds.
+`python tools/clips.py [TASK ...]` writes docs/clips/TASK.webp of each task (without tasks, of all), and docs/teams.webp
+from the clips of all tasks, side by side. Each shows how the median successful one of 48 episodes succeeds, in matches
+against the scripted policy.
 """
 
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from mqe_jax import make
 from mqe_jax.envs import TASKS
@@ -26,29 +27,37 @@ EPISODES, SECONDS, AFTER, FPS = 48, 4.4, 1.2, 10.0  # AFTER: duration shown afte
 SIZE, TILE, COLUMNS = (640, 360), (240, 135), 4
 
 
-def write(task: str) -> list[np.ndarray]:
-    """Writes a task's clip, from a fixed camera, and returns its frames as tiles with a title."""
+def write(task: str) -> None:
+    """Writes a task's clip, from a fixed camera."""
     env = make(task, impl="c", num_envs=EPISODES)
-    own = load_policy(task, env)
-    policy = all_agents(env, own, own if len(env.teams) > 1 else None)
+    policy = all_agents(env, load_policy(task, env), load_policy("scripted", env) if len(env.teams) > 1 else None)
     memory = policy.initial_memory(EPISODES)
     episode = typical(record(env, policy.act, memory, jax.random.PRNGKey(0), episodes=EPISODES))
-    end = min(round((episode.settled + AFTER) / episode.dt), len(episode))
+    end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
     shown = episode.cut(slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt))))
     views = cameras(rendering_model(env.mj_model, shown), shown, "near", SIZE[0] / SIZE[1])
-    frames = list(render_frames(env, shown, views, SIZE))
-    write_clip(DOCS / "clips" / f"{task}.webp", map(legend(env, SIZE), frames), FPS)
-    tiles, font = [Image.fromarray(frame).resize(TILE) for frame in frames], ImageFont.load_default(11)
-    for tile in tiles:
-        ImageDraw.Draw(tile).rectangle((0, 0, font.getlength(env.title) + 9, 16), fill=(28, 32, 40))
-        ImageDraw.Draw(tile).text((5, 8), env.title, fill=(246, 246, 242), font=font, anchor="lm")
-    return [np.asarray(tile) for tile in tiles]
+    write_clip(DOCS / "clips" / f"{task}.webp", map(legend(env, SIZE), render_frames(env, shown, views, SIZE)), FPS)
+
+
+def tiles(task: str) -> list[np.ndarray]:
+    """Returns the frames of a task's clip as tiles, with its title in place of the legend."""
+    title, font = TASKS[task].title, ImageFont.load_default(11)
+    found = []
+    with Image.open(DOCS / "clips" / f"{task}.webp") as clip:
+        for frame in ImageSequence.Iterator(clip):
+            tile = frame.convert("RGB").resize(TILE, Image.Resampling.LANCZOS)
+            ImageDraw.Draw(tile).rectangle((0, TILE[1] - 17, font.getlength(title) + 9, TILE[1]), fill=(28, 32, 40))
+            ImageDraw.Draw(tile).text((5, TILE[1] - 9), title, fill=(246, 246, 242), font=font, anchor="lm")
+            found.append(np.asarray(tile))
+    return found
 
 
 if __name__ == "__main__":
-    TILES = [write(task) for task in sys.argv[1:] or [task for task in TASKS if task != "go1plane"]]
-    if not sys.argv[1:]:  # a tile that ends early keeps its last frame
-        length = max(map(len, TILES))
-        still = np.array([tile + tile[-1:] * (length - len(tile)) for tile in TILES])  # (12, T, height, width, 3)
-        rows = [np.concatenate(list(still[i : i + COLUMNS]), axis=2) for i in range(0, len(still), COLUMNS)]
-        write_clip(DOCS / "teams.webp", iter(np.concatenate(rows, axis=1)), FPS)
+    SHOWN = [task for task in TASKS if task != "go1plane"]
+    for name in sys.argv[1:] or SHOWN:
+        write(name)
+    TILES = list(map(tiles, SHOWN[: len(SHOWN) // COLUMNS * COLUMNS]))
+    length = max(map(len, TILES))  # a tile that ends early keeps its last frame
+    still = np.array([tile + tile[-1:] * (length - len(tile)) for tile in TILES])  # (tasks, T, height, width, 3)
+    rows = [np.concatenate(list(still[i : i + COLUMNS]), axis=2) for i in range(0, len(still), COLUMNS)]
+    write_clip(DOCS / "teams.webp", iter(np.concatenate(rows, axis=1)), FPS)

@@ -122,7 +122,7 @@ def pages() -> dict[str, str]:
 def front(readme: str) -> str:
     """Returns the README as the site's first page: its links as from docs/, tasks linked to their pages."""
     page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
-    return re.sub(r"^\| `(go1[\w-]+)` \|", r"| [`\1`](tasks/\1.md) |", page, flags=re.MULTILINE)
+    return re.sub(r"^(\| .*) `(go1[\w-]+)`:", r"\1 [`\2`](tasks/\2.md):", page, flags=re.MULTILINE)
 
 
 def overview(tasks: Mapping[str, Any]) -> str:
@@ -147,8 +147,8 @@ def task_page(task: Any) -> str:
     bodies = (inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__)
     body = next(filter(None, bodies))  # that of a base class where the task's is one line
     policy = "shipped" if name in zoo.names() else "scripted"
-    command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
-    against = " against itself" if len(env.teams) > 1 else ""
+    command = f"mqe render {name}" + (" --opponent scripted" if len(env.teams) > 1 else "")
+    against = " against the scripted one" if len(env.teams) > 1 else ""
     clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{_seen(task)}]({_clip(name)})"
     watch = f"`mqe view {name}` shows the {policy} policy live ([how good](../results/strength.md) it is)."
     training = f"`mqe train {name}` trains one: [settings, and what to expect](../results/settings.md)."
@@ -174,7 +174,10 @@ def task_page(task: Any) -> str:
 
 
 def _seen(task: Any) -> str:
-    return f"{task.title}: {inspect.cleandoc(task.__doc__ or '').splitlines()[0]}"
+    """Returns the alternative text of a task's clip, that of the page about the policies' strength."""
+    text = (ROOT / "docs" / "results" / "strength.md").read_text(encoding="utf-8")
+    found = re.search(rf"!\[([^\]]+)\]\(\.\./clips/{task.name}\.webp\)", text)
+    return f"{task.title}: {found[1]}" if found else task.title
 
 
 def _clip(name: str) -> str | None:
