@@ -46,8 +46,8 @@ test: $(STAMP) ## Run the tests
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
 
 docs: $(STAMP) npm ## Build the documentation site into build/site
+	JAX_PLATFORMS=cpu $(BIN)/mqe play-site -o build/play || echo "docs: the page for playing was not built"
 	NO_MKDOCS_2_WARNING=1 JAX_PLATFORMS=cpu $(BIN)/mkdocs build --strict --quiet
-	JAX_PLATFORMS=cpu $(BIN)/mqe play-site -o build/site/play || echo "docs: the site has no page play/"
 	@echo "docs: open build/site/index.html"
 
 soak: $(STAMP) ## Run the heavy tests too (about an hour)

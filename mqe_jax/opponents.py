@@ -11,8 +11,9 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.envs.state import EnvironmentState
+from mqe_jax.envs.wrappers import Wrapper
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Number
 from mqe_jax.policies import load_opponent, team_size
@@ -50,7 +51,7 @@ class TeamState(EnvironmentState):
     Every (M / N)th of `step` and `assistance` is that of a match; `key` is that of the opponents' actions.
     """
 
-    match: State
+    match: EnvironmentState
     """State of the matches, leading axis N."""
     action: jax.Array
     """Actions of all agents in the last step (N, A, D)."""
@@ -63,8 +64,8 @@ class OneTeam:
 
     env: QuadrupedEnv
     """The task."""
-    matches: VectorEnv
-    """The matches."""
+    matches: Any
+    """The matches, a `VectorEnv` or a `Wrapper`."""
     num_envs: int
     """Number of environments M."""
     num_agents: int
@@ -74,7 +75,7 @@ class OneTeam:
     max_episode_steps: int
     """Environment steps until the time limit."""
 
-    def __init__(self, matches: VectorEnv, num_envs: int) -> None:
+    def __init__(self, matches: VectorEnv | Wrapper, num_envs: int) -> None:
         if len(check("env", matches, AnyBatch).teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
         self.env, self.matches, self.name, self.num_envs = matches.env, matches, matches.name, num_envs
@@ -92,7 +93,7 @@ class OneTeam:
         other.matches = self.matches.share(parts)
         return other
 
-    def _stepped(self, state: TeamState, action: jax.Array) -> State:
+    def _stepped(self, state: TeamState, action: jax.Array) -> EnvironmentState:
         """Advances the matches by a step with the actions of all agents (N, A, D)."""
         every = self.num_envs // self.matches.num_envs
         match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
@@ -113,12 +114,9 @@ class Versus(OneTeam):
     opponents: tuple[Policy, ...]
     """Opponent of each block at the start."""
 
-    def __init__(
-        self, matches: VectorEnv, opponents: Sequence[Policy], draw_reward: float = 0.0, time_limit_ends: bool = False
-    ) -> None:
+    def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
         super().__init__(matches, matches.num_envs)
-        self.draw_reward, self.time_limit_ends = draw_reward, time_limit_ends
-        self.privileged_observation_size += time_limit_ends
+        self.draw_reward = draw_reward
         for policy in opponents:
             if (policy.agents, policy.task) != (self.num_agents, self.name):
                 given = f"a policy of {policy.agents} agents on {policy.task}"
@@ -145,7 +143,7 @@ class Versus(OneTeam):
             waiting, memory = jnp.zeros((self._size,), bool), policy.initial_memory(self._size)
             opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
         action = jnp.zeros((self.num_envs, self.matches.num_agents, self.action_size))
-        return self._seen(match, action, tuple(opponents), key, match.step)
+        return self._seen(match, action, tuple(opponents), key)
 
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
@@ -164,7 +162,7 @@ class Versus(OneTeam):
         ended = jnp.stack([done & (match.metrics[f"team0/{name}"] > 0) for name in OUTCOMES], axis=-1)
         match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2])
         started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
-        return self._seen(match, both, started, key, state.step + 1)
+        return self._seen(match, both, started, key)
 
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
         """Returns the state with another opponent in a block.
@@ -207,26 +205,20 @@ class Versus(OneTeam):
         return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
 
     def _seen(
-        self, match: State, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array, reached: jax.Array
+        self, match: EnvironmentState, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array
     ) -> TeamState:
-        """Returns the state of team 0; `reached` (N,) are the steps of the episodes at the end of the last step."""
+        """Returns the state of team 0."""
         own = slice(0, self.num_agents)
-        ends = match.truncated & self.time_limit_ends
-
-        def timed(privileged: jax.Array, step: jax.Array) -> jax.Array:
-            left = 1.0 - step[:, None] / self.max_episode_steps
-            return jnp.concatenate([privileged, left], axis=1) if self.time_limit_ends else privileged
-
         return TeamState(
             match=match,
             action=action,
             obs=match.obs[:, own],
-            privileged_obs=timed(match.privileged_obs, match.step),
+            privileged_obs=match.privileged_obs,
             final_obs=match.final_obs[:, own],
-            final_privileged_obs=timed(match.final_privileged_obs, reached),
+            final_privileged_obs=match.final_privileged_obs,
             reward=match.reward[:, own],
-            terminated=match.terminated | ends,
-            truncated=match.truncated & ~ends,
+            terminated=match.terminated,
+            truncated=match.truncated,
             metrics={name: value for name, value in match.metrics.items() if not name.startswith("team1/")},
             step=match.step,
             assistance=match.assistance,
@@ -236,9 +228,7 @@ class Versus(OneTeam):
 
 
 @checked(env=AnyBatch, draw_reward=Number)
-def versus(
-    env: VectorEnv, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0, time_limit_ends: bool = False
-) -> Versus:
+def versus(env: VectorEnv | Wrapper, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
     The environments meet the opponents in turn, equally many each. Trained policies act as they are loaded (sampled,
@@ -248,7 +238,6 @@ def versus(
         env: the matches.
         opponents: policies, or what `load_policy` accepts; their number divides the number of environments.
         draw_reward: added to the reward of a step that ends an episode with a draw.
-        time_limit_ends: as in `TrainConfig`.
 
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
@@ -259,7 +248,7 @@ def versus(
         if not isinstance(policy, str | Path) and not hasattr(policy, "initial_memory"):
             fail("opponents", policy, "a policy, or what load_policy accepts")
     policies = [load_opponent(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
-    return Versus(env, policies, draw_reward, time_limit_ends)
+    return Versus(env, policies, draw_reward)
 
 
 class Mirror(OneTeam):
@@ -284,7 +273,7 @@ class Mirror(OneTeam):
         both = action.reshape(self.matches.num_envs, 2 * self.num_agents, self.action_size)
         return self._seen(self._stepped(state, both), both)
 
-    def _seen(self, match: State, action: jax.Array) -> TeamState:
+    def _seen(self, match: EnvironmentState, action: jax.Array) -> TeamState:
         def teams(x: jax.Array) -> jax.Array:
             return x.reshape(self.num_envs, self.num_agents, *x.shape[2:])
 

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -29,7 +30,7 @@ from mqe_jax.train.networks import NETWORKS
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # Blocks that are not run, by page and first line, with the reason.
@@ -91,8 +92,34 @@ def test_a_wrong_command_would_be_found() -> None:
             parse(wrong)
 
 
+def test_pages_are_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 700
+    for page in (ROOT / "docs").rglob("*.md"):
+        assert len(page.read_text(encoding="utf-8").splitlines()) <= 150, page
+
+
+def faults(site: Path) -> set[tuple[str, str]]:
+    """Links and pictures of a built site that lead nowhere, and pictures without an alternative text, by page."""
+    texts = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    anchors = {path: set(re.findall(r'\b(?:id|name)="?([^"\s>]+)', text)) for path, text in texts.items()}
+    found = set()
+    for page in set(texts) - {site / "404.html"} - set((site / "play").rglob("*.html")):
+        for target in re.findall(r'\s(?:href|src)="?([^"\s>]+)', re.sub(r"(?s)<(pre|code).*?</\1>", "", texts[page])):
+            path, _, anchor = target.partition("#")
+            file = (page.parent / path).resolve() if path else page
+            if re.match(r"[a-z]+:", target) or (file.exists() and (not anchor or anchor in anchors[file])):
+                continue
+            found.add((page.name, target))
+        pictures = re.findall(r"<img[^>]*>", texts[page])
+        found |= {(page.name, picture) for picture in pictures if not re.search(r'\balt="[^"]+"', picture)}
+    return found
+
+
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
-    """Every task has a page with its clip, observation and rewards; formulas and links need no other host."""
+    """Every task has a page with its clip, observation and rewards; formulas and links need no other host.
+
+    All links lead somewhere and all pictures have an alternative text, with and without the page of `mqe play-site`.
+    """
     pytest.importorskip("mkdocs")
     pytest.importorskip("mkdocstrings")
     built = subprocess.run(
@@ -104,7 +131,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
         timeout=300,
     )
     assert built.returncode == 0, built.stderr[-3000:]
-    assert "WARNING" not in built.stderr
+    assert "WARNING" not in built.stderr and not faults(tmp_path)
     first = (tmp_path / "index.html").read_text(encoding="utf-8")
     overview = (tmp_path / "tasks" / "index.html").read_text(encoding="utf-8")
     for name in TASKS:
@@ -120,6 +147,40 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert "<math" in (tmp_path / "algorithms.html").read_text(encoding="utf-8")
     for page, name in (("state", "final_obs"), ("base", "QuadrupedEnv.step")):
         assert name in (tmp_path / "reference" / f"envs.{page}.html").read_text(encoding="utf-8")
+
+
+def test_the_site_has_the_page_for_playing_where_it_is_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mkdocs")
+    import docs_pages
+    from mkdocs.config import load_config
+    from mkdocs.structure.files import Files
+
+    config = load_config(str(ROOT / "mkdocs.yml"))
+    monkeypatch.setattr(config.plugins, "_current_plugin", "hooks", raising=False)  # as mkdocs does
+    monkeypatch.setattr(docs_pages, "pages", dict)
+    monkeypatch.setattr(docs_pages, "PLAY", tmp_path)
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "starts.bin").touch()
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="play.md"))
+    text = docs_pages.on_page_markdown("# Play\n\nA page", page, config, None)
+    assert "play/index.html" not in text and "`make docs`" in text  # site.json, written last, is not there
+    assert not [file for file in docs_pages.on_files(Files([]), config) if file.src_uri.startswith("play/")]
+    (tmp_path / "site.json").touch()
+    assert "(play/index.html)" in docs_pages.on_page_markdown("# Play\n\nA page", page, config, None)
+    added = {file.src_uri for file in docs_pages.on_files(Files([]), config)}
+    assert {"play/site.json", "play/tasks/starts.bin"} <= added
+
+
+def test_the_address_is_filled_in_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The link in the header, the badges of the first page and the links to files come from one value."""
+    pytest.importorskip("mkdocs")
+    import docs_pages
+
+    here = "https://github.com/someone/mqe_jax"
+    for address in (here, ""):
+        monkeypatch.setattr(docs_pages, "repository", lambda address=address: address)
+        assert docs_pages.on_config({}) == ({"repo_url": here, "repo_name": "someone/mqe_jax"} if address else {})
+        assert (f"({here}/actions/" in docs_pages.pages()["index.md"]) == bool(address)
 
 
 def test_tables_of_tasks_match_the_docstrings() -> None:
@@ -148,7 +209,8 @@ def test_links_out_of_the_docs_become_paths_and_formulas_mathml() -> None:
     assert docs_pages.links("[a](../b.md)", here, "results") == "[a](../b.md)"
     assert docs_pages.links("[a](../../b.py)", here, "results") == f"[a]({here}/blob/main/b.py)"
     colab = "https://colab.research.google.com/github/someone/mqe_jax/blob/main/n.ipynb"
-    assert docs_pages.links("[a](../n.ipynb)", here).endswith(f"([open in Colab]({colab}))")
+    kaggle = f"https://kaggle.com/kernels/welcome?src={here}/blob/main/n.ipynb"
+    assert docs_pages.links("[a](../n.ipynb)", here).endswith(f" (open in [Colab]({colab}), [Kaggle]({kaggle}))")
     assert docs_pages.formulas("`$HOME` and $x^2$").startswith("`$HOME` and <math")
 
 
@@ -223,7 +285,8 @@ def run(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dic
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     resources = {"metadata": {"path": str(tmp_path)}}
     client = nbclient.NotebookClient(notebook, timeout=900, kernel_name="python3", resources=resources)
-    return [output.get("data", {}) for cell in client.execute().cells for output in cell.get("outputs", [])]
+    outputs = [output for cell in client.execute().cells for output in cell.get("outputs", [])]
+    return [output.get("data", {"text/plain": output.get("text", "")}) for output in outputs]
 
 
 def run_here(path: Path) -> list[dict[str, Any]]:
@@ -255,7 +318,7 @@ def check(outputs: list[dict[str, Any]], name: str) -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_are_committed_with_the_outputs_of_one_run(path: Path) -> None:
-    """`jupyter execute --inplace FILE` stores them."""
+    """`jupyter execute --inplace FILE` stores them; clips are then encoded smaller, by `ffmpeg -crf 36`."""
     notebook = pytest.importorskip("nbformat").read(path, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
@@ -279,5 +342,9 @@ def test_notebooks_run_at_small_size(path: Path, tmp_path: Path, monkeypatch: py
 def test_notebooks_run_whole_in_under_five_minutes(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MQE_NOTEBOOK_SMALL", raising=False)
     start = time.monotonic()
-    check(run(path, tmp_path, monkeypatch), path.stem)
+    outputs = run(path, tmp_path, monkeypatch)
+    check(outputs, path.stem)
     assert time.monotonic() - start < 300
+    if path.stem == "tour":  # the team that it trains has learned
+        (wins,) = re.findall(r"against idle: win_rate (\d+)%", "".join(str(data.get("text/plain")) for data in outputs))
+        assert int(wins) >= 80

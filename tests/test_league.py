@@ -19,6 +19,7 @@ import pytest
 from mqe_jax import cli
 from mqe_jax.cli.setup import base_config
 from mqe_jax.envs import make
+from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError
 from mqe_jax.league import pool, tournament
 from mqe_jax.league.league import League
@@ -191,9 +192,11 @@ def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
     assert [opponent.outcomes.tolist() for opponent in state.opponents] == [[0, 2, 0], [0, 4, 0]]
 
 
-def test_the_time_limit_may_end_episodes_for_the_learner() -> None:
-    env = versus(matches(), ["idle"], time_limit_ends=True)
-    step, still = jax.jit(env.step), jnp.zeros((4, 1, 12))
+@pytest.mark.parametrize("task", ["go1revolvingdoor", "go1gate"])
+def test_the_time_limit_may_end_episodes_for_the_learner(task: str) -> None:
+    inner = matches(task)
+    env = Deadline(inner) if task == "go1gate" else versus(Deadline(inner), ["idle"])
+    step, still = jax.jit(env.step), jnp.zeros((4, env.num_agents, 12))
     state = jax.jit(env.reset)(KEY)
     assert state.privileged_obs.shape[1] == env.privileged_observation_size
     for i in range(10):

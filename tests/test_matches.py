@@ -330,5 +330,6 @@ def test_robots_start_as_listed(task: str, colors: tuple[int, int]) -> None:
     }[task]
     spread = [1.0, 0, 0, 0] if task == "go1tug" else [0.1, 0.1, 0, 0]
     assert np.all(np.abs(spawn - mean) <= np.array(spread) + 1e-5)
-    assert np.abs(spawn - mean)[..., 0].max() > 0.8 * spread[0]
+    for side in (spawn - mean, mean - spawn):
+        assert np.all(side[..., 0].max(axis=0) > 0.8 * spread[0])
     assert env.compiled.scene.colors == colors

@@ -17,6 +17,7 @@ import yaml
 from mqe_jax import cli
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.errors import InputError
+from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, Versus, versus
 from mqe_jax.policies import BothTeams, all_agents, load_policy
 from mqe_jax.settings import build
@@ -189,6 +190,35 @@ def test_a_mirrored_match_shows_both_teams() -> None:
     state = jax.jit(env.step)(state, action)
     np.testing.assert_array_equal(state.action, jnp.stack([action[::2, 0], action[1::2, 0]], axis=1))
     np.testing.assert_allclose(state.reward[::2], -state.reward[1::2], atol=1e-6)
+
+
+def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half(door: VectorEnv) -> None:
+    """The policy moves as it would as team 1; results and rewards are its own."""
+    env, action = BothSides(door), jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)
+    exchanged = action.at[2:].set(action[2:, ::-1])
+    plain, state = door.reset(KEY), env.reset(KEY)
+    step, plain_step = jax.jit(env.step), jax.jit(door.step)
+    for _ in range(6):
+        plain, state = plain_step(plain, exchanged), step(state, action)
+        for name in ("obs", "final_obs", "reward"):
+            own, theirs = getattr(state, name), getattr(plain, name)
+            np.testing.assert_array_equal(own[:2], theirs[:2])
+            np.testing.assert_array_equal(own[2:], theirs[2:, ::-1])
+        np.testing.assert_array_equal(state.action, exchanged)
+        np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 0, 1, 1])
+        np.testing.assert_array_equal(state.privileged_obs[:, :-1], plain.privileged_obs)
+        np.testing.assert_allclose(state.metrics["average_step_reward"], state.reward[:, 0], atol=1e-7)
+        np.testing.assert_array_equal(state.metrics["team0/win"][2:], plain.metrics["team1/win"][2:])
+        np.testing.assert_array_equal(state.metrics["team1/win"][2:], plain.metrics["team0/win"][2:])
+        np.testing.assert_array_equal(state.metrics["success"], state.metrics["team0/win"])
+
+
+def test_a_team_wins_from_both_sides() -> None:
+    inner = matches("go1revolvingdoor", 4, control="command", episode_length=3.0, line_x=1.2)
+    env = versus(BothSides(inner), ["idle"])
+    result = evaluate(env, load_policy("forward", inner.env).act, 4, KEY)
+    assert (result.success_rate, result.match["win_rate"]) == (1.0, 1.0)
+    assert result.episode_return > 0.0 and result.average_step_reward > 0.0
 
 
 @pytest.mark.soak

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -42,7 +43,25 @@ def test_package_sites_get_a_readme_with_the_repositorys_address() -> None:
     assert {"docs/teams.webp", "docs/faq.md"} <= {path for _, path in paths}
     assert all((kind == "raw") == (Path(path).suffix in (".webp", ".png", ".svg")) for kind, path in paths)
     assert all((ROOT / path).exists() for _, path in paths)
-    assert not re.search(r"\]\((?!https?:|#)", made) and release.absolute(text, "") == text
+    assert not re.search(r"\]\((?!https?:|#)", made)
+    for readme in (made, release.absolute(text, "")):
+        assert 'pip install "mqe-jax[render]" ' in readme and '".[' not in readme and "repository, with" not in readme
+
+
+def test_badges_are_of_the_repositorys_workflows() -> None:
+    text, there = "# mqe_jax\n\nTeams", "https://github.com/someone/mqe_jax"
+    made = release.badges(text, there)
+    for name in ("tests", "release"):
+        page = f"{there}/actions/workflows/{name}.yml"
+        assert (release.WORKFLOWS / f"{name}.yml").is_file() and f"[![{name}]({page}/badge.svg)]({page})" in made
+    assert made.startswith("# mqe_jax\n\n[![") and made.endswith("\n\nTeams")
+    assert release.badges(text, "") == release.badges(text, "https://example.org/mqe_jax") == text
+
+
+def test_a_bill_of_materials_names_no_folder() -> None:
+    bill = '{"externalReferences": [{"url": "file:///home/me/dist/mqe_jax-1.2.0-py3-none-any.whl"}, {"url": "https://a/b"}]}'
+    found = [reference["url"] for reference in json.loads(release.without_folders(bill))["externalReferences"]]
+    assert found == ["mqe_jax-1.2.0-py3-none-any.whl", "https://a/b"]
 
 
 def test_the_versions_of_this_tree_agree() -> None:

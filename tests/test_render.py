@@ -22,7 +22,7 @@ from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.viz import cameras, clips, framing, geometry, recording, render
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.recording import Episode, record
-from tests.states import made, placed
+from tests.states import initial, made, placed
 
 
 @pytest.fixture(scope="module")
@@ -274,10 +274,10 @@ def longest(flags: np.ndarray) -> int:
     return max((len(run) for column in columns for run in column.split()), default=0)
 
 
-def check(env: Any, episode: Episode) -> None:
-    """Checks that a following camera shows all targets and the goal, unhidden, and moves smoothly."""
+def check(env: Any, episode: Episode, view: str = "follow") -> None:
+    """Checks that the cameras of a view show all targets and the goal, unhidden, and move smoothly."""
     model = geometry.rendering_model(env.mj_model, episode)
-    views = cameras.cameras(model, episode, "follow", ASPECT)
+    views = cameras.cameras(model, episode, view, ASPECT)
     assert in_frame(model, episode, views).all(axis=1).mean() >= 0.95
     assert longest(framing.hidden(model, episode, views) == 1.0) * episode.dt <= 1.0
     eyes = np.array([view.position for view in views])
@@ -314,6 +314,16 @@ def test_the_meadows_camera_shows_nine_sheep() -> None:
     check(made("go1sheep-hard"), walking("go1sheep-hard", dogs, flock, frames=11))
 
 
+@pytest.mark.parametrize("task", TWELVE)
+def test_the_cameras_of_every_task_show_all_from_the_start(task: str) -> None:
+    """Robots walk one metre ahead, to the first team's goal."""
+    env = made(task)
+    start = np.asarray(initial(env).data.qpos)[np.asarray(env.index.base_qpos)][:, :3]
+    episode = walking(task, lambda t: start + t * np.array([1.0, 0.0, 0.0]), frames=6)
+    for view in ("follow", "near"):
+        check(env, episode, view)
+
+
 def test_a_robot_behind_a_wall_is_hidden_and_one_beside_another_is_not() -> None:
     env = made("go1gate")
     episode = walking("go1gate", lambda t: [[3.9, 1.2, 0.3], [1.0, 1.2, 0.3]], frames=2)
@@ -345,4 +355,5 @@ def test_the_camera_of_every_task_shows_an_episode_of_its_policy(task: str) -> N
     own = load_policy(task, env)
     policy = all_agents(env, own, own if len(env.teams) > 1 else None)
     for episode in record(env, policy.act, policy.initial_memory(4), jax.random.PRNGKey(1), episodes=4):
-        check(env, episode.cut(slice(None, None, 4)))
+        for view in ("follow", "near"):
+            check(env, episode.cut(slice(None, None, 4)), view)

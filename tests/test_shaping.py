@@ -15,7 +15,6 @@ from mqe_jax.demonstrations import Demonstrated, _earlier, _phases
 from mqe_jax.envs import Moment, State, make
 from mqe_jax.envs.reward import faded
 from mqe_jax.errors import InputError
-from mqe_jax.policies import load_policy
 from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
 from tests.states import terms_of
@@ -63,6 +62,7 @@ def test_box_and_robots_start_further_by_the_same_distance() -> None:
 def test_a_box_does_not_start_inside_the_gate() -> None:
     with pytest.raises(InputError, match=r"head_start: 1.0 .* at most 0.95"):
         make(BOX, impl="c", head_start=1.0)
+    assert make(BOX, impl="c", num_envs=1, box_x=4.5).params.head_start == 0  # where there is no room for any
 
 
 def test_ball_and_robots_start_nearer_to_the_goal() -> None:
@@ -164,9 +164,11 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
     state = jax.tree.map(lambda x: x[0], states)
     ball, speed = env.objects["ball"].qpos[:2], env.objects["ball"].qvel[0]
 
-    def kicked(state: State, robot: int, change: float, apart: float = 0.4, x: float = 6.0) -> State:
+    def kicked(
+        state: State, robot: int, change: float, apart: float = 0.4, x: float = 6.0, other: float = 3.0
+    ) -> State:
         qpos = state.data.qpos.at[jnp.asarray(ball)].set(jnp.array([x, 0.0]))
-        places = jnp.array([[2.5, 3.0], [2.5, -3.0], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
+        places = jnp.array([[x, other], [x, -other], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
         qpos = qpos.at[jnp.asarray(env.index.base_qpos[:, :2])].set(places)
         after = dataclasses.replace(
             state, data=state.data.replace(qpos=qpos, qvel=state.data.qvel.at[speed].add(change))
@@ -176,6 +178,7 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
 
     first = kicked(state, 0, 0.5)
     assert first.task.touched.tolist() == [True, False]
+    assert kicked(state, 1, 0.5, other=0.5).task.touched.tolist() == [False, True]  # the nearest alone
     for nothing in (kicked(state, 0, 0.05), kicked(state, 0, 0.5, apart=0.8), kicked(state, 2, 0.5)):
         assert not nothing.task.touched.any()
     alone, both = kicked(first, 0, 0.5, x=12.1), kicked(kicked(first, 1, 0.5), 2, 0.0, x=12.1)
@@ -184,6 +187,14 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
         outcome = env.outcome(end, env.read(end.data), jnp.array(False))
         assert bool(outcome["success"]) and bool(outcome["success/both_touched"]) == together
         assert bool(terms_of(env, first, end)[0]["both_touched"]) == together
+    for before, end, goal, joint in (
+        (first, alone, 1, 0),
+        (first, both, 1, 1),
+        (alone, late, 0, 0),
+        (both, both, 0, 0),
+    ):
+        terms = terms_of(env, before, end)[0]
+        assert (float(terms["first_goal"]), float(terms["joint_goal"])) == (goal, joint)
     both_now = dataclasses.replace(first, task=dataclasses.replace(first.task, touched=jnp.ones(2, bool)))
     steps = ((state, first, 1.0), (first, first, 0.0), (first, both_now, 1.0), (state, both_now, 2.0))
     for before, after, count in steps:
@@ -216,11 +227,23 @@ def test_weights_of_shaping_terms_count_in_training_only_where_given(task: str) 
 N = 32
 
 
+class Bending:
+    """A demonstrator that bends all joints further in every step of an episode, by its recurrent state."""
+
+    task, agents = "go1plane", 1
+
+    def initial_memory(self, num_envs: int) -> jax.Array:
+        return jnp.ones(num_envs)
+
+    def act(self, obs: jax.Array, memory: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.broadcast_to(0.01 * memory[:, None, None], (*obs.shape[:2], 12)), memory + 1.0
+
+
 @pytest.fixture(scope="module")
 def rollout() -> tuple[Any, dict[str, Any]]:
-    """A batch of short episodes, and its states over two time limits for assistance 0 and 1, leading axis time."""
-    task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.64)
-    env = Demonstrated(task, N, load_policy("random", task))
+    """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading axis time."""
+    task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.64, min_height=0.3)
+    env = Demonstrated(task, N, Bending())
 
     @jax.jit
     def run(assistance: jax.Array) -> Any:
@@ -235,7 +258,7 @@ def rollout() -> tuple[Any, dict[str, Any]]:
         last, seen = jax.lax.scan(advance, state, None, length=2 * env.max_episode_steps)
         return last.demonstrations, seen
 
-    return env, {name: run(jnp.asarray(level)) for name, level in (("none", 0.0), ("all", 1.0))}
+    return env, {name: run(jnp.asarray(level)) for name, level in (("none", 0.0), ("few", 0.3), ("all", 1.0))}
 
 
 def test_episodes_start_in_demonstrated_states(rollout: Any) -> None:
@@ -256,11 +279,31 @@ def test_without_assistance_episodes_start_as_the_task_does(rollout: Any) -> Non
     assert np.asarray(done).any() and not np.asarray(step)[np.asarray(done)].any()
 
 
+def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> None:
+    """30% of the starts."""
+    demonstrations, (_, qpos, done) = rollout[1]["few"]
+    moments = {tuple(np.asarray(q)) for q in demonstrations["data"]["qpos"]}
+    starts = [tuple(np.asarray(qpos[t, i])) in moments for t, i in np.argwhere(np.asarray(done))]
+    assert len(starts) >= 4 * N and 0.2 < np.mean(starts) < 0.4
+
+
+def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> None:
+    """All joints are bent by as many hundredths of their range as the episode has had steps."""
+    env, runs = rollout
+    demonstrations = runs["all"][0]
+    step, ctrl = np.asarray(demonstrations["step"]), np.asarray(demonstrations["data"]["ctrl"])
+    assert len(step) == 128 * 16 and len(set(step.tolist())) > 8
+    bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(env.env.robot.action_scale, env.num_agents)
+    np.testing.assert_allclose(bent, 0.01 * np.tile(step[:, None], bent.shape[1]), atol=1e-5)
+
+
 def test_demonstrations_do_not_depend_on_the_key(rollout: Any) -> None:
     """Two runs of a task have the same demonstrations."""
     env, runs = rollout
-    other = jax.jit(lambda key: env.reset(key).demonstrations)(jax.random.PRNGKey(2))
-    jax.tree.map(np.testing.assert_array_equal, other, runs["all"][0])
+    begin = jax.jit(lambda key: env.reset(key).demonstrations)
+    one, other = begin(jax.random.PRNGKey(2)), begin(jax.random.PRNGKey(3))
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), one, runs["all"][0])  # another program
 
 
 def test_a_demonstrator_needs_assistance() -> None:

@@ -152,6 +152,9 @@ def test_value_statistics_at_their_limits() -> None:
     for constant in (0.0, 5.0):
         statistics = value_update(value_init(), jnp.full((3,), constant), 0.99)
         assert float(jnp.abs(value_normalize(statistics, jnp.float32(constant)))) < 0.1
+    # The deviation of nearly constant targets is taken to be a thousandth of their size.
+    statistics = value_update(value_init(), 5.0 + 1e-4 * target, 0.99)
+    np.testing.assert_allclose(value_normalize(statistics, jnp.float32(5.5)), 100.0, rtol=2e-2)
 
 
 def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:

@@ -22,7 +22,7 @@ from mqe_jax.viz.recording import record, typical
 from mqe_jax.viz.render import render_frames
 
 DOCS = Path(__file__).parents[1] / "docs"
-EPISODES, SECONDS, AFTER, FPS = 48, 5.8, 1.2, 10.0  # AFTER: duration shown after the success, s
+EPISODES, SECONDS, AFTER, FPS = 48, 4.4, 1.2, 10.0  # AFTER: duration shown after the success, s
 SIZE, TILE, COLUMNS = (640, 360), (240, 135), 4
 
 

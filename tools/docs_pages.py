@@ -3,7 +3,8 @@
 Generated: the README as first page, one page per task (clip, sizes, observation, rewards, parameters) with an overview,
 and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/
 lead to the repository's address, `[project.urls]` in pyproject.toml; where it is not set they become paths, so that the
-built site needs neither the repository nor another host.
+built site needs neither the repository nor another host. The page of `mqe play-site` is part of the site where it is in
+build/play, and else the site says how to build it.
 """
 
 from __future__ import annotations
@@ -22,19 +23,24 @@ from typing import Any
 import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
-from release import repository
+from release import badges, repository
 
 from mqe_jax import zoo
 
 ROOT = Path(__file__).parents[1]
+PLAY = ROOT / "build" / "play"
+"""Folder of the page of `mqe play-site`."""
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the generated pages."""
+    """Adds the generated pages, and the files of the page of `mqe play-site`."""
     (reference,) = (section["API reference"] for section in config["nav"] if "API reference" in section)
     modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
     for path, content in (pages() | {path: f"# {x}\n\n::: {x}\n" for path, x in modules.items()}).items():
         files.append(File.generated(config, path, content=content))
+    for file in filter(Path.is_file, PLAY.rglob("*") if _playable() else ()):
+        path = f"play/{file.relative_to(PLAY).as_posix()}"
+        files.append(File.generated(config, path, abs_src_path=str(file)))
     return files
 
 
@@ -46,15 +52,17 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Converts links and formulas of a page."""
+    """Converts links and formulas of a page; the one about playing leads to the page of `mqe play-site`."""
+    if page.file.src_uri == "play.md":
+        markdown = play_link(markdown, _playable())
     return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
 
 
 def links(markdown: str, address: str = "", folder: str = "") -> str:
     """Leads links to files outside docs/, from a page in a folder of it, to the repository's address.
 
-    Notebooks get a second link, to Colab, where the address is on GitHub. Without an address links become the file's
-    name and path.
+    Notebooks get links to Colab and Kaggle too, where the address is on GitHub. Without an address links become the
+    file's name and path.
     """
 
     def led(match: re.Match[str]) -> str:
@@ -67,9 +75,22 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
         link = f"[{text}]({address}/blob/main/{path})"
         hub = address.partition("https://github.com/")[2]
         colab = f"https://colab.research.google.com/github/{hub}/blob/main/{path}"
-        return f"{link} ([open in Colab]({colab}))" if hub and path.endswith(".ipynb") else link
+        kaggle = f"https://kaggle.com/kernels/welcome?src={address}/blob/main/{path}"
+        opened = f" (open in [Colab]({colab}), [Kaggle]({kaggle}))"
+        return link + opened if hub and path.endswith(".ipynb") else link
 
     return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", led, markdown)
+
+
+def play_link(markdown: str, present: bool) -> str:
+    """Puts the link to the page of `mqe play-site` below the title, or how to build it where it is not present."""
+    absent = "This copy of the documentation was built without the page: run `make docs`, or the commands below."
+    title, _, rest = markdown.partition("\n")
+    return f"{title}\n\n{'**[Open the page](play/index.html)**' if present else absent}\n{rest}"
+
+
+def _playable() -> bool:
+    return (PLAY / "site.json").is_file()
 
 
 def formulas(markdown: str) -> str:
@@ -94,7 +115,7 @@ def pages() -> dict[str, str]:
         from mqe_jax.envs import TASKS
     made = {f"tasks/{name}.md": task_page(task) for name, task in TASKS.items()}
     made["tasks/index.md"] = overview(TASKS)
-    made["index.md"] = front((ROOT / "README.md").read_text(encoding="utf-8"))
+    made["index.md"] = badges(front((ROOT / "README.md").read_text(encoding="utf-8")), repository())
     return made
 
 
@@ -105,19 +126,18 @@ def front(readme: str) -> str:
 
 
 def overview(tasks: Mapping[str, Any]) -> str:
-    """Returns the page that lists all tasks."""
+    """Returns the page that shows all tasks, as a gallery."""
     kinds: dict[str, list[str]] = {"Cooperative": [], "Competitive": [], "For tests": []}
     for name, task in tasks.items():
         env = task(num_envs=1, impl="c")
         kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
-        style = '{ style="min-width: 9em" }'
-        image = f"[![{task.title}]({_clip(name)}){style}]({name}.md)" if _clip(name) else ""
-        sizes = f"{env.num_agents} | {env.observation_size} | {env.privileged_observation_size}"
-        limit = f"{env.params.episode_length:g}"
-        kinds[kind].append(f"| [`{name}`]({name}.md) | {task.title} | {sizes} | {limit} | {image} |")
-    columns = "| id | name | agents | observation | privileged | time limit, s | |\n|---|---|---|---|---|---|---|"
-    parts = [f"## {kind}\n\n{columns}\n" + "\n".join(rows) for kind, rows in kinds.items()]
-    head = "# Tasks\n\nSizes, rewards and parameters on these pages are read from the code."
+        image = f"[![{_seen(task)}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
+        robots = " vs ".join(str(len(team)) for team in env.teams)
+        sizes = f"{robots} robots, {env.observation_size} numbers observed by each, {env.params.episode_length:g} s"
+        kinds[kind].append(f"- {image}[**{task.title}**]({name}.md) `{name}`: {sizes}")
+    galleries = [(kind, "\n".join(items)) for kind, items in kinds.items()]
+    parts = [f'## {kind}\n\n<div class="gallery" markdown>\n\n{items}\n\n</div>' for kind, items in galleries]
+    head = "# Tasks\n\nEach page has a task's observation, rewards and parameters, which are read from the code."
     return "\n\n".join([head, *parts]) + "\n"
 
 
@@ -129,8 +149,8 @@ def task_page(task: Any) -> str:
     policy = "shipped" if name in zoo.names() else "scripted"
     command = f"mqe render {name}" + (" --opponent scripted" if policy == "scripted" and len(env.teams) > 1 else "")
     against = " against itself" if len(env.teams) > 1 else ""
-    clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{task.title}]({_clip(name)})"
-    watch = f"`mqe view {name}` shows the {policy} policy live ([how strong](../results/strength.md) it is)."
+    clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{_seen(task)}]({_clip(name)})"
+    watch = f"`mqe view {name}` shows the {policy} policy live ([how good](../results/strength.md) it is)."
     training = f"`mqe train {name}` trains one: [settings, and what to expect](../results/settings.md)."
     media = [clip, f"{watch} {training}"] if _clip(name) else []
     facts = [
@@ -151,6 +171,10 @@ def task_page(task: Any) -> str:
         "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _seen(task: Any) -> str:
+    return f"{task.title}: {inspect.cleandoc(task.__doc__ or '').splitlines()[0]}"
 
 
 def _clip(name: str) -> str | None:

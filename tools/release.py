@@ -2,8 +2,8 @@
 
 `python tools/release.py [--tag TAG] [--audit]` writes into dist/; with `--audit` it only looks up known vulnerabilities
 of the packages in constraints.txt. All files must name the same version, and with a tag that of the tag. The commands
-run in another folder, which the source tree cannot be imported from. Links and pictures of the wheel's README, for
-package sites, lead to the repository: `[project.urls]` in pyproject.toml.
+run in another folder, which the source tree cannot be imported from. Links, pictures and badges of the wheel's README,
+for package sites, lead to the repository: `[project.urls]` in pyproject.toml.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
+WORKFLOWS = ROOT / ".github" / "workflows"
 EXTRAS = "render"
 """Extras that the README's commands need."""
 SHORTER = {
@@ -123,12 +124,31 @@ def repository(text: str | None = None) -> str:
     return project.get("urls", {}).get("Repository", "").rstrip("/")
 
 
+def badges(readme: str, address: str) -> str:
+    """Returns the README with the states of the repository's workflows below its title; unchanged without GitHub."""
+    if not address.startswith("https://github.com/"):
+        return readme
+    title, _, rest = readme.partition("\n")
+    pages = {path.stem: f"{address}/actions/workflows/{path.name}" for path in sorted(WORKFLOWS.glob("*.yml"))}
+    row = " ".join(f"[![{name}]({page}/badge.svg)]({page})" for name, page in pages.items())
+    return f"{title}\n\n{row}\n{rest}"
+
+
 def absolute(readme: str, address: str) -> str:
-    """Returns the README with relative links and pictures led to the repository's address; unchanged without one."""
+    """Returns the README for package sites.
+
+    It installs the package by name. With the repository's address it has badges, and links and pictures lead there.
+    """
+    readme = readme.replace('pip install ".[', 'pip install "mqe-jax[').replace('GPU: ".[', 'GPU: "mqe-jax[')
+    readme = readme.replace("In the folder of this repository, with", "With")
     if not address:
         return readme
-    readme = re.sub(r"(!\[[^\]\n]*\]\()(?![a-z]+:|#)", rf"\1{address}/raw/main/", readme)
-    return re.sub(r"(\]\()(?![a-z]+:|#)", rf"\1{address}/blob/main/", readme)
+
+    def led(match: re.Match[str]) -> str:
+        picture = Path(match[1]).suffix in (".webp", ".png", ".svg")
+        return f"]({address}/{'raw' if picture else 'blob'}/main/{match[1]})"
+
+    return badges(re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", led, readme), address)
 
 
 def build(folder: Path) -> Path:
@@ -145,6 +165,11 @@ def build(folder: Path) -> Path:
     run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", DIST, folder)
     (wheel,) = DIST.glob("*.whl")
     return wheel
+
+
+def without_folders(bill: str) -> str:
+    """Returns a bill of materials in which files of this machine, such as the wheel, have their name alone."""
+    return re.sub(r'"file:[^"]*/([^"/]+)"', r'"\1"', bill)
 
 
 def try_readme(programs: Path, folder: Path) -> None:
@@ -179,6 +204,7 @@ def main() -> int:
         programs = new_environment(folder / "venv", f"{wheel}[{EXTRAS}]")
         bill = wheel.with_suffix(".cdx.json")
         run(tools / "cyclonedx-py", "environment", programs / "python", "--output-file", bill)
+        bill.write_text(without_folders(bill.read_text(encoding="utf-8")), encoding="utf-8")
         (folder / "work").mkdir()
         try_readme(programs, folder / "work")
     print(f"release: {wheel.relative_to(ROOT)} and {bill.relative_to(ROOT)}")

@@ -14,9 +14,11 @@ from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.match import Match
+from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import MOVING, League
+from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
 from mqe_jax.settings import fail, load_yaml, override
@@ -77,12 +79,14 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
     demonstrator = config.curriculum.demonstrator
 
-    def batch(num_envs: int) -> VectorEnv:
+    def batch(num_envs: int) -> Any:
         if demonstrator is None:
-            return env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
-        policy = load_policy(demonstrator, both)
-        everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
-        return Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
+            started = env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
+        else:
+            policy = load_policy(demonstrator, both)
+            everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
+            started = Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
+        return Deadline(started) if config.time_limit_ends else started
 
     eval_env = None
     if config.evaluation.every is not None:
@@ -90,10 +94,14 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     _check_teams(both, config)
     if len(both.teams) < 2:
         return batch(config.num_envs), eval_env
-    learning = League(batch(config.num_envs), opponents, config) if opponents else Mirror(batch(config.num_envs // 2))
+    if opponents:
+        matches = batch(config.num_envs)
+        learning = League(BothSides(matches) if config.both_sides else matches, opponents, config)
+    else:
+        learning = Mirror(batch(config.num_envs // 2))
     if eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
-        eval_env = versus(eval_env, fixed or anchors(eval_env.env)[:1])
+        eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed or anchors(eval_env.env)[:1])
     return learning, eval_env
 
 
@@ -115,6 +123,8 @@ def check_start(config: TrainConfig) -> None:
 def _check_teams(env: Any, config: TrainConfig) -> None:
     if len(env.teams) < 2 and config.opponents:
         fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+    if config.both_sides and not config.opponents:
+        fail("both_sides", True, "false where there are no opponents")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 

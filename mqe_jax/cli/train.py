@@ -17,6 +17,7 @@ from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
 from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS
 from mqe_jax.envs.replay import content, save_recording
+from mqe_jax.envs.wrappers import WrappedState
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Seeds
 from mqe_jax.opponents import TeamState
@@ -175,6 +176,8 @@ class DivergenceRecorder:
         """Returns the fields on which a step of all environments depends, and all agents' actions."""
         if isinstance(after, TeamState):
             before, action, after = before.match, after.action, after.match
+        while isinstance(after, WrappedState):
+            before, action, after = before.inner, after.action, after.inner
         return Trace(content(before), action, after.metrics["diverged"])
 
     def add(self, trace: Trace) -> None:

@@ -38,6 +38,10 @@ class DefenderRewards:
     """As `approach`, of the robot that is farther from the ball. Not in the paper: shaping."""
     first_touch: float = 0.0
     """Per robot that touches the ball for the first time in the episode. Not in the paper: shaping."""
+    first_goal: float = 0.0
+    """In the step of an episode's first goal. Not in the paper: for training, where `goal` favours early goals."""
+    joint_goal: float = 0.0
+    """As `first_goal`, if both robots touched the ball before. Not in the paper."""
 
 
 @record
@@ -121,6 +125,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     ) -> dict[str, jax.Array]:
         (goal_before, near_before, far_before), (goal, near, far) = self.distances(before), self.distances(after)
         scoring, touched = self.in_goal(after.state.data)[0], after.state.task.touched
+        first = after.state.task.scored & ~before.state.task.scored
         return {
             "goal": scoring,
             "nearness": jnp.exp(-goal / 3.0),
@@ -129,6 +134,8 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
             "both_touched": scoring & jnp.all(touched),
             "join": far_before - far,
             "first_touch": jnp.sum(touched & ~before.state.task.touched),
+            "first_goal": first,
+            "joint_goal": first & jnp.all(touched),
         }
 
     def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import VectorEnv
+from mqe_jax.envs.wrappers import Wrapper
 from mqe_jax.league import pool
 from mqe_jax.league.pool import Pool
 from mqe_jax.opponents import OUTCOMES, Versus, exchanged, versus
@@ -58,7 +59,7 @@ class LeagueState(NamedTuple):
 class League(Versus):
     """`Versus` whose blocks also play the newest policy and members of a pool; a learner hook."""
 
-    def __init__(self, matches: VectorEnv, opponents: Sequence[str], config: TrainConfig) -> None:
+    def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig) -> None:
         """Creates the matches of a training run; `opponents` are those of `TrainConfig.opponents`."""
         dims = env_dims(versus(matches, ["idle"]), config)
         self._network, self._config, self.sources = config.network.build(dims), config, tuple(opponents)
@@ -68,7 +69,7 @@ class League(Versus):
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
         first = TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": matches.name})
         policies = [first if source in MOVING else load_opponent(source, matches.env) for source in opponents]
-        super().__init__(matches, policies, config.draw_reward, config.time_limit_ends)
+        super().__init__(matches, policies, config.draw_reward)
         self._members = config.league.members if drawn else 1
         self._moving = np.array([source in DRAWN for source in opponents])
         self._scripted = np.array([source == "scripted" for source in opponents])

@@ -39,12 +39,12 @@ def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}, structure
 
 
-def _checksum(arrays: Mapping[str, np.ndarray], metadata: str | None) -> str:
-    """Returns the checksum of arrays, their names and metadata; without metadata that of version 2, of arrays alone."""
-    total = 0 if metadata is None else zlib.crc32(metadata.encode())
+def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
+    """Returns the checksum of arrays, their names and metadata."""
+    total = zlib.crc32(metadata.encode())
     for name in sorted(arrays):
         array = arrays[name]
-        about = "" if metadata is None else f"{name} {array.dtype} {array.shape}"
+        about = f"{name} {array.dtype} {array.shape}"
         total = zlib.crc32(array.tobytes(), zlib.crc32(about.encode(), total))
     return str(total)
 
@@ -71,14 +71,15 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     try:
         with parsing(path, f"a {kind}, or truncated"), safe_open(path, framework="numpy") as file:
             found = file.metadata() or {}
-            header = parse_json(found[FORMAT], "header") if FORMAT in found else found  # version 2
-            _check_header(header, kind, FORMAT in found or found.get("format") == FORMAT)
+            if FORMAT not in found:
+                raise InputError(f"not a file of this package, or of a version before 0.2.0; a {kind} is needed")
+            header = parse_json(found[FORMAT], "header")
+            _check_header(header, kind)
             arrays = {name: file.get_tensor(name) for name in file.keys()}
             metadata = parse_json(header["metadata"], "metadata")
             if not isinstance(metadata, dict):
                 raise ValueError("its metadata is not a mapping")
-            checked = header["metadata"] if header["version"] == str(VERSION) else None
-            if header["checksum"] != _checksum(arrays, checked):
+            if header["checksum"] != _checksum(arrays, header["metadata"]):
                 raise ValueError("its content does not match its checksum")
     except InputError as error:
         text = str(error)
@@ -86,13 +87,11 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     return arrays, metadata
 
 
-def _check_header(header: Any, kind: str, ours: bool) -> None:
-    """Raises an InputError for a file of another package, kind or version."""
-    if not ours:
-        raise InputError(f"not a file of this package; a {kind} is needed")
+def _check_header(header: Any, kind: str) -> None:
+    """Raises an InputError for a file of another kind or version."""
     if header["kind"] != kind:
         raise InputError(f"holds a {brief(str(header['kind']))}; a {kind} is needed")
-    if header["version"] not in ("2", str(VERSION)):
+    if header["version"] != str(VERSION):
         raise InputError(f"has format version {brief(str(header['version']))}; version {VERSION} is needed")
 
 

@@ -188,11 +188,13 @@ class TrainConfig:
     the task, the task itself (its shipped policy), a run folder or a policy file; in training also newest (the policy
     itself), older (a member of the league's pool, more often one that is hard to beat) or uniform (any member). Several
     have equal shares of the environments. Without, both teams of each match learn."""
+    both_sides: bool = False
+    """Whether the policy plays its opponents as the task's team 1 in half of the environments, in evaluations too."""
     draw_reward: float = 0.0
     """Added to the reward where an episode against opponents ends in a draw, during training only."""
     time_limit_ends: bool = False
-    """Whether the time limit of an episode against opponents ends it for the learner too: no value follows, and the
-    critic's privileged observation includes the time left."""
+    """Whether the time limit ends the episode for the learner too: no value follows, and the privileged observation
+    includes the time left. During training only."""
     league: LeagueSettings = LeagueSettings()
     start: str | None = None
     """Run folder or policy file whose policy the run starts from: its parameters and observation statistics; none

@@ -1,0 +1,95 @@
+"""Batches of environments that show another batch differently, for training."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.envs.state import EnvironmentState
+from mqe_jax.train import devices
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class WrappedState(EnvironmentState):
+    """States of N environments as a wrapper shows them."""
+
+    inner: Any
+    """States of the wrapped batch."""
+    action: jax.Array
+    """Actions that the wrapped batch received in the last step (N, A, D)."""
+
+
+class Wrapper:
+    """A batch of environments around another, with the interface of `VectorEnv`; subclasses change what is seen."""
+
+    inner: Any
+    """The wrapped batch."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner, self.env, self.name, self.num_envs = inner, inner.env, inner.name, inner.num_envs
+        self.num_agents, self.teams, self.action_size = inner.num_agents, inner.teams, inner.action_size
+        self.observation_size = inner.observation_size
+        self.privileged_observation_size = inner.privileged_observation_size
+        self.max_episode_steps = inner.max_episode_steps
+
+    def share(self, parts: int) -> Self:
+        """Returns the batch of one of several processes, as `VectorEnv.share`."""
+        other = copy.copy(self)
+        other.num_envs = devices.share("num_envs", self.num_envs, parts)
+        other.inner = self.inner.share(parts)
+        return other
+
+    def check_action(self, action: jax.Array) -> None:
+        """Raises an InputError for actions of another shape than (N, A, action_size)."""
+        self.inner.check_action(action)
+
+    def reset(self, key: jax.Array) -> WrappedState:
+        """Returns the initial states of all environments."""
+        inner = self.inner.reset(key)
+        return self._state(inner, jnp.zeros((self.num_envs, self.num_agents, self.action_size)), inner.step)
+
+    def step(self, state: WrappedState, action: jax.Array) -> WrappedState:
+        """Advances all environments by one step with actions (N, A, action_size); errors as of `VectorEnv`."""
+        self.check_action(action)
+        action = self.passed(action)
+        inner = dataclasses.replace(state.inner, step=state.step, assistance=state.assistance)
+        return self._state(self.inner.step(inner, action), action, state.step + 1)
+
+    def passed(self, action: jax.Array) -> jax.Array:
+        """Returns the actions that the wrapped batch receives (N, A, action_size)."""
+        return action
+
+    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+        """Returns the fields that differ from the wrapped states'; `reached` (N,) are the steps before any reset."""
+        return {}
+
+    def _state(self, inner: Any, action: jax.Array, reached: jax.Array) -> WrappedState:
+        fields = {field.name: getattr(inner, field.name) for field in dataclasses.fields(EnvironmentState)}
+        return WrappedState(**{**fields, **self.seen(inner, reached)}, inner=inner, action=action)
+
+
+class Deadline(Wrapper):
+    """The time limit terminates episodes; the privileged observation has one more number, the share of time left.
+
+    What a team may still do after the limit is worth nothing to it then (Pardo et al., arXiv 1712.00378).
+    """
+
+    def __init__(self, inner: Any) -> None:
+        super().__init__(inner)
+        self.privileged_observation_size += 1
+
+    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+        def timed(privileged: jax.Array, step: jax.Array) -> jax.Array:
+            return jnp.concatenate([privileged, 1.0 - step[:, None] / self.max_episode_steps], axis=1)
+
+        return {
+            "privileged_obs": timed(inner.privileged_obs, inner.step),
+            "final_privileged_obs": timed(inner.final_privileged_obs, reached),
+            "terminated": inner.terminated | inner.truncated,
+            "truncated": jnp.zeros_like(inner.truncated),
+        }

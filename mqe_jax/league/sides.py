@@ -1,0 +1,62 @@
+"""Matches whose teams change sides, so that the learner, always team 0, is trained from both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.envs.wrappers import Wrapper
+from mqe_jax.train import devices
+
+
+class BothSides(Wrapper):
+    """Matches, in the second half of which team 0 is the task's team 1.
+
+    The privileged observation has one more number: 1 where the teams have changed places, else 0. Of the metrics,
+    outcomes are those of the new teams; terms of the reward, zero-sum, change sign.
+
+    It makes a difference where a match is symmetric under a reflection: robots walk not quite as their mirror images.
+    """
+
+    def __init__(self, inner: Any) -> None:
+        super().__init__(inner)
+        self.privileged_observation_size += 1
+
+    def passed(self, action: jax.Array) -> jax.Array:
+        return self._exchanged(action)
+
+    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+        changed = self._changed()
+        other = {"team0/": "team1/", "team1/": "team0/"}
+        metrics = {}
+        for name, value in inner.metrics.items():
+            if name[:6] in other:
+                value = jnp.where(changed, inner.metrics[other[name[:6]] + name[6:]], value)
+            elif name == "success":
+                value = jnp.where(changed, inner.metrics["team1/win"], value)
+            elif name.startswith("reward/") or name == "average_step_reward":
+                value = jnp.where(changed, -value, value)
+            metrics[name] = value
+
+        def told(privileged: jax.Array) -> jax.Array:
+            return jnp.concatenate([privileged, changed[:, None].astype(privileged.dtype)], axis=1)
+
+        return {
+            "obs": self._exchanged(inner.obs),
+            "final_obs": self._exchanged(inner.final_obs),
+            "privileged_obs": told(inner.privileged_obs),
+            "final_privileged_obs": told(inner.final_privileged_obs),
+            "reward": self._exchanged(inner.reward),
+            "metrics": metrics,
+        }
+
+    def _changed(self) -> jax.Array:
+        """Returns where the teams have changed places (N,) bool."""
+        return devices.rows(lambda n: jnp.arange(n) >= n // 2, self.num_envs)
+
+    def _exchanged(self, x: jax.Array) -> jax.Array:
+        """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A, ...)."""
+        other = jnp.roll(x, self.num_agents // 2, axis=1)
+        return jnp.where(self._changed().reshape(-1, *(1,) * (x.ndim - 1)), other, x)

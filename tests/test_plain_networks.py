@@ -1,0 +1,172 @@
+"""Networks and policies against plain numpy: layers, initial gains, drawn actions."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.settings import build
+from mqe_jax.train.actor_critic import ActorCritic
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.mat import Mat
+from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.normalize import RunningStatistics
+from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.types import NetworkMemory
+
+KEY = jax.random.PRNGKey(0)
+
+
+def dense(layer: Any, x: np.ndarray) -> np.ndarray:
+    return x @ np.asarray(layer["weight"], float) + np.asarray(layer["bias"], float)
+
+
+def norm(layer: Any, x: np.ndarray) -> np.ndarray:
+    x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5)
+    return x * np.asarray(layer["scale"], float) + np.asarray(layer["shift"], float)
+
+
+def gelu(x: np.ndarray) -> np.ndarray:
+    return x * 0.5 * (1 + np.vectorize(math.erf)(x / math.sqrt(2)))
+
+
+def attended(layers: Any, query: np.ndarray, context: np.ndarray, heads: int, causal: bool) -> np.ndarray:
+    """Attention (A, W) of every agent to all, or to those up to itself, head by head."""
+    q, k, v = (dense(layers[name], x) for name, x in (("query", query), ("key", context), ("value", context)))
+    agents, width = q.shape
+    size, mixed = width // heads, np.zeros((agents, width))
+    for head in range(heads):
+        part = slice(head * size, (head + 1) * size)
+        for agent in range(agents):
+            seen = agent + 1 if causal else agents
+            weight = np.exp(np.array([q[agent, part] @ k[other, part] for other in range(seen)]) / math.sqrt(size))
+            mixed[agent, part] = sum(w * v[other, part] for other, w in enumerate(weight / weight.sum()))
+    return dense(layers["projection"], mixed)
+
+
+def test_the_transformer_is_that_of_a_plain_implementation() -> None:
+    settings, agents = Mat(blocks=2, heads=2, width=8), 3
+    network = settings.build(EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents))
+    random = np.random.default_rng(0)
+    params = jax.tree.map(
+        lambda x: jnp.asarray(x + 0.4 * random.normal(size=x.shape), jnp.float32), jax.jit(network.init)(KEY)
+    )
+    obs, action = random.normal(size=(4, agents, 5)), random.normal(size=(4, agents, 2))
+    arrays = jnp.zeros(4, bool), jnp.asarray(obs), jnp.zeros((4, 1)), jnp.asarray(action)
+    found = jax.jit(network.evaluate)(params, NetworkMemory((), ()), *arrays)
+    value, _ = jax.jit(network.value)(params, (), *arrays[:3])
+    np.testing.assert_allclose(value, found.value, atol=1e-5)
+    deviation = 0.5 / (1 + np.exp(-np.asarray(params["deviation"], float)))
+    encoder, decoder = params["encoder"], params["decoder"]
+    for n in range(4):
+        x = norm(encoder["norm"], gelu(dense(encoder["embed"], norm(encoder["norm_in"], obs[n]))))
+        for block in encoder["blocks"]:
+            x = norm(block["norm0"], x + attended(block["attention0"], x, x, 2, False))
+            x = norm(block["norm1"], x + dense(block["mlp"]["1"], gelu(dense(block["mlp"]["0"], x))))
+        head = params["value_head"]
+        own = dense(head["out"], norm(head["norm"], gelu(dense(head["hidden"], x))))[:, 0]
+        np.testing.assert_allclose(found.value[n], own, atol=1e-4)
+        features, tokens = x, np.concatenate([np.zeros((1, 2)), action[n, :-1]])
+        x = norm(decoder["norm"], gelu(dense(decoder["embed"], tokens)))
+        for block in decoder["blocks"]:
+            x = norm(block["norm0"], x + attended(block["attention0"], x, x, 2, True))
+            x = norm(block["norm1"], features + attended(block["attention1"], features, x, 2, True))
+            x = norm(block["norm2"], x + dense(block["mlp"]["1"], gelu(dense(block["mlp"]["0"], x))))
+        head = decoder["head"]
+        mean = dense(head["out"], norm(head["norm"], gelu(dense(head["hidden"], x))))
+        z = (action[n] - mean) / deviation
+        expected = -0.5 * z**2 - np.log(deviation * math.sqrt(2 * math.pi))
+        np.testing.assert_allclose(found.log_prob[n], expected, rtol=1e-3, atol=1e-3)
+        entropy = np.sum(0.5 * np.log(2 * math.pi * math.e * deviation**2))
+        np.testing.assert_allclose(found.entropy[n], np.full(agents, entropy), rtol=1e-4)
+
+
+def gain(matrix: Any) -> float:
+    """The gain of a matrix with orthogonal rows or columns, whichever are fewer."""
+    matrix = np.asarray(matrix)
+    square = matrix.T @ matrix if matrix.shape[0] >= matrix.shape[1] else matrix @ matrix.T
+    np.testing.assert_allclose(square, square[0, 0] * np.eye(len(square)), atol=1e-4 * square[0, 0] + 1e-7)
+    return float(np.sqrt(square[0, 0]))
+
+
+def test_layers_begin_with_their_gains_and_without_bias() -> None:
+    dims = EnvDims(agents=2, observation=9, privileged=7, action=3, values=2)
+    settings = ActorCritic(hidden_sizes=(8, 6), gru_size=5, openrl_layers=True, action_gain=0.05, log_std_init=-0.7)
+    for share in (True, False):
+        network = dataclasses.replace(settings, share_policy=share).build(dims)
+        params = jax.jit(network.init)(KEY)
+        actors = [params["actor"]] if share else [jax.tree.map(lambda x, i=i: x[i], params["actor"]) for i in (0, 1)]
+        assert params["log_std"].shape == ((3,) if share else (2, 3)) and np.allclose(params["log_std"], -0.7)
+        for part, head in (*((actor, 0.05) for actor in actors), (params["critic"], 1.0)):
+            assert gain(part["head"]["weight"]) == pytest.approx(head, rel=1e-3)
+            for layer in (part["hidden"]["0"], part["hidden"]["1"], part["linear"]):
+                assert gain(layer["weight"]) == pytest.approx(math.sqrt(2), rel=1e-3)
+            for name in ("input", "hidden"):
+                for gate in np.split(np.asarray(part["gru"][name]["weight"]), 3, axis=1):
+                    assert gain(gate) == pytest.approx(1.0, rel=1e-3)
+            layers = [*part["hidden"].values(), part["linear"], part["head"], *part["gru"].values()]
+            assert not any(np.asarray(layer["bias"]).any() for layer in layers)
+        if not share:
+            assert np.abs(actors[0]["head"]["weight"] - actors[1]["head"]["weight"]).max() > 1e-3
+    params = jax.jit(Mat(width=8, gain=0.02, blocks=2).build(dims).init)(KEY)
+    blocks = [*params["encoder"]["blocks"], *params["decoder"]["blocks"]]
+    for block in blocks:
+        assert gain(block["mlp"]["0"]["weight"]) == pytest.approx(math.sqrt(2), rel=1e-3)
+        small = [block["mlp"]["1"], *(x for name in block if "attention" in name for x in block[name].values())]
+        assert len(small) in (5, 9)
+        assert all(gain(layer["weight"]) == pytest.approx(0.02, rel=1e-3) for layer in small)
+    for head in (params["value_head"], params["decoder"]["head"]):
+        assert gain(head["hidden"]["weight"]) == pytest.approx(math.sqrt(2), rel=1e-3)
+        assert gain(head["out"]["weight"]) == pytest.approx(0.02, rel=1e-3)
+    for part in ("encoder", "decoder"):
+        assert gain(params[part]["embed"]["weight"]) == pytest.approx(math.sqrt(2), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["actor_critic", "mat"])
+def test_actions_are_drawn_from_the_distribution_they_are_weighed_by(kind: str) -> None:
+    """Independent of each other, also between agents and environments."""
+    dims, count = EnvDims(agents=2, observation=4, privileged=1, action=3, values=2), 4096
+    plain = ActorCritic(recurrent=False, hidden_sizes=(4,), log_std_init=-0.4, log_std_min=-0.5)
+    network = plain.build(dims) if kind == "actor_critic" else Mat(width=4).build(dims)
+    params = network.policy_params(jax.jit(network.init)(KEY))
+    obs = jnp.tile(jax.random.normal(KEY, (2, 4)), (count, 1, 1))
+    act = jax.jit(network.act)
+    action, density, _ = act(params, (), obs, jax.random.PRNGKey(3))
+    middle, top, _ = act(params, (), obs, None)
+    deviation = np.exp(-0.4) if kind == "actor_critic" else 0.5 / (1 + np.exp(-1))
+    np.testing.assert_allclose(top, -np.log(deviation * np.sqrt(2 * np.pi)), rtol=1e-4)
+    z = (np.asarray(action) - np.asarray(middle)) / deviation
+    np.testing.assert_allclose(density[:, 0], top[:, 0] - 0.5 * z[:, 0] ** 2, atol=1e-4)
+    columns = z.reshape(count, 6)
+    assert np.abs(columns.mean(0)).max() < 0.08 and np.abs(columns.std(0) - 1).max() < 0.05
+    assert np.abs(np.corrcoef(columns.T) - np.eye(6)).max() < 0.08
+    assert abs(np.corrcoef(columns[:-1, 0], columns[1:, 0])[0, 1]) < 0.08
+
+
+def test_a_policy_normalises_scales_and_clips() -> None:
+    dims = EnvDims(agents=2, observation=3, privileged=1, action=2, values=2)
+    config = build(
+        TrainConfig,
+        {
+            "action_scale": 0.5,
+            "normalization": {"observations": True},
+            "network": {"recurrent": False, "hidden_sizes": [4], "action_gain": 3.0, "log_std_init": -1.0},
+        },
+    )
+    network = config.network.build(dims)
+    params = network.policy_params(jax.jit(network.init)(KEY))
+    statistics = RunningStatistics(jnp.full(3, 0.5), jnp.full(3, 4.0), jnp.float32(9.0))
+    policy = TrainedPolicy(params, statistics, dims, config, {"task": "probe"})
+    obs = 4.0 * jax.random.normal(KEY, (50, 2, 3))
+    raw, _, _ = network.act(params, (), (obs - 0.5) / 2.0, None)
+    np.testing.assert_allclose(policy.act(obs, ())[0], np.clip(0.5 * np.asarray(raw), -1, 1), atol=1e-5)
+    assert np.abs(raw).max() > 2.5
+    drawn, same = policy.act(obs, (), KEY)[0], dataclasses.replace(policy, deterministic=True).act(obs, (), KEY)[0]
+    np.testing.assert_allclose(same, policy.act(obs, ())[0])
+    assert np.abs(np.asarray(drawn - same)).max() > 0.1

@@ -1,0 +1,315 @@
+"""Rollouts, evaluations, leagues and opponents against plain implementations: loops over steps, episodes and games."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.league import league, pool
+from mqe_jax.opponents import Mirror, Opponent, exchanged
+from mqe_jax.policies import BothTeams, load_policy
+from mqe_jax.train.evaluate import Evaluator
+from mqe_jax.train.networks import Network
+from mqe_jax.train.normalize import RunningStatistics
+from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, rollout
+from mqe_jax.train.types import NetworkMemory
+from tests import training as probes
+from tests.states import made
+from tests.test_opponents import matches
+from tests.training import Probe
+
+KEY = jax.random.PRNGKey(0)
+N = 4
+"""Environments."""
+
+
+class Rich(Probe):
+    """A probe with more outcomes, a term of the reward and divergences; it starts alike with every key."""
+
+    def reset(self, key: jax.Array) -> probes.ProbeState:
+        return self._more(super().reset(jax.random.PRNGKey(7)))
+
+    def step(self, state: probes.ProbeState, action: jax.Array) -> probes.ProbeState:
+        return self._more(super().step(state, action))
+
+    def _more(self, state: probes.ProbeState) -> probes.ProbeState:
+        number, step = jnp.arange(self.num_envs), state.step
+        more = {
+            "success/way": state.hidden + number,
+            "team0/draw": (step + number) % 3 == 0,
+            "pace": state.reward[:, 1],
+        }
+        more |= {"team0/loss": number == 1, "diverged": (number + 2 * step) % 3 == 1, "reward/way": state.reward[:, 0]}
+        metrics = {**state.metrics, **{name: x.astype(jnp.float32) for name, x in more.items()}}
+        return dataclasses.replace(state, metrics=metrics)
+
+
+def pay_differently(hidden: jax.Array, action: jax.Array) -> jax.Array:
+    """Rewards (N, 2) that depend on both actions."""
+    return jnp.stack([action[:, 0, 0] + hidden, 2.0 * action[:, 1, 0] - 0.5], axis=-1)
+
+
+def rich(**values: Any) -> Rich:
+    show = lambda hidden, step: jnp.stack([hidden, 0.5 * step], axis=-1)  # noqa: E731
+    return Rich(show, pay_differently, N, features=2, max_episode_steps=2, odd_episode_steps=3, **values)
+
+
+class Episode(NamedTuple):
+    """What is summed over an episode."""
+
+    steps: int = 0
+    total: float = 0.0
+
+
+def test_a_rollout_is_that_of_a_plain_implementation() -> None:
+    """Two rollouts one after the other; the recurrent states count steps and add up what they see."""
+
+    def act(params: Any, memory: Any, obs: Any, key: Any) -> tuple[Any, Any, Any]:
+        action = params["gain"] * obs[..., 2:3] + 0.1 * memory[:, None, None]
+        return action, -action, memory + 1.0
+
+    def value(params: Any, memory: Any, first: Any, obs: Any, privileged: Any) -> tuple[Any, Any]:
+        assert first.shape[0] == obs.shape[0] == privileged.shape[0] == 1
+        return None, memory + params["all"] * (jnp.sum(obs[0], axis=(1, 2)) + jnp.sum(privileged[0], axis=1))
+
+    nothing: Any = None
+    zero = lambda count: NetworkMemory(jnp.zeros(count), jnp.zeros(count))  # noqa: E731
+    network = Network(nothing, lambda params: {"gain": params["gain"]}, zero, act, value, nothing, chunk_length=2)
+    env, params = rich(even_truncate=True), {"gain": jnp.float32(0.7), "all": jnp.float32(0.3)}
+    statistics = [RunningStatistics(jnp.full(n, 0.2), jnp.full(n, 4.0), jnp.float32(9.0)) for n in (4, 2)]
+    start = RolloutState(env.reset(KEY), zero(N), jnp.ones(N, bool), jnp.zeros(N, jnp.int32), jnp.zeros(N))
+
+    @jax.jit
+    def both(state: RolloutState) -> Any:
+        options = {"normalize": True, "action_scale": 0.25, "trace_step": None}
+        found = []
+        for _ in range(2):
+            state, *rest = rollout(env, network, params, ObservationNormalizer(*statistics), state, KEY, 4, **options)
+            found.append(rest)
+        return state, found
+
+    state, found = both(start)
+    step, now = jax.jit(env.step), env.reset(KEY)
+    actor, critic, first = np.zeros(N), np.zeros(N), np.ones(N, bool)
+    episodes = [Episode()] * N
+    for transitions, metrics in found:
+        rows: dict[str, list[float]] = {}
+        ends: dict[str, list[float]] = {}
+        for t in range(4):
+            actor, critic = (np.where(first, 0.0, x) for x in (actor, critic))
+            got = jax.tree.map(lambda x: np.asarray(x[t]), transitions._replace(memory=transitions.memory.critic))  # noqa: B023
+            np.testing.assert_allclose(got.memory, critic, rtol=1e-5)
+            if t % 2 == 0:
+                np.testing.assert_allclose(transitions.memory.actor[t // 2], actor, rtol=1e-5)
+            np.testing.assert_array_equal(got.is_first, first)
+            obs, privileged = (np.asarray(now.obs) - 0.2) / 2, (np.asarray(now.privileged_obs) - 0.2) / 2
+            action = 0.7 * obs[..., 2:3] + 0.1 * actor[:, None, None]
+            np.testing.assert_allclose(got.action, action, rtol=1e-5)
+            np.testing.assert_allclose(got.log_prob, -action, rtol=1e-5)
+            for name in ("obs", "privileged_obs"):
+                np.testing.assert_allclose(getattr(got, name), getattr(now, name))
+            actor, critic = actor + 1.0, critic + 0.3 * (obs.sum((1, 2)) + privileged.sum(1))
+            now = step(now, jnp.asarray(0.25 * action, jnp.float32))
+            for name in ("final_obs", "final_privileged_obs", "reward", "terminated"):
+                np.testing.assert_allclose(getattr(got, name), getattr(now, name), rtol=1e-5)
+            first = np.asarray(now.terminated | now.truncated)
+            np.testing.assert_array_equal(got.done, first)
+            for n in range(N):
+                episodes[n] = Episode(episodes[n].steps + 1, episodes[n].total + float(now.reward[n].mean()))
+                for name, x in now.metrics.items():
+                    rows.setdefault(name, []).append(float(x[n]))
+                    if first[n]:
+                        ends.setdefault(name, []).append(float(x[n]))
+                if first[n]:
+                    ends.setdefault("episode_length", []).append(episodes[n].steps)
+                    ends.setdefault("episode_return", []).append(episodes[n].total)
+                    episodes[n] = Episode()
+        expected = {name: np.mean(values) for name, values in rows.items()}
+        expected |= {name: np.sum(rows[name]) for name in ("diverged", "overflow")}
+        outcomes = (
+            "success",
+            "success/way",
+            "team0/win",
+            "team0/draw",
+            "team0/loss",
+            "episode_length",
+            "episode_return",
+        )
+        expected |= {name: np.mean(ends[name]) for name in outcomes} | {"episodes": len(ends["success"])}
+        assert set(metrics) == set(expected)
+        for name, x in expected.items():
+            np.testing.assert_allclose(metrics[name], x, rtol=1e-5, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(state.memory.actor, actor)
+    np.testing.assert_allclose(state.memory.critic, critic, rtol=1e-5)
+    np.testing.assert_array_equal(state.episode_steps, [episode.steps for episode in episodes])
+    np.testing.assert_allclose(state.episode_return, [episode.total for episode in episodes], rtol=1e-5, atol=1e-6)
+
+
+def test_evaluations_are_those_of_a_plain_implementation() -> None:
+    """Two policies, nine episodes each over four environments: three of the first, two of the others."""
+    env = rich(teams=((1,), (0,)))
+
+    def act(params: Any, obs: Any, memory: Any, key: Any) -> tuple[Any, Any]:
+        return params * obs[..., 2:3] + memory[:, None, None], memory + 0.5
+
+    both = jnp.array([0.3, -0.8])
+    found = Evaluator(env, act, jnp.full(N, 0.1), block=4)(both, 9, jax.random.split(KEY, 2))
+    step = jax.jit(env.step)
+    for gain, result in zip((0.3, -0.8), found, strict=True):
+        now, memory, left = env.reset(KEY), np.full(N, 0.1), np.array([3, 2, 2, 2])
+        rows, ends, rewards = [], [], []
+        while left.any():
+            action = gain * np.asarray(now.obs)[..., 2:3] + memory[:, None, None]
+            now, memory = step(now, jnp.asarray(action, jnp.float32)), memory + 0.5
+            done = np.asarray(now.terminated | now.truncated)
+            for n in np.flatnonzero(left):
+                rows.append({name: float(x[n]) for name, x in now.metrics.items()})
+                rewards.append(float(now.reward[n, 1]))
+                if done[n]:
+                    ends.append(rows[-1])
+            memory[done] = 0.1
+            left = left - (done & (left > 0))
+        mean = lambda name, of: np.mean([row[name] for row in of])  # noqa: E731
+        expected = {"success_rate": mean("success", ends), "average_step_reward": mean("average_step_reward", rows)}
+        expected |= {"episode_return": np.sum(rewards) / 9, "episode_length": len(rows) / 9}
+        expected |= {"overflow": sum(row["overflow"] for row in rows), "diverged": sum(row["diverged"] for row in ends)}
+        expected |= {"success/way": mean("success/way", ends)}
+        expected |= {f"{name}_rate": mean(f"team0/{name}", ends) for name in ("win", "draw", "loss")}
+        values = result.to_dict()
+        terms = values.pop("terms")
+        assert (values.pop("task"), values.pop("episodes")) == ("probe", 9)
+        assert values == pytest.approx(expected, rel=1e-5)
+        assert terms == pytest.approx({name: mean(f"reward/{name}", rows) for name in ("pay", "way")}, rel=1e-5)
+
+
+def test_a_league_counts_as_a_plain_implementation() -> None:
+    """Thirty updates with random results of blocks that play members, the scripted policy and others."""
+    sources, members = ("newest", "older", "scripted", "uniform", "idle"), 4
+    moving, scripted = np.isin(sources, ("older", "uniform")), np.isin(sources, ("scripted",))
+    env: Any = object.__new__(league.League)
+    env.sources, env._moving, env._scripted, env._members = sources, moving, scripted, members
+    random = np.random.default_rng(0)
+    ratings = random.normal(0, 200, members).astype(np.float32)
+    start = pool.new_pool({"x": jnp.zeros(1)}, members)._replace(
+        born=jnp.array([0, 3, 5, -1]), rating=jnp.asarray(ratings)
+    )
+    zeros = jnp.zeros(5, jnp.int32)
+    state = league.LeagueState(start, zeros, zeros, jnp.zeros(()), jnp.int32(0), jnp.zeros((5, 3)), KEY)
+    score, games, rating, played, recent = np.zeros(members), np.zeros(members), 0.0, np.zeros(5), np.zeros((5, 3))
+    for number in range(30):
+        member = random.integers(0, 3, 5)
+        outcomes = random.integers(0, 40 if number % 7 == 0 else 4, (5, 3)) * (random.random((5, 1)) < 0.7)
+        state = state._replace(member=jnp.asarray(member, jnp.int32))
+        state = env._recorded(state, [SimpleNamespace(outcomes=jnp.asarray(row)) for row in outcomes])
+        gained, met = 0.0, set()
+        for i, (wins, draws, losses) in enumerate(outcomes):
+            count, points = wins + draws + losses, wins + 0.5 * draws
+            played[i] += count
+            if moving[i] or scripted[i]:
+                theirs = 0.0 if scripted[i] else ratings[member[i]]
+                gained += points - count / (1 + 10 ** ((theirs - rating) / 400))
+            if moving[i] and count and member[i] not in met:
+                met.add(member[i])
+                score[member[i]] *= 0.98
+                games[member[i]] *= 0.98
+        for i, (wins, draws, losses) in enumerate(outcomes):
+            if moving[i]:
+                score[member[i]] += wins + 0.5 * draws
+                games[member[i]] += wins + draws + losses
+        rating += np.clip(gained, -30, 30)
+        recent = 0.95 * recent + outcomes
+    np.testing.assert_allclose(state.pool.score, score, rtol=1e-4)
+    np.testing.assert_allclose(state.pool.games, games, rtol=1e-4)
+    np.testing.assert_allclose(state.rating, rating, rtol=1e-3)
+    np.testing.assert_array_equal(state.played, played)
+    np.testing.assert_allclose(state.recent, recent, rtol=1e-4)
+    metrics = env._metrics(state)
+    rates = (score + 2) / (games + 4)
+    expected = {"league/rating": rating, "league/members": 3, "league/win_rate": rates[:3].mean()}
+    for i, source in enumerate(sources):
+        for name, share in zip(("win", "draw", "loss"), recent[i] / recent[i].sum(), strict=True):
+            expected[f"league/{name}/{source}"] = share
+    assert {name: float(value) for name, value in metrics.items()} == pytest.approx(expected, rel=1e-3)
+    older, any_ = (np.asarray(jax.nn.softmax(pool.chances(state.pool, uniform))) for uniform in (False, True))
+    weight = (1 - rates[:3]) ** 2 + 1e-4
+    np.testing.assert_allclose(older, [*(weight / weight.sum()), 0.0], rtol=1e-3)
+    np.testing.assert_allclose(any_, [1 / 3, 1 / 3, 1 / 3, 0.0], rtol=1e-5)
+
+
+def test_blocks_draw_the_members_that_their_source_says() -> None:
+    """Of two members one is always beaten, the other never; a block that has not played enough keeps its member."""
+    env: Any = object.__new__(league.League)
+    env.sources, env._moving = ("older", "uniform", "older", "idle"), np.array([True, True, True, False])
+    env._config = SimpleNamespace(league=SimpleNamespace(episodes=5))
+    now = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(born=jnp.array([0, 3, -1]), games=jnp.full(3, 1e6))
+    now, none = now._replace(score=jnp.array([1e6, 0.0, 0.0])), jnp.zeros(4, jnp.int32)
+    opponents = [SimpleNamespace(waiting=jnp.zeros(2, bool))] * 4
+
+    def drawn(key: jax.Array) -> Any:
+        played = jnp.array([5, 6, 4, 9], jnp.int32)
+        state = league.LeagueState(now, none, played, jnp.zeros(()), jnp.int32(0), jnp.zeros((4, 3)), key)
+        after, redrawn = env._redrawn(state, opponents)
+        return after.member, after.played, redrawn
+
+    member, played, redrawn = jax.jit(jax.vmap(drawn))(jax.random.split(KEY, 512))
+    share = np.asarray(member).mean(axis=0)
+    assert share[0] > 0.99 and 0.42 < share[1] < 0.58 and not share[2:].any()
+    assert played.tolist() == [[0, 0, 4, 9]] * 512 and redrawn.tolist() == [[True, True, False, False]] * 512
+
+
+def test_a_second_change_replaces_only_the_opponent_that_is_waited_for() -> None:
+    waiting = jnp.array([True, False])
+    one = Opponent(jnp.float32(1.0), jnp.float32(0.0), waiting, (), jnp.zeros(3, jnp.int32))
+    two = exchanged(one, jnp.float32(2.0))
+    assert (float(two.arrays), float(two.before), two.waiting.tolist()) == (2.0, 0.0, [True, False])
+    free = exchanged(dataclasses.replace(two, waiting=~jnp.ones(2, bool)), jnp.float32(3.0))
+    assert (float(free.arrays), float(free.before), free.waiting.tolist()) == (3.0, 2.0, [True, True])
+    now = exchanged(two, jnp.float32(4.0), at_once=True)
+    assert (float(now.arrays), float(now.before), now.waiting.tolist()) == (4.0, 4.0, [False, False])
+
+
+def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
+    env = Mirror(matches("go1tug", 3))
+    state = env.reset(KEY).match
+    numbers = jnp.arange(3.0)
+    metrics = {name: numbers + 1 for name in state.metrics}
+    rows = {"obs": state.obs + 1, "final_obs": state.final_obs + 2, "reward": jnp.arange(6.0).reshape(3, 2)}
+    rows |= {"privileged_obs": state.privileged_obs + 3, "final_privileged_obs": state.final_privileged_obs + 4}
+    flags = {"terminated": jnp.array([True, False, False]), "truncated": jnp.array([False, True, False])}
+    more = {"step": jnp.array([3, 1, 2], jnp.int32), "assistance": numbers / 4, "metrics": metrics}
+    seen = env._seen(dataclasses.replace(state, **rows, **flags, **more), jnp.zeros((3, 2, 12)))
+    for i in range(6):
+        match, team = divmod(i, 2)
+        for name in ("obs", "final_obs", "reward"):
+            np.testing.assert_array_equal(getattr(seen, name)[i, 0], rows[name][match, team])
+        for name in ("privileged_obs", "final_privileged_obs"):
+            np.testing.assert_array_equal(getattr(seen, name)[i], [*np.asarray(rows[name][match]), team])
+        for name in ("terminated", "truncated"):
+            assert bool(getattr(seen, name)[i]) == bool(flags[name][match])
+        for name in ("step", "assistance"):
+            assert float(getattr(seen, name)[i]) == float(more[name][match])
+        for name, values in seen.metrics.items():
+            counted = name not in ("diverged", "overflow") or team == 0
+            assert float(values[i]) == (match + 1 if counted else 0)
+    assert not any(name.startswith("team1/") for name in seen.metrics)
+
+
+def test_policies_without_files_act_as_named() -> None:
+    env = made("go1football-2vs2")
+    obs = jnp.zeros((2000, 2, env.observation_size))
+    random, idle, forward = (load_policy(name, env) for name in ("random", "idle", "forward"))
+    columns = np.asarray(random.act(obs, (), KEY)[0]).reshape(2000, -1)
+    assert columns.shape[1] == 24 and columns.min() < -0.99 and columns.max() > 0.99
+    assert np.abs(columns.mean(0)).max() < 0.08 and np.abs(columns.std(0) - 3**-0.5).max() < 0.03
+    assert np.abs(np.corrcoef(columns.T) - np.eye(24)).max() < 0.13
+    teams = BothTeams(random, random).act(jnp.zeros((2000, 4, 1)), ((), ()), KEY)[0]
+    assert np.abs(np.corrcoef(np.asarray(teams).reshape(2000, -1).T) - np.eye(48)).max() < 0.13
+    assert not np.asarray(idle.act(obs, (), KEY)[0]).any()
+    ahead = np.asarray(forward.act(obs, (), KEY)[0])
+    assert np.all(ahead[..., 0] == 0.25) and not ahead[..., 1:].any()

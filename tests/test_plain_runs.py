@@ -1,0 +1,224 @@
+"""What a run begins with and keeps: staggered episodes, assistance, evaluations, members of a league, results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import demonstrations
+from mqe_jax.league import league, pool, tournament
+from mqe_jax.opponents import OUTCOMES
+from mqe_jax.policies import SimplePolicy
+from mqe_jax.settings import build, to_mapping
+from mqe_jax.train import learner as learning
+from mqe_jax.train.checkpoint import save_checkpoint
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.monitor import EvaluationLog, Monitor
+from mqe_jax.train.policy import policy_of
+from mqe_jax.train.seeds import Seeds
+from mqe_jax.train.start import first_state, own_learner, without_environments
+from tests import training as probes
+from tests.training import Probe
+
+KEY = jax.random.PRNGKey(0)
+N = 4
+"""Environments."""
+
+
+def test_first_episodes_begin_at_any_step_of_their_time() -> None:
+    state = SimpleNamespace(step=jnp.zeros(8000, jnp.int32), replace=lambda step: step)
+    env: Any = SimpleNamespace(max_episode_steps=8)
+    counts = np.bincount(np.asarray(learning._stagger(env, state, KEY)), minlength=8)
+    assert len(counts) == 8 and np.abs(counts / 1000 - 1).max() < 0.15
+
+
+class Helped(NamedTuple):
+    """The state of an environment whose reward is its assistance; every step is an episode, and a success."""
+
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    assistance: jax.Array
+
+
+class Help:
+    """One agent in four environments."""
+
+    name, num_envs, num_agents, action_size = "help", N, 1, 1
+    observation_size, privileged_observation_size = 1, 1
+
+    def reset(self, key: jax.Array) -> Helped:
+        return self._state(jnp.zeros(N))
+
+    def step(self, state: Helped, action: jax.Array) -> Helped:
+        return self._state(state.assistance)
+
+    def _state(self, assistance: jax.Array) -> Helped:
+        obs, done, metrics = jnp.zeros((N, 1, 1)), jnp.ones(N, bool), {"pay": assistance, "success": jnp.ones(N)}
+        return Helped(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, metrics, assistance)
+
+
+def test_environments_get_the_assistance_of_the_schedule_and_of_their_success() -> None:
+    """It falls by 0.3 with every update that succeeds, from 0.8, and is annealed to 0 within 5 of 10 updates."""
+    values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
+    values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5, "assistance_step": 0.3}}
+    learner = make_learner(Help(), build(TrainConfig, {**values, "network": {"recurrent": False}}))
+    state, update = jax.jit(learner.init)(KEY), jax.jit(learner.update)
+    for expected in (0.8, 0.5, 0.2, 0.0):
+        state, metrics = update(state)
+        assert float(metrics["pay"]) == pytest.approx(expected, abs=1e-6) == float(metrics["assistance"])
+
+
+def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp_path: Path) -> None:
+    env = Probe(probes.show_hidden, probes.pay_one, N)
+    values: dict[str, Any] = {"num_envs": N, "rollout_steps": 4, "checkpoint": {"environments": False}}
+    config = build(TrainConfig, {**values, "network": {"recurrent": False}})
+    learner, processes = own_learner(env, config, None)
+    shared = Seeds(learner.init, 1).shared
+    start, _ = first_state(env, learner, processes, config, None, shared)
+    keys = [start.rollout.env_state.key.tolist()]
+    metadata = {"task": "probe", "config": to_mapping(config), "seconds": 1.0, "environments": False}
+    for updates in (1, 2):
+        later = without_environments(start) | {"updates": jnp.int32(updates)}
+        path = save_checkpoint(tmp_path, later, 16 * updates, metadata, keep=2)
+        state, seconds = first_state(env, learner, processes, config, path, shared)
+        keys.append(state.rollout.env_state.key.tolist())
+        assert seconds == 1.0 and int(state.updates) == updates and state.key.tolist() == start.key.tolist()
+    assert len({tuple(key) for key in keys}) == 3
+
+
+def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> None:
+    env = Probe(probes.show_hidden, probes.pay_near_hidden, N)
+    results = []
+    for seed in (0, 1):
+        values: dict[str, Any] = {
+            "num_envs": N,
+            "seed": seed,
+            "evaluation": {"every": 1, "episodes": N},
+            "ppo": {"minibatches": 1},
+        }
+        config = build(
+            TrainConfig, {**values, "network": {"recurrent": False, "hidden_sizes": [4]}, "rollout_steps": 4}
+        )
+        state = jax.jit(make_learner(env, config).init)(KEY)
+        policy = policy_of(state, env_dims(env, config), config, task="probe")
+        one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
+        assert (one["env_steps"], two["env_steps"]) == (3, 5) and one["sampled"] == two["sampled"] != one[
+            "deterministic"
+        ]
+        assert one["deterministic"] == two["deterministic"]
+        results.append(one["sampled"])
+    assert results[0] != results[1]
+
+
+def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> None:
+    whole = [{"env_steps": steps, "sampled": {}, "deterministic": {}} for steps in (5, 10)]
+    text = {"evaluations": whole, "absolute": {"env_steps": 5, "sampled": {}, "deterministic": {}}, "ended_at": 10}
+    (tmp_path / "evaluations.json").write_text(json.dumps(text))
+    for steps, count, absolute in ((4, 0, False), (5, 1, False), (9, 1, False), (10, 2, True), (15, 2, False)):
+        log = EvaluationLog(tmp_path, steps)
+        assert log.evaluations == whole[:count] and (log.absolute is not None) == absolute
+        assert log.last_steps() == ([None, 5, 10][count])
+
+
+# -- leagues and tournaments -------------------------------------------------------------------------------------------
+
+
+def test_a_member_joins_with_the_learners_rating_and_weights() -> None:
+    """A snapshot is due every four updates, and a place in use by a block that plays members is kept."""
+    env: Any = object.__new__(league.League)
+    env._moving, env._members = np.array([True, False]), 2
+    settings = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=1.0)
+    env._config = SimpleNamespace(league=settings, steps_per_update=4)
+    full = pool.new_pool({"x": jnp.zeros(1)}, 2)._replace(born=jnp.array([0, 1]), score=jnp.array([9.0, 5.0]))
+    full = full._replace(games=jnp.full(2, 9.0), rating=jnp.array([1.0, 2.0]))
+    for member, place in (([1, 0], 0), ([0, 1], 1)):
+        blocks = jnp.array(member, jnp.int32)
+        state = league.LeagueState(full, blocks, blocks, jnp.float32(55.0), jnp.int32(2), jnp.zeros((2, 3)), KEY)
+        assert env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(5)).pool.born.tolist() == [0, 1]
+        after = env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(6))
+        assert int(after.snapshot) == int(after.pool.born[place]) == 6
+        assert float(after.pool.rating[place]) == 55.0 and float(after.pool.arrays["x"][place, 0]) == 1.0
+        other = 1 - place
+        assert [float(x[other]) for x in (after.pool.rating, after.pool.games)] == [1.0 + other, 9.0]
+        assert float(after.pool.games[place]) == float(after.pool.score[place]) == 0.0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """The state of matches without physics."""
+
+    obs: jax.Array
+    privileged_obs: jax.Array
+    final_obs: jax.Array
+    final_privileged_obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    metrics: dict[str, jax.Array]
+    step: jax.Array
+    assistance: jax.Array
+
+
+class Matches:
+    """Twelve matches of episodes of two steps; match i ends its first in win, draw or loss by i modulo 3, then wins."""
+
+    name, num_envs, num_agents, action_size, teams, max_episode_steps = "match", 12, 2, 1, ((0,), (1,)), 8
+    observation_size, privileged_observation_size, env = 1, 1, None
+
+    def reset(self, key: jax.Array) -> Score:
+        return self._state(jnp.zeros(12, jnp.int32))
+
+    def step(self, state: Score, action: jax.Array) -> Score:
+        return self._state(state.step + 1)
+
+    def _state(self, step: jax.Array) -> Score:
+        done, result = step % 2 == 0, jnp.where(step <= 2, jnp.arange(12) % 3, 0)
+        metrics = {f"team0/{name}": (result == i).astype(jnp.float32) for i, name in enumerate(OUTCOMES)}
+        obs, none = jnp.zeros((12, 2, 1)), jnp.zeros((12, 1))
+        return Score(obs, none, obs, none, jnp.zeros((12, 2)), done, jnp.zeros(12, bool), metrics, step, none[:, 0])
+
+
+def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
+    """Opponents are met in turn: of two, the first has the even matches."""
+    idle = SimplePolicy("match", 1, lambda obs, key: jnp.zeros((len(obs), 1, 1)))
+    for count, expected in ((1, [[4, 4, 4]]), (2, [[2, 2, 2]] * 2), (3, [[4, 0, 0], [0, 4, 0], [0, 0, 4]])):
+        matches: Any = Matches()
+        assert tournament.play(matches, idle, [idle] * count, KEY).tolist() == expected
+
+
+class Decided(Matches):
+    """Episodes of eight steps; from the sixth on team 0 has won every third match, and team 1 the next ones."""
+
+    def _state(self, step: jax.Array) -> Score:
+        state, late = super()._state(step), step >= 6
+        metrics = {"success": late & (jnp.arange(12) % 3 == 0), "team1/win": late & (jnp.arange(12) % 3 == 1)}
+        metrics = {name: value.astype(jnp.float32) for name, value in metrics.items()}
+        return dataclasses.replace(state, metrics=metrics, terminated=step == 8)
+
+
+def test_phases_of_a_match_lead_to_either_teams_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "EPISODES", 12)
+    monkeypatch.setattr(demonstrations, "MOMENTS", 4)
+    monkeypatch.setattr(demonstrations, "_fields", lambda state: {"step": state.step})
+    batch: Any = object.__new__(demonstrations.Demonstrated)
+    batch._guide, batch.backward, batch.max_episode_steps = Decided(), True, 8
+    batch.demonstrator = SimplePolicy("match", 2, lambda obs, key: jnp.zeros((len(obs), 2, 1)))
+    found = batch._record()
+    np.testing.assert_allclose(found["phase"], [*[2 / 6] * 8, *[4 / 6] * 8, *[np.inf] * 32])
+    assert found["step"][:16].tolist() == [2] * 8 + [4] * 8
