@@ -6,7 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mqe_jax import demonstrations
+from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.league import league, pool, tournament
 from mqe_jax.opponents import OUTCOMES
 from mqe_jax.policies import SimplePolicy
@@ -41,35 +42,28 @@ def test_first_episodes_begin_at_any_step_of_their_time() -> None:
     assert len(counts) == 8 and np.abs(counts / 1000 - 1).max() < 0.15
 
 
-class Helped(NamedTuple):
-    """The state of an environment whose reward is its assistance; every step is an episode, and a success."""
-
-    obs: jax.Array
-    privileged_obs: jax.Array
-    final_obs: jax.Array
-    final_privileged_obs: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    metrics: dict[str, jax.Array]
-    assistance: jax.Array
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Fields(EnvironmentState):
+    """The state of an environment without physics."""
 
 
 class Help:
-    """One agent in four environments."""
+    """One agent in four environments; its reward is its assistance; every step is an episode, and a success."""
 
     name, num_envs, num_agents, action_size = "help", N, 1, 1
     observation_size, privileged_observation_size = 1, 1
 
-    def reset(self, key: jax.Array) -> Helped:
+    def reset(self, key: jax.Array) -> Fields:
         return self._state(jnp.zeros(N))
 
-    def step(self, state: Helped, action: jax.Array) -> Helped:
+    def step(self, state: Fields, action: jax.Array) -> Fields:
         return self._state(state.assistance)
 
-    def _state(self, assistance: jax.Array) -> Helped:
+    def _state(self, assistance: jax.Array) -> Fields:
         obs, done, metrics = jnp.zeros((N, 1, 1)), jnp.ones(N, bool), {"pay": assistance, "success": jnp.ones(N)}
-        return Helped(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, metrics, assistance)
+        rest = metrics, jnp.zeros(N, jnp.int32), assistance, KEY
+        return Fields(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, *rest)
 
 
 def test_environments_get_the_assistance_of_the_schedule_and_of_their_success() -> None:
@@ -158,40 +152,24 @@ def test_a_member_joins_with_the_learners_rating_and_weights() -> None:
         assert float(after.pool.games[place]) == float(after.pool.score[place]) == 0.0
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Score:
-    """The state of matches without physics."""
-
-    obs: jax.Array
-    privileged_obs: jax.Array
-    final_obs: jax.Array
-    final_privileged_obs: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    metrics: dict[str, jax.Array]
-    step: jax.Array
-    assistance: jax.Array
-
-
 class Matches:
     """Twelve matches of episodes of two steps; match i ends its first in win, draw or loss by i modulo 3, then wins."""
 
     name, num_envs, num_agents, action_size, teams, max_episode_steps = "match", 12, 2, 1, ((0,), (1,)), 8
     observation_size, privileged_observation_size, env = 1, 1, None
 
-    def reset(self, key: jax.Array) -> Score:
+    def reset(self, key: jax.Array) -> Fields:
         return self._state(jnp.zeros(12, jnp.int32))
 
-    def step(self, state: Score, action: jax.Array) -> Score:
+    def step(self, state: Fields, action: jax.Array) -> Fields:
         return self._state(state.step + 1)
 
-    def _state(self, step: jax.Array) -> Score:
+    def _state(self, step: jax.Array) -> Fields:
         done, result = step % 2 == 0, jnp.where(step <= 2, jnp.arange(12) % 3, 0)
         metrics = {f"team0/{name}": (result == i).astype(jnp.float32) for i, name in enumerate(OUTCOMES)}
         obs, none = jnp.zeros((12, 2, 1)), jnp.zeros((12, 1))
-        return Score(obs, none, obs, none, jnp.zeros((12, 2)), done, jnp.zeros(12, bool), metrics, step, none[:, 0])
+        rest = jnp.zeros((12, 2)), done, jnp.zeros(12, bool), metrics, step, none[:, 0], KEY
+        return Fields(obs, none, obs, none, *rest)
 
 
 def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
@@ -205,7 +183,7 @@ def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
 class Decided(Matches):
     """Episodes of eight steps; from the sixth on team 0 has won every third match, and team 1 the next ones."""
 
-    def _state(self, step: jax.Array) -> Score:
+    def _state(self, step: jax.Array) -> Fields:
         state, late = super()._state(step), step >= 6
         metrics = {"success": late & (jnp.arange(12) % 3 == 0), "team1/win": late & (jnp.arange(12) % 3 == 1)}
         metrics = {name: value.astype(jnp.float32) for name, value in metrics.items()}
