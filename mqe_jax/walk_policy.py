@@ -237,7 +237,7 @@ class RestrictedWalkPolicy(WalkPolicy):
             rows[:, 1:, 1:] = window[..., self._kept]
             rows[:, :-1, -NUM_JOINTS:] += window[..., _COLUMNS["previous_action"]]
             history = rows.reshape(len(weight), -1)[:, -self._size :]
-            layers["0"] = {**layers["0"], "weight": jnp.asarray(np.concatenate([history, rest], axis=1))}
+            layers["0"] = {**layers["0"], "weight": jax.device_put(np.concatenate([history, rest], axis=1))}
         return params
 
 
@@ -271,7 +271,7 @@ def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
         if tuple(flat[name].shape) != shape:
             raise InputError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
         part, layer, kind = name.split(".")
-        params[part].setdefault(layer, {})[kind] = jnp.asarray(np.asarray(flat[name], np.float32))
+        params[part].setdefault(layer, {})[kind] = jax.device_put(np.asarray(flat[name], np.float32))
     return params
 
 
