@@ -89,8 +89,8 @@ class QuadrupedEnv(Task[S, P]):
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         skill = skills.make(self.params.skill, self.robot)
-        if not (npcs := scene.num_robots > self.num_agents):  # NPC robots may get any commands
-            skill = skill.restricted(self.params.commands, self.params.gait)
+        if not (npcs := scene.num_robots > self.num_agents) or self.npc_varied:
+            skill = skill.restricted((*self.params.commands, *self.npc_varied), self.params.gait)
         uses_skill = control == "command" or npcs
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
