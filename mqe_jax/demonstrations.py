@@ -59,11 +59,6 @@ class Demonstrated(VectorEnv):
             demonstrations = self._record()
         return DemonstratedState(**vars(super().reset(key)), demonstrations=demonstrations)
 
-    def share(self, parts: int) -> Demonstrated:
-        """Returns the batch of one of several processes, as `VectorEnv.share`."""
-        num_envs = devices.share("num_envs", self.num_envs, parts)
-        return Demonstrated(self.env, num_envs, self.demonstrator, self.copies, backward=self.backward)
-
     def step(self, state: State, action: jax.Array) -> DemonstratedState:
         """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
         self.check_action(action)

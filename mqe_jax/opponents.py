@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs import QuadrupedEnv, VectorEnv
+from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.state import EnvironmentState
-from mqe_jax.envs.wrappers import Wrapper
+from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Number
 from mqe_jax.policies import load_opponent, team_size
@@ -59,47 +58,24 @@ class TeamState(EnvironmentState):
     """The opponent of each block of environments."""
 
 
-class OneTeam:
-    """What `Versus` and `Mirror` share: the interface of `VectorEnv`, for one team."""
-
-    env: QuadrupedEnv
-    """The task."""
-    matches: Any
-    """The matches, a `VectorEnv` or a `Wrapper`."""
-    num_envs: int
-    """Number of environments M."""
-    num_agents: int
-    """Number of agents of a team T."""
-    teams: tuple[tuple[int, ...], ...]
-    """Agents of the only team."""
-    max_episode_steps: int
-    """Environment steps until the time limit."""
+class OneTeam(Outer):
+    """What `Versus` and `Mirror` share: M environments of the only team, around matches."""
 
     def __init__(self, matches: VectorEnv | Wrapper, num_envs: int) -> None:
         if len(check("env", matches, AnyBatch).teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
-        self.env, self.matches, self.name, self.num_envs = matches.env, matches, matches.name, num_envs
-        self.num_agents = team_size(matches)
+        super().__init__(matches)
+        self.num_envs, self.num_agents = num_envs, team_size(matches)
         self.teams = (tuple(range(self.num_agents)),)
-        self.max_episode_steps = matches.max_episode_steps
-        self.observation_size = matches.observation_size
-        self.privileged_observation_size = matches.privileged_observation_size
-        self.action_size = matches.action_size
-
-    def share(self, parts: int) -> Self:
-        """Returns the environments of one of several processes, as `VectorEnv.share`."""
-        other = copy.copy(self)
-        other.num_envs = devices.share("num_envs", self.num_envs, parts)
-        other.matches = self.matches.share(parts)
-        return other
 
     def _stepped(self, state: TeamState, action: jax.Array) -> EnvironmentState:
         """Advances the matches by a step with the actions of all agents (N, A, D)."""
-        every = self.num_envs // self.matches.num_envs
+        every = self.num_envs // self.inner.num_envs
         match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
-        return self.matches.step(match, action)
+        return self.inner.step(match, action)
 
-    def _check_action(self, action: jax.Array) -> None:
+    def check_action(self, action: jax.Array) -> None:
+        """Raises an InputError for actions of another shape than (M, T, action_size)."""
         shape = (self.num_envs, self.num_agents, self.action_size)
         if jnp.shape(action) != shape:
             raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
@@ -136,18 +112,18 @@ class Versus(OneTeam):
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
         key, match_key = jax.random.split(key)
-        match = self.matches.reset(match_key)
+        match = self.inner.reset(match_key)
         opponents = []
         for policy in self.opponents:
             arrays = _arrays(policy)
             waiting, memory = jnp.zeros((self._size,), bool), policy.initial_memory(self._size)
             opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
-        action = jnp.zeros((self.num_envs, self.matches.num_agents, self.action_size))
+        action = jnp.zeros((self.num_envs, self.inner.num_agents, self.action_size))
         return self._seen(match, action, tuple(opponents), key)
 
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
-        self._check_action(action)
+        self.check_action(action)
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
         others, opponents = [], []
         for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
@@ -264,13 +240,13 @@ class Mirror(OneTeam):
 
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments."""
-        action = jnp.zeros((self.matches.num_envs, self.matches.num_agents, self.action_size))
-        return self._seen(self.matches.reset(key), action)
+        action = jnp.zeros((self.inner.num_envs, self.inner.num_agents, self.action_size))
+        return self._seen(self.inner.reset(key), action)
 
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
-        self._check_action(action)
-        both = action.reshape(self.matches.num_envs, 2 * self.num_agents, self.action_size)
+        self.check_action(action)
+        both = action.reshape(self.inner.num_envs, 2 * self.num_agents, self.action_size)
         return self._seen(self._stepped(state, both), both)
 
     def _seen(self, match: EnvironmentState, action: jax.Array) -> TeamState:

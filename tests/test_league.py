@@ -298,7 +298,7 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
 def test_a_process_has_a_league_of_its_own_environments() -> None:
     env = League(matches(num_envs=8), SOURCES, config_of()).share(2)
     assert isinstance(env, League) and env.learner_hook is env
-    assert env.num_envs == env.matches.num_envs == 4
+    assert env.num_envs == env.inner.num_envs == 4
 
 
 def test_ratings_recover_the_strengths_behind_many_games() -> None:

@@ -52,6 +52,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "optimizer": {"schedule": "linear", "target_kl": 100.0},
         "normalization": {"observations": True, "advantages": False},
         "curriculum": {"failure_bootstrap": 0.6},
+        "imitation": {"teacher": "scripted", "weight": 0.7, "until": 0.6},
+        "action_scale": 0.5,
     },
     "a ratio per dimension": {
         "ppo": {"ratio": "dimension", "critic_warmup": 0.9, "value_clip": 0.5, "entropy_coef": 0.2},
@@ -60,6 +62,16 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "normalization": {"values": False, "observations": True},
     },
 }
+
+
+class Teacher:
+    """A policy that acts by two of the numbers that an agent observes."""
+
+    def initial_memory(self, num_envs: int) -> tuple[()]:
+        return ()
+
+    def act(self, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return jnp.sin(obs[..., -2:]), memory
 
 
 def config_of(name: str) -> TrainConfig:
@@ -73,7 +85,7 @@ def config_of(name: str) -> TrainConfig:
 def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tuple[Any, Transition]:
     """A state after some updates, whose statistics are not trivial, and a rollout of random numbers."""
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
-    env = dataclasses.replace(env, show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
+    env = dataclasses.replace(env, teacher=Teacher(), show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
     made = learning.make_learner(env, config)
     normal = lambda *shape: jnp.asarray(random.normal(size=shape), jnp.float32)  # noqa: E731
     state = jax.jit(made.init)(jax.random.PRNGKey(0))
@@ -211,10 +223,12 @@ class Plain:
         parts = jax.vmap(lambda chunk: self.parts(params, *chunk))(jnp.asarray(chunks))
         mean, ppo = {name: jnp.mean(values) for name, values in parts.items()}, self.config.ppo
         actor = 0.0 if self.progress < ppo.critic_warmup else 1.0
+        taught = self.config.imitation.weight * (1.0 - self.progress / self.config.imitation.until)
         coefficient = ppo.entropy_coef
         if ppo.entropy_coef_final is not None:
             coefficient += self.progress * (ppo.entropy_coef_final - ppo.entropy_coef)
-        return actor * (mean["policy"] - coefficient * mean["entropy"]) + ppo.value_coef * mean["value"], mean
+        loss = mean["policy"] - coefficient * mean["entropy"] + taught * mean.get("imitation", 0.0)
+        return actor * loss + ppo.value_coef * mean["value"], mean
 
     def parts(self, params: Any, start: Any, n: Any) -> dict[str, Any]:
         """The parts of the loss of one chunk, each in a list over its steps and agents."""
@@ -233,6 +247,10 @@ class Plain:
                 mean, log_std, memory = self.mean(params, agent, memory, self.obs[t, n, agent])
                 next_actors.append(memory)
                 density = -0.5 * ((data.action[t, n, agent] - mean) / jnp.exp(log_std)) ** 2 - log_std
+                if self.config.imitation.teacher:
+                    apart = jnp.sin(data.obs[t, n, agent, -2:]) / self.config.action_scale - mean
+                    density_there = -0.5 * (apart / jnp.exp(log_std)) ** 2 - log_std - 0.5 * math.log(2 * math.pi)
+                    rows.setdefault("imitation", []).append(-jnp.sum(density_there))
                 change.append(density - 0.5 * math.log(2 * math.pi) - data.log_prob[t, n, agent])
                 rows["entropy"].append(jnp.sum(log_std) + D * 0.5 * math.log(2 * math.pi * math.e))
                 rows["kl"].append(jnp.exp(jnp.sum(change[-1])) - 1 - jnp.sum(change[-1]))
@@ -317,7 +335,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
     plain.prepare()
     params, rate, moments, factor = plain.learn(np.stack([length * (order // N), order % N], axis=-1))
     names = {"policy": "loss/policy", "value": "loss/value", "kl": "approx_kl", "clipped": "clip_fraction"}
-    names["norm"] = "grad_norm"
+    names |= {"norm": "grad_norm", "imitation": "loss/imitation"}
     for key, value in plain.metrics.items():
         np.testing.assert_allclose(metrics[names.get(key, key)], value, rtol=2e-3, atol=1e-4, err_msg=key)
     close = lambda x, y: np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-4)  # noqa: E731

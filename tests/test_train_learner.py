@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -214,6 +215,39 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
     assert all(sorted(order) == list(range(8)) for order in drawn)
 
 
+class Opposite:
+    """Acts against the hidden sign, which agents observe."""
+
+    def initial_memory(self, num_envs: int) -> tuple[()]:
+        return ()
+
+    def act(self, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        return -0.5 * obs[..., -1:], memory
+
+
+class Recurrent(Opposite):
+    def initial_memory(self, num_envs: int) -> Any:
+        return jnp.zeros(num_envs)
+
+
+def test_a_teacher_is_imitated_while_its_weight_lasts() -> None:
+    """The reward asks for the sign, the teacher shows the opposite: imitated at first, given up for the reward."""
+    env = Probe(probes.show_hidden, lambda hidden, action: hidden * jnp.mean(jnp.clip(action[..., 0], -1, 1), -1))
+    env = dataclasses.replace(env, num_envs=32, teacher=Opposite())
+    config = small(total_steps=32 * 8 * 120, network__log_std_min=-1.0)
+    config = override(config, {"imitation": {"teacher": "scripted", "weight": 20.0, "until": 0.5}})
+    learner = make_learner(env, config)
+    state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
+    rewards = []
+    for _ in range(120):
+        state, _ = update(state)
+        rewards.append(float(jnp.mean(state.rollout.env_state.reward)))
+    assert np.mean(rewards[20:40]) < -0.3
+    assert np.mean(rewards[-10:]) > 0.6
+    with pytest.raises(InputError, match=r"^imitation\.teacher: 'scripted' is not allowed; .* without recurrent state"):
+        make_learner(dataclasses.replace(env, teacher=Recurrent()), config)
+
+
 def test_outcomes_and_returns_are_averaged_over_episode_ends(one_pass: OnePass) -> None:
     """Even environments end after 2 steps with success, odd ones after 4 without: 2 of 3 ends are successes."""
     metrics = one_pass.metrics[0]
@@ -232,6 +266,10 @@ def test_settings_must_fit_the_environment() -> None:
         ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
         ({"num_envs": 4, "network": {"recurrent": True, "chunk_length": 3}}, "rollout_steps: 8 .* chunk_length"),
         ({"num_envs": 4, "curriculum__assistance": 1.0}, "curriculum.assistance: 1.0 is not allowed"),
+        (
+            {"num_envs": 4, "imitation__teacher": "scripted"},
+            "imitation.teacher: 'scripted' is not allowed; .* recurrent",
+        ),
         ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
     ):
         with pytest.raises(InputError, match=f"^{message}"):

@@ -64,6 +64,7 @@ class Probe:
     even_truncate: bool = False
     teams: tuple[tuple[int, ...], ...] = ((0, 1),)
     name: str = "probe"
+    teacher: Any = None
 
     @property
     def observation_size(self) -> int:

@@ -92,13 +92,18 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     if config.evaluation.every is not None:
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
     _check_teams(both, config)
+    learning: Any
     if len(both.teams) < 2:
-        return batch(config.num_envs), eval_env
-    if opponents:
+        learning = batch(config.num_envs)
+    elif opponents:
         matches = batch(config.num_envs)
         learning = League(BothSides(matches) if config.both_sides else matches, opponents, config)
     else:
         learning = Mirror(batch(config.num_envs // 2))
+    if config.imitation.teacher is not None:
+        learning.teacher = load_policy(config.imitation.teacher, both)
+    if len(both.teams) < 2:
+        return learning, eval_env
     if eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
         eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed or anchors(eval_env.env)[:1])
@@ -116,8 +121,9 @@ def check_start(config: TrainConfig) -> None:
     _check_teams(env, config)
     for name in {*config.opponents} - {*MOVING}:
         load_opponent(name, env)
-    if config.curriculum.demonstrator is not None:
-        load_policy(config.curriculum.demonstrator, env)
+    for name in (config.curriculum.demonstrator, config.imitation.teacher):
+        if name is not None:
+            load_policy(name, env)
 
 
 def _check_teams(env: Any, config: TrainConfig) -> None:

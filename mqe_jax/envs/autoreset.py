@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -86,9 +88,12 @@ class VectorEnv:
         """Returns N initial states; every leaf has a leading axis N."""
         return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
 
-    def share(self, parts: int) -> VectorEnv:
+    def share(self, parts: int) -> Self:
         """Returns the batch of one of several processes; raises an InputError for a fraction of an environment."""
-        return VectorEnv(self.env, devices.share("num_envs", self.num_envs, parts), self.copies)
+        other = copy.copy(self)
+        other.num_envs = devices.share("num_envs", self.num_envs, parts)
+        other.env = self.env.with_num_envs(other.num_envs * self.copies)
+        return other
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances all environments by one step with actions (N, A, action_size); resets those that ended.

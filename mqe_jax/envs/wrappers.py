@@ -24,8 +24,8 @@ class WrappedState(EnvironmentState):
     """Actions that the wrapped batch received in the last step (N, A, D)."""
 
 
-class Wrapper:
-    """A batch of environments around another, with the interface of `VectorEnv`; subclasses change what is seen."""
+class Outer:
+    """A batch of environments around another: the attributes of `VectorEnv`, by default those of the inner one."""
 
     inner: Any
     """The wrapped batch."""
@@ -43,6 +43,10 @@ class Wrapper:
         other.num_envs = devices.share("num_envs", self.num_envs, parts)
         other.inner = self.inner.share(parts)
         return other
+
+
+class Wrapper(Outer):
+    """A batch of environments around another; subclasses change what is seen."""
 
     def check_action(self, action: jax.Array) -> None:
         """Raises an InputError for actions of another shape than (N, A, action_size)."""

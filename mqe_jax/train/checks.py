@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 
 from mqe_jax.errors import InputError
@@ -42,6 +44,9 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
     if config.curriculum.assistance_step and "success" not in state.metrics:
         fail("curriculum.assistance_step", config.curriculum.assistance_step, f"0: {env.name} has no metric success")
+    teacher: Any = getattr(env, "teacher", None)
+    if config.imitation.teacher is not None and (teacher is None or jax.tree.leaves(teacher.initial_memory(1))):
+        fail("imitation.teacher", config.imitation.teacher, "a policy without recurrent state, which is env.teacher")
     if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
         fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
 

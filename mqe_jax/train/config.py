@@ -119,6 +119,21 @@ class Curriculum:
 
 
 @record
+class Imitation:
+    """A teacher that the policy imitates in the states that it reaches itself (Schmitt et al., arXiv 1803.03835).
+
+    The loss is the negative log-probability of the teacher's action.
+    """
+
+    teacher: str | None = None
+    """Policy without recurrent state: scripted, a run folder or a policy file; none disables imitation."""
+    weight: NonNegative = 1.0
+    """Initial weight of the loss, annealed linearly to 0."""
+    until: Positive = 0.5
+    """Fraction of training after which the weight is 0."""
+
+
+@record
 class Normalization:
     """Normalisation to mean 0 and standard deviation 1."""
 
@@ -215,6 +230,7 @@ class TrainConfig:
     optimizer: OptimizerSettings = OptimizerSettings()
     network: Annotated[NetworkSettings, pydantic.BeforeValidator(network_settings)] = ActorCritic()
     curriculum: Curriculum = Curriculum()
+    imitation: Imitation = Imitation()
     normalization: Normalization = Normalization()
     checkpoint: Checkpointing = Checkpointing()
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)

@@ -153,8 +153,7 @@ def chunks(x: jax.Array, length: int) -> jax.Array:
 def take(batch: Batch, index: jax.Array) -> Batch:
     """Returns the chunks with the given indices (C',)."""
     memory = jax.tree.map(lambda x: x[index], batch.memory)
-    rest = {name: getattr(batch, name)[:, index] for name in Batch._fields if name != "memory"}
-    return Batch(memory=memory, **rest)
+    return jax.tree.map(lambda x: x[:, index], batch._replace(memory=()))._replace(memory=memory)
 
 
 def minibatches(ppo: PPO, key: jax.Array, parts: int, envs: int) -> jax.Array:

@@ -23,6 +23,8 @@ class Scheduled(NamedTuple):
     """`ppo.advantage_clip`; infinite where it does not apply."""
     entropy_coef: jax.Array
     """`ppo.entropy_coef`."""
+    imitation: jax.Array
+    """`imitation.weight`."""
     actor_coef: jax.Array | float
     """Weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1."""
     learning_rate_factor: jax.Array
@@ -49,6 +51,7 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
         failure_bootstrap=falling(curriculum.failure_bootstrap, curriculum.failure_bootstrap_until),
         advantage_clip=jnp.where(progress < ppo.advantage_clip_until, clip, jnp.inf),
         entropy_coef=entropy_coef,
+        imitation=falling(config.imitation.weight, config.imitation.until),
         actor_coef=(progress >= ppo.critic_warmup).astype(jnp.float32) if ppo.critic_warmup else 1.0,
         learning_rate_factor=factor,
     )

@@ -61,8 +61,9 @@ class VectorEnv(Protocol):
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
-    which `curriculum.assistance` sets (see `replace_fields`); `learner_hook` (a `LearnerHook`). In several processes,
-    `share(parts)` returns the batch of one, whose states are consecutive rows of those of all (`devices.rows`).
+    which `curriculum.assistance` sets (see `replace_fields`); `teacher`, a `Policy` without recurrent state, which
+    `imitation` needs; `learner_hook` (a `LearnerHook`). In several processes, `share(parts)` returns the batch of one,
+    whose states are consecutive rows of those of all (`devices.rows`).
     """
 
     @property
@@ -199,3 +200,5 @@ class Batch(NamedTuple):
     """Value targets in units of reward (L, C, V)."""
     old_value: jax.Array
     """Normalised values at collection (L, C, V)."""
+    lesson: jax.Array | tuple[()]
+    """Actions of the teacher, unscaled (L, C, A, D); empty without one."""
