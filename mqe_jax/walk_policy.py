@@ -16,8 +16,8 @@ adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives t
 the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32; in
 an environment's step in TF32 on an NVIDIA GPU.
 
-These 2100 numbers contain every action twice, constant commands 30 times, and in most gaits one clock four times. `RestrictedWalkPolicy` computes the same
-actions from about two thirds of them, with weights changed accordingly.
+These 2100 numbers contain every action twice, constant commands 30 times, and in most gaits one clock four times.
+`RestrictedWalkPolicy` computes the same actions from about two thirds of them, with weights changed accordingly.
 """
 
 from __future__ import annotations
