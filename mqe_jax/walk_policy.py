@@ -16,8 +16,8 @@ adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives t
 the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32; in
 an environment's step in TF32 on an NVIDIA GPU.
 
-These 2100 numbers contain every action twice and constant commands 30 times. `RestrictedWalkPolicy` computes the same
-actions from about two thirds of them, with weights changed accordingly.
+These 2100 numbers contain every action twice, constant commands 30 times, and in most gaits one clock four times.
+`RestrictedWalkPolicy` computes the same actions from about two thirds of them, with weights changed accordingly.
 """
 
 from __future__ import annotations
@@ -105,11 +105,16 @@ class WalkMemory:
     """Phase of the gait cycle () in [0, 1)."""
 
 
+def _shifts(commands: Any) -> list[Any]:
+    """Returns each foot's shift in the gait cycle, FL FR RL RR."""
+    phase, offset, bound = commands[5], commands[6], commands[7]
+    return [phase + offset + bound, offset, bound, phase]
+
+
 def foot_phases(gait: jax.Array, commands: jax.Array) -> jax.Array:
     """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above."""
-    phase, offset, bound, duration = commands[5], commands[6], commands[7], commands[8]
-    shift = jnp.stack([phase + offset + bound, offset, bound, phase])
-    raw = jnp.mod(gait + shift, 1.0)
+    duration = commands[8]
+    raw = jnp.mod(gait + jnp.stack(_shifts(commands)), 1.0)
     return jnp.where(raw < duration, 0.5 * raw / duration, 0.5 + 0.5 * (raw - duration) / (1.0 - duration))
 
 
@@ -197,18 +202,27 @@ class RestrictedWalkPolicy(WalkPolicy):
     """The walk policy where only some commands vary: the same actions from a shorter history.
 
     The history is the end of a stream of rows, one per observation: a one, and the observation without the constant
-    commands and without the action before the last one, which is the last action of the row before.
+    commands and without the action before the last one, which is the last action of the row before. Where all feet are
+    in step or half a cycle apart, it has the first foot's clock alone, which the others equal except for the sign.
     """
 
     def __init__(self, robot: Robot, varied: Sequence[str], gait: str | None) -> None:
         """Creates the skill; commands that are not in `varied` always have the gait's defaults."""
         super().__init__(robot)
-        changing = np.sort(self.index(varied))
-        self._constant = COMMAND_SCALE * self.default_commands(gait)
-        self._constant[changing] = 0.0
-        state = [_COLUMNS[name] for name in ("gravity", "joint_position", "joint_velocity", "clock", "action")]
-        self._kept = np.concatenate([_COLUMNS["commands"][changing], *state])
+        changing, default = np.unique(self.index(varied)), self.default_commands(gait)
+        halves = 2 * (np.array(_shifts(default)) - _shifts(default)[0])  # half cycles after the first foot
+        alike = default[8] == 0.5 and not (halves % 1).any() and not {5, 6, 7, 8} & {*changing.tolist()}
+        clock = _COLUMNS["clock"][: 1 if alike else None]
+        sensed = [_COLUMNS[name] for name in ("gravity", "joint_position", "joint_velocity")]
+        self._kept = np.concatenate([_COLUMNS["commands"][changing], *sensed, clock, _COLUMNS["action"]])
         self._width = 1 + len(self._kept)
+        constant = COMMAND_SCALE * default
+        constant[changing] = 0.0
+        self._observation = np.zeros((OBSERVATION_SIZE, self._width), np.float32)  # times a row
+        self._observation[_COLUMNS["commands"], 0] = constant
+        self._observation[self._kept, 1:] = np.eye(len(self._kept))
+        if alike:
+            self._observation[_COLUMNS["clock"], -NUM_JOINTS - 1] = (-1) ** halves
         least = HISTORY * self._width + NUM_JOINTS  # the rows, and the last action of the row before
         self._size = least + -least % 16  # 64 bytes: products of aligned rows are faster
 
@@ -224,8 +238,8 @@ class RestrictedWalkPolicy(WalkPolicy):
     def folded(self, params: Params) -> Params:
         """Returns weights that compute from histories of rows what `params` compute from 30 observations.
 
-        In the first layers, the weights of both occurrences of an action are added, and those of constant commands,
-        times their values, become the weight of the row's one.
+        In the first layers, the weights of both occurrences of an action are added, those of constant commands,
+        times their values, become the weight of the row's one, and those of clocks that are alike become one.
         """
         params = {part: dict(layers) for part, layers in params.items()}
         for layers in params.values():
@@ -233,11 +247,10 @@ class RestrictedWalkPolicy(WalkPolicy):
             window, rest = np.split(weight, [HISTORY * OBSERVATION_SIZE], axis=1)
             window = window.reshape(-1, HISTORY, OBSERVATION_SIZE)
             rows = np.zeros((len(weight), HISTORY + 1, self._width), np.float32)
-            rows[:, 1:, 0] = window[..., _COLUMNS["commands"]] @ self._constant
-            rows[:, 1:, 1:] = window[..., self._kept]
+            rows[:, 1:] = window @ self._observation
             rows[:, :-1, -NUM_JOINTS:] += window[..., _COLUMNS["previous_action"]]
             history = rows.reshape(len(weight), -1)[:, -self._size :]
-            layers["0"] = {**layers["0"], "weight": jnp.asarray(np.concatenate([history, rest], axis=1))}
+            layers["0"] = {**layers["0"], "weight": jax.device_put(np.concatenate([history, rest], axis=1))}
         return params
 
 
@@ -271,7 +284,7 @@ def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
         if tuple(flat[name].shape) != shape:
             raise InputError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
         part, layer, kind = name.split(".")
-        params[part].setdefault(layer, {})[kind] = jnp.asarray(np.asarray(flat[name], np.float32))
+        params[part].setdefault(layer, {})[kind] = jax.device_put(np.asarray(flat[name], np.float32))
     return params
 
 

@@ -1,6 +1,7 @@
 """The command line: output, streams, settings, run folders, policies and profiles."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -280,6 +281,21 @@ def test_tasks_are_listed_without_mjx_and_nothing_prints_a_warning() -> None:
     rows = {line.split()[0]: line.split() for line in lines if line.startswith("go1")}
     assert rows["go1gate"][-1] == "shipped" and rows["go1plane"][-1] == "none"
     assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"]
+
+
+def test_a_command_starts_without_what_it_does_not_need() -> None:
+    """Nobody chose a GL library before the command, or after it; the list of installed packages is whole again."""
+    code = """
+import importlib.metadata, os, sys
+from mqe_jax.cli import main
+sys.argv = ["mqe", "zoo"]
+assert main() == 0
+print([name for name in ("glfw", "mqe_jax.study.runs") if name in sys.modules], "MUJOCO_GL" in os.environ)
+print(any(True for found in importlib.metadata.distributions()))
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-2:] == ["[] False", "True"]
 
 
 def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:

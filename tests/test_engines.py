@@ -312,3 +312,20 @@ running = f(np.zeros((300, 300), np.float32))
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 0, ended.stderr
+
+
+def test_mjx_imports_what_meshes_need_when_a_model_has_one() -> None:
+    """A tetrahedron above a plane; in a process of its own, since imports stay."""
+    code = """
+import sys, mujoco, jax
+from mqe_jax.engines.private import load_mjx
+mjx = load_mjx()
+print([name in sys.modules for name in ("trimesh", "scipy.spatial")])
+model = mujoco.MjModel.from_xml_string('''<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+<worldbody><geom type="plane" size="9 9 9"/><body pos="0 0 1"><freejoint/><geom type="mesh" mesh="m"/></body>
+</worldbody></mujoco>''')
+data = jax.jit(mjx.forward)(mjx.put_model(model), mjx.make_data(model))
+print([name in sys.modules for name in ("trimesh", "scipy.spatial")])
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ended.stdout.splitlines() == ["[False, False]", "[True, True]"], ended.stderr

@@ -245,15 +245,16 @@ def test_a_taken_or_missing_id_is_refused() -> None:
         register_task(type("Other", (TASKS["go1plane"],), {"name": "go1gate"}))
     with pytest.raises(ValueError, match="its `name` is empty"):
         register_task(type("Nameless", (TASKS["go1plane"],), {"name": ""}))
+    assert [task.name for task in TASKS.values()] == list(TASKS)
 
 
-def test_making_and_stepping_imports_no_foreign_learning_library() -> None:
+def test_making_and_stepping_imports_no_foreign_library_and_no_other_task() -> None:
     code = (
         "import sys, jax, mqe_jax, mqe_jax.train.runner, mqe_jax.walk.training\n"
         "env = mqe_jax.make('go1plane', impl='c', control='position')\n"
         "state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))\n"
         "jax.eval_shape(env.step, state, jax.numpy.zeros((env.num_agents, 12)))\n"
-        "print([m for m in ('flax', 'optax', 'brax', 'torch') if m in sys.modules])"
+        "print([m for m in ('flax', 'optax', 'brax', 'torch', 'gymnasium', 'mqe_jax.envs.gate') if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip().splitlines()[-1] == "[]"

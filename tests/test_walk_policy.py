@@ -225,7 +225,8 @@ def test_phases_are_warped_by_the_duration() -> None:
 
 
 @pytest.mark.parametrize(
-    ("varied", "size"), [(("yaw_rate", "vx", "vy"), 1424), (("vx", "pitch", "gait_frequency", "stance_width"), 1456)]
+    ("varied", "size"),
+    [(("yaw_rate", "vx", "vy"), 1344), (("vx", "pitch", "gait_frequency", "stance_width"), 1376), (("phase",), 1376)],
 )
 def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, ...], size: int) -> None:
     """From the zeros after a reset until the history is full, and beyond, with all weights random."""
@@ -244,10 +245,11 @@ def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, 
 
 
 def test_environments_store_what_actions_can_change() -> None:
-    """All of an observation for NPC robots, to which a task may give any commands."""
+    """All of an observation where a task may give NPC robots any commands."""
     gate, defender = (make(task, impl="c", num_envs=1) for task in ("go1gate", "go1football-defender"))
-    histories = [jax.eval_shape(env.controller.reset).skill.history.shape for env in (gate, defender)]
-    assert histories == [(2, 1424), (3, 30, 70)]
+    leaning = type("Leaning", (type(defender),), {"npc_varied": ()})(impl="c")
+    histories = [jax.eval_shape(env.controller.reset).skill.history.shape for env in (gate, defender, leaning)]
+    assert histories == [(2, 1344), (3, 1344), (3, 30, 70)]
 
 
 def test_memory_shifts_and_advances() -> None:

@@ -28,6 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         interrupts.install()
         from mqe_jax.cli import programs  # after `interrupts.install`
 
+        programs.hasten()
         programs.keep()
     try:
         code, message = _attempt(sys.argv[1:] if arguments is None else arguments)
@@ -81,6 +82,7 @@ def _run(command: Any) -> None:
     from mqe_jax.cli import programs
     from mqe_jax.cli.options import standard_output
 
+    programs.import_libraries()
     programs.write_whole()
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:

@@ -43,10 +43,10 @@ class Render(PolicyOptions):
     def run(self) -> dict[str, Any]:
         """Renders an episode to a file; returns the object for `--json`, with all episodes."""
         from mqe_jax.viz.clips import check_output
-        from mqe_jax.viz.render import gl_backend
+        from mqe_jax.viz.render import load_gl
 
         check_output(self.output)
-        threading.Thread(target=gl_backend, daemon=True).start()  # found while the episode is computed
+        threading.Thread(target=load_gl, daemon=True).start()  # while the episode is computed
         env, _, policy = self.environments(self.best_of)
         options = {name: getattr(self, name) for name in ("seed", "seconds", "fps", "view", "speed", "at")}
         size = None if self.width is None else (self.width, round(self.width * 9 / 32) * 2)

@@ -22,7 +22,6 @@ from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
 from mqe_jax.settings import fail, load_yaml, override
-from mqe_jax.train import runner
 from mqe_jax.train.config import TrainConfig, load_config
 
 CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
@@ -41,6 +40,8 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 
 def run_config(target: str) -> Any:
     """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
+    from mqe_jax.train import runner
+
     if target.endswith(".safetensors"):
         return load_policy(target).config
     if not Path(target).is_dir():

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import importlib
 import io
+import sys
 from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,11 +23,31 @@ if TYPE_CHECKING:
 _ITERATIONS = 1 << 9 | 1 << 10
 
 
+class _Late(ModuleType):
+    """A module that is imported when it is used, once `ready`; until then, all its attributes are `object`."""
+
+    ready = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module(self.__name__), name) if self.ready else object
+
+
+@functools.cache
 def load_mjx() -> ModuleType:
-    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is not installed."""
+    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is not installed.
+
+    The packages with which it computes convex hulls of meshes take 80% of this time; they are imported when it does.
+    """
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        from mujoco import mjx
+    late = {name: _Late(name) for name in ("scipy.spatial", "trimesh") if name not in sys.modules}
+    sys.modules.update(late)
+    try:
+        with contextlib.redirect_stdout(printed):
+            from mujoco import mjx
+    finally:
+        for name, module in late.items():
+            del sys.modules[name]
+            module.ready = True
     for line in printed.getvalue().splitlines():
         if not line.endswith("No module named 'warp'"):
             print(line)

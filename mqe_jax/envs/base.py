@@ -11,7 +11,6 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -21,7 +20,7 @@ from jax.core import Tracer
 from mqe_jax import engines, robots, skills
 from mqe_jax.actuators import Actuators, NetworkActuators, load_actuator_network
 from mqe_jax.control import Controller, check_mode
-from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.observation import ObservationLayout, box
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
@@ -37,6 +36,7 @@ from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.types import RandomKey
 
 if TYPE_CHECKING:
+    from gymnasium.spaces import Box
     from mujoco import mjx
 
 
@@ -89,8 +89,8 @@ class QuadrupedEnv(Task[S, P]):
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         skill = skills.make(self.params.skill, self.robot)
-        if not (npcs := scene.num_robots > self.num_agents):  # NPC robots may get any commands
-            skill = skill.restricted(self.params.commands, self.params.gait)
+        if not (npcs := scene.num_robots > self.num_agents) or self.npc_varied:
+            skill = skill.restricted((*self.params.commands, *self.npc_varied), self.params.gait)
         uses_skill = control == "command" or npcs
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
@@ -144,14 +144,14 @@ class QuadrupedEnv(Task[S, P]):
         return self.privileged_layout.size
 
     @property
-    def action_space(self) -> gymnasium.spaces.Box:
+    def action_space(self) -> Box:
         """All agents' actions (A, action_size) in [-1, 1]."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (self.num_agents, self.action_size), np.float32)
+        return box(1.0, (self.num_agents, self.action_size))
 
     @property
-    def observation_space(self) -> gymnasium.spaces.Box:
+    def observation_space(self) -> Box:
         """All agents' observations (A, O)."""
-        return gymnasium.spaces.Box(-np.inf, np.inf, (self.num_agents, self.observation_size), np.float32)
+        return box(np.inf, (self.num_agents, self.observation_size))
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:

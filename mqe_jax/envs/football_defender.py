@@ -82,6 +82,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi))
     ball_spot = (5.0, -2.1)
     colors = (0, 1, 2)
+    npc_varied = ("vx", "vy", "yaw_rate")
 
     def npc_commands(self, state: State[DefenderState], robot_state: RobotState) -> jax.Array:
         """Walk commands of the defender (1, C)."""
@@ -90,7 +91,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
             move = defend(
                 robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
             )
-            commands = commands.at[self.controller.skill.index(("vx", "vy", "yaw_rate"))].set(move)
+            commands = commands.at[self.controller.skill.index(self.npc_varied)].set(move)
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Box
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,3 +120,10 @@ def others(values: jax.Array) -> jax.Array:
 def for_all(value: jax.Array, agents: int) -> jax.Array:
     """Repeats a vector for every agent: (D,) -> (A, D)."""
     return jnp.broadcast_to(value.reshape(-1), (agents, value.size))
+
+
+def box(bound: float, shape: tuple[int, ...]) -> Box:
+    """Returns the space of arrays of a shape with numbers from -bound to bound."""
+    from gymnasium.spaces import Box  # on demand: importing Gymnasium takes 0.1 s
+
+    return Box(-bound, bound, shape, np.float32)

@@ -1,9 +1,12 @@
-"""Registry of tasks and their scripted policies; a new task is one line in `_SHIPPED`."""
+"""Registry of tasks and their scripted policies; a new task is one line in `_SHIPPED`.
+
+A task's module is imported when its class is asked for: those of all tasks take 0.2 s.
+"""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, MutableMapping
 from typing import Any
 
 import jax
@@ -14,22 +17,22 @@ from mqe_jax.errors import InputError
 Planner = Callable[[dict[str, jax.Array]], jax.Array]
 """Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the `command` mode."""
 
-# The task, as MODULE:CLASS of mqe_jax.envs, and its scripted policy, as MODULE:FUNCTION of mqe_jax.planners or none.
-_SHIPPED: tuple[tuple[str, str | None], ...] = (
-    ("plane:Go1Plane", None),
-    ("gate:Go1Gate", "cooperative:plan_gate"),
-    ("seesaw:Go1Seesaw", "cooperative:plan_seesaw"),
-    ("sheep:Go1SheepEasy", "cooperative:plan_sheep_easy"),
-    ("sheep:Go1SheepHard", "cooperative:plan_sheep_hard"),
-    ("pushbox:Go1PushBox", "cooperative:plan_pushbox"),
-    ("football_defender:Go1FootballDefender", "football:plan_defender"),
-    ("tug:Go1Tug", "matches:plan_tug"),
-    ("door:Go1RevolvingDoor", "matches:plan_revolving_door"),
-    ("wrestling:Go1Wrestling", "matches:plan_wrestling"),
-    ("bridge:Go1Bridge", "matches:plan_bridge"),
-    ("football:Go1Football1vs1", "football:plan_match"),
-    ("football:Go1Football2vs2", "football:plan_match"),
-)
+# By id: MODULE:CLASS of mqe_jax.envs, and the scripted policy, as MODULE:FUNCTION of mqe_jax.planners or none.
+_SHIPPED: dict[str, tuple[str, str | None]] = {
+    "go1plane": ("plane:Go1Plane", None),
+    "go1gate": ("gate:Go1Gate", "cooperative:plan_gate"),
+    "go1seesaw": ("seesaw:Go1Seesaw", "cooperative:plan_seesaw"),
+    "go1sheep-easy": ("sheep:Go1SheepEasy", "cooperative:plan_sheep_easy"),
+    "go1sheep-hard": ("sheep:Go1SheepHard", "cooperative:plan_sheep_hard"),
+    "go1pushbox": ("pushbox:Go1PushBox", "cooperative:plan_pushbox"),
+    "go1football-defender": ("football_defender:Go1FootballDefender", "football:plan_defender"),
+    "go1tug": ("tug:Go1Tug", "matches:plan_tug"),
+    "go1revolvingdoor": ("door:Go1RevolvingDoor", "matches:plan_revolving_door"),
+    "go1wrestling": ("wrestling:Go1Wrestling", "matches:plan_wrestling"),
+    "go1bridge": ("bridge:Go1Bridge", "matches:plan_bridge"),
+    "go1football-1vs1": ("football:Go1Football1vs1", "football:plan_match"),
+    "go1football-2vs2": ("football:Go1Football2vs2", "football:plan_match"),
+}
 
 # Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.planners.
 _NAMED: list[tuple[str, str, str]] = []
@@ -37,10 +40,40 @@ _NAMED: list[tuple[str, str, str]] = []
 # Alternative ids, from the released system.
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
-TASKS: dict[str, type[QuadrupedEnv]] = {}
+
+class _Tasks(MutableMapping[str, type[QuadrupedEnv]]):
+    """Task classes by id, of which the shipped ones are imported on demand."""
+
+    def __init__(self) -> None:
+        self._tasks: dict[str, type[QuadrupedEnv] | None] = dict.fromkeys(_SHIPPED)
+
+    def __getitem__(self, name: str) -> type[QuadrupedEnv]:
+        task = self._tasks[name]
+        if task is None:
+            task = self._tasks[name] = load("mqe_jax.envs", _SHIPPED[name][0])
+            assert task.name == name, f"{task.__name__} has the id {task.name!r}, the registry {name!r}"
+        return task
+
+    def __setitem__(self, name: str, task: type[QuadrupedEnv]) -> None:
+        self._tasks[name] = task
+
+    def __delitem__(self, name: str) -> None:
+        del self._tasks[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._tasks
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tasks)
+
+    def __len__(self) -> int:
+        return len(self._tasks)
+
+
+TASKS = _Tasks()
 """Task classes by id."""
 
-PLANNERS: dict[str, Planner | str] = {}
+PLANNERS: dict[str, Planner | str] = {name: planner for name, (_, planner) in _SHIPPED.items() if planner is not None}
 """Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
 
 
@@ -83,7 +116,5 @@ def load(package: str, path: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{module}"), name)
 
 
-for _task, _planner in _SHIPPED:
-    register_task(load("mqe_jax.envs", _task), _planner)
 for _id, _name, _path in _NAMED:
     register_planner(_id, _name, _path)

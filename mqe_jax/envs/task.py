@@ -37,6 +37,8 @@ class Task(Generic[S, P]):
     """Class of the task's parameters, P."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
     """Non-zero values of metrics in a step in which the physics diverged."""
+    npc_varied: ClassVar[tuple[str, ...]] = ()
+    """The commands of the skill that `npc_commands` changes; without names it may change all."""
     variable_num_agents: ClassVar[bool] = False
     """Whether `num_agents` may differ from the task's default."""
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save
@@ -136,7 +135,7 @@ def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False,
             arrays[name] = found.astype(np.float32)
         elif found.dtype != leaf.dtype:
             raise InputError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
-    leaves = [jnp.asarray(arrays[name]) for name in expected]
+    leaves = [jax.device_put(arrays[name]) for name in expected]
     return Checkpoint(jax.tree_util.tree_unflatten(structure, leaves), metadata)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mqe_jax.files import replacing
-from mqe_jax.study.runs import REWARD, read_curve
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
@@ -30,6 +29,8 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
 def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = None) -> None:
     """Plots average step reward (and success) of runs over environment steps, and writes the image atomically."""
     from matplotlib.figure import Figure
+
+    from mqe_jax.study.runs import REWARD, read_curve
 
     tables = [read_curve(run / "metrics.csv") for run in runs]
     figure = Figure((7.2, 4.2), dpi=150, layout="constrained")

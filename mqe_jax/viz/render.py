@@ -67,6 +67,24 @@ def _working_backend() -> str | None:
     return None
 
 
+def _gl_context(backend: str) -> Any:
+    """Returns MuJoCo's class of contexts of a GL library, whatever MUJOCO_GL was at the import of MuJoCo."""
+    os.environ["MUJOCO_GL"] = backend
+    if os.environ.get("PYOPENGL_PLATFORM", backend) != backend:
+        del os.environ["PYOPENGL_PLATFORM"]
+    return import_module(f"mujoco.{backend}").GLContext
+
+
+def load_gl() -> None:
+    """Finds and loads the GL library, as a thread may do while an episode is computed."""
+    backend = gl_backend()
+    if backend in ("egl", "osmesa"):
+        with _probing:
+            context = _gl_context(backend)(64, 64)
+            context.make_current()
+            context.free()
+
+
 def _draw_gl(
     model: mujoco.MjModel, episode: Episode, cameras: Sequence[Camera], size: tuple[int, int], backend: str
 ) -> Iterator[np.ndarray]:
@@ -98,12 +116,8 @@ def _draw_gl(
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
     data = mujoco.MjData(model)
-    # The backend is chosen here, whatever MUJOCO_GL was at the import of MuJoCo.
-    os.environ["MUJOCO_GL"] = backend
-    if os.environ.get("PYOPENGL_PLATFORM", backend) != backend:
-        del os.environ["PYOPENGL_PLATFORM"]
     gl_context = import_module("mujoco.rendering.classic.gl_context")
-    gl_context.GLContext = import_module(f"mujoco.{backend}").GLContext  # type: ignore[attr-defined]
+    gl_context.GLContext = _gl_context(backend)  # type: ignore[attr-defined]
     with mujoco.Renderer(model, size[1], size[0]) as renderer:
         for index, camera in enumerate(cameras):
             view.lookat[:] = camera.lookat
