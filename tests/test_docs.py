@@ -53,8 +53,13 @@ def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path:
     """Blocks of one page run in order in one namespace."""
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {"__name__": "__main__"}
-    for block in run_blocks(page):
-        exec(compile(block, page, "exec"), namespace)
+    tasks = {*TASKS}
+    try:
+        for block in run_blocks(page):
+            exec(compile(block, page, "exec", dont_inherit=True), namespace)
+    finally:
+        for name in {*TASKS} - tasks:
+            del TASKS[name]
 
 
 def commands(page: str) -> list[list[str]]:

@@ -11,7 +11,7 @@ import pytest
 
 from mqe_jax.train import loss, nn
 from mqe_jax.train.actor_critic import ActorCritic
-from mqe_jax.train.config import PPO, Curriculum, OptimizerSettings, TrainConfig
+from mqe_jax.train.config import PPO, Curriculum, Imitation, OptimizerSettings, TrainConfig
 from mqe_jax.train.loss import gae
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import (
@@ -102,12 +102,13 @@ def test_schedules_by_hand() -> None:
         ),
         optimizer=OptimizerSettings(schedule="linear", anneal=0.2),
         curriculum=Curriculum(assistance=1.0, assistance_until=0.5, failure_bootstrap=0.8, failure_bootstrap_until=0.4),
+        imitation=Imitation(weight=3.0, until=0.6),
     )
     expected = {
-        0: (1.0, 0.8, 3.0, 0.01, 0.0, 1.0),
-        2: (0.6, 0.4, 3.0, 0.008, 1.0, 1.0),
-        5: (0.0, 0.0, math.inf, 0.005, 1.0, 1.0),
-        9: (0.0, 0.0, math.inf, 0.001, 1.0, 0.5),
+        0: (1.0, 0.8, 3.0, 0.01, 3.0, 0.0, 1.0),
+        2: (0.6, 0.4, 3.0, 0.008, 2.0, 1.0, 1.0),
+        5: (0.0, 0.0, math.inf, 0.005, 0.5, 1.0, 1.0),
+        9: (0.0, 0.0, math.inf, 0.001, 0.0, 1.0, 0.5),
     }
     for updates, values in expected.items():
         np.testing.assert_allclose(jnp.stack(scheduled(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
