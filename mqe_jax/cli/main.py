@@ -82,7 +82,7 @@ def _run(command: Any) -> None:
     from mqe_jax.cli import programs
     from mqe_jax.cli.options import standard_output
 
-    programs.import_libraries()
+    programs.import_mujoco()
     programs.write_whole()
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import importlib.metadata
+import importlib
 import os
 import platform
 import zlib
@@ -18,22 +18,15 @@ def hasten() -> None:
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
-def import_libraries() -> None:
-    """Imports MuJoCo and JAX without what takes them 0.2 s and is of no use here.
-
-    MuJoCo would look for GLFW, which draws into windows, in a process of its own; JAX would read the metadata of all
-    installed packages, to find one for AMD's GPUs.
-    """
-    chosen, distributions = os.environ.get("MUJOCO_GL"), importlib.metadata.distributions
-    os.environ.setdefault("MUJOCO_GL", "disable")
-    importlib.metadata.distributions = lambda **context: []
+def import_mujoco() -> None:
+    """Imports MuJoCo without a search for GLFW, which draws into windows; MuJoCo starts a process for it."""
+    if "MUJOCO_GL" in os.environ:
+        return
+    os.environ["MUJOCO_GL"] = "disable"
     try:
         importlib.import_module("mujoco")
-        importlib.import_module("jax")
     finally:
-        importlib.metadata.distributions = distributions
-        if chosen is None:
-            del os.environ["MUJOCO_GL"]
+        del os.environ["MUJOCO_GL"]
 
 
 def keep() -> None:

@@ -103,9 +103,7 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
         learning = Mirror(batch(config.num_envs // 2))
     if config.imitation.teacher is not None:
         learning.teacher = load_policy(config.imitation.teacher, both)
-    if len(both.teams) < 2:
-        return learning, eval_env
-    if eval_env is not None:
+    if len(both.teams) > 1 and eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
         eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed or anchors(eval_env.env)[:1])
     return learning, eval_env

@@ -145,8 +145,10 @@ def make_learner(
             action_scale=config.action_scale,
             trace_step=trace_step,
         )
-        lesson = () if config.imitation.teacher is None else _lesson(env, config, transitions.obs)
-        batch, value_normalizer, batch_metrics = _prepare(network, config, now, state, transitions, lesson)
+        batch, value_normalizer, batch_metrics = _prepare(network, config, now, state, transitions)
+        if config.imitation.teacher is not None:
+            shown = _teacher_actions(env, transitions.obs) / config.action_scale
+            batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
         params, optimizer_state, learning_rate, loss_metrics = _learn(
             network, optimizer, config, now, state, value_normalizer, batch, epoch_key
         )
@@ -196,21 +198,16 @@ def _strongly_typed(state: TrainState) -> TrainState:
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), state)
 
 
-def _lesson(env: VectorEnv, config: TrainConfig, obs: jax.Array) -> jax.Array:
-    """Returns the teacher's actions (T, N, A, D), before `action_scale`, for observations (T, N, A, O)."""
+def _teacher_actions(env: VectorEnv, obs: jax.Array) -> jax.Array:
+    """Returns the teacher's actions (T, N, A, D) for observations (T, N, A, O)."""
     teacher: Any = getattr(env, "teacher")  # noqa: B009
     flat = obs.reshape(-1, *obs.shape[2:])
     action, _ = teacher.act(flat, teacher.initial_memory(len(flat)), jax.random.PRNGKey(0))
-    return action.reshape(*obs.shape[:2], *action.shape[1:]) / config.action_scale
+    return action.reshape(*obs.shape[:2], *action.shape[1:])
 
 
 def _prepare(
-    network: Network,
-    config: TrainConfig,
-    now: Scheduled,
-    state: TrainState,
-    transitions: Transition,
-    lesson: jax.Array | tuple[()],
+    network: Network, config: TrainConfig, now: Scheduled, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
@@ -267,7 +264,6 @@ def _prepare(
         advantage=chunks(advantage, steps),
         target=chunks(target, steps),
         old_value=chunks(pair[0], steps),
-        lesson=lesson if isinstance(lesson, tuple) else chunks(lesson, steps),
     )
     return batch, value_normalizer, metrics
 
@@ -299,8 +295,9 @@ def _loss(
     }
     metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
     actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
-    if not isinstance(batch.lesson, tuple):
-        taught = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.lesson)
+    if config.imitation.teacher is not None:
+        action = batch.teacher_action
+        taught = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, action)
         metrics["loss/imitation"] = -jnp.mean(jnp.sum(taught.log_prob, axis=-1))
         actor_loss += now.imitation * metrics["loss/imitation"]
     return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics

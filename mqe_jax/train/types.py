@@ -200,5 +200,5 @@ class Batch(NamedTuple):
     """Value targets in units of reward (L, C, V)."""
     old_value: jax.Array
     """Normalised values at collection (L, C, V)."""
-    lesson: jax.Array | tuple[()]
+    teacher_action: Any = ()
     """Actions of the teacher, unscaled (L, C, A, D); empty without one."""
