@@ -11,7 +11,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import jax
 import jax.export
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 
 from mqe_jax import engines
-from mqe_jax.engines import Engine
+from mqe_jax.engines import Engine, private
 from mqe_jax.engines.host_call import host_call
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
@@ -222,6 +223,28 @@ def called(function: Any, number: int, owner: Owner) -> Any:
     """A compiled program that calls a host function of two arrays (3,)."""
     result = jax.ShapeDtypeStruct((3,), jnp.float32)
     return jax.jit(jax.vmap(lambda x, y: host_call(number, owner, function, result, (x, y))))
+
+
+class _Stream:
+    """A stand-in for Warp's handle to a stream of JAX: any that is collected releases the stream."""
+
+    known: ClassVar[set[int]] = set()
+
+    def __init__(self, address: int, owner: bool) -> None:
+        self.address, self.owner = address, owner
+        self.known.add(address)
+
+    def __del__(self) -> None:
+        self.known.discard(self.address)
+
+
+def test_warp_keeps_a_stream_of_jax_when_an_old_handle_to_it_is_collected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "warp", SimpleNamespace(Stream=_Stream))
+    private.keep_streams.__wrapped__()
+    old, new, owned = _Stream(1, False), _Stream(1, False), _Stream(2, True)
+    del old, owned
+    gc.collect()
+    assert _Stream.known == {new.address}
 
 
 def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change() -> None:

@@ -114,6 +114,7 @@ class WarpEngine(MjxEngine):
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
         self._mjx = private.load_mjx()
+        private.keep_streams()
         self.mjx_model = private.without_warnings(self._mjx.put_model(model, jax.local_devices()[0], impl="warp"))
 
     @classmethod

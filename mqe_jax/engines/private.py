@@ -74,6 +74,18 @@ def warp_is_installed() -> bool:
     return bool(mjx_warp.WARP_INSTALLED)
 
 
+@functools.cache
+def keep_streams() -> None:
+    """Makes Warp remember JAX's streams until the process ends.
+
+    It forgets a stream when the garbage collector finds an old handle to it, even while a step is being recorded on a
+    newer one, which then fails with "unknown stream" (warp 1.18; seen with several environments in one process).
+    """
+    stream = importlib.import_module("warp").Stream
+    release = stream.__del__
+    stream.__del__ = lambda handle: release(handle) if handle.owner else None
+
+
 def without_warnings(model: mjx.Model) -> mjx.Model:
     """Disables Warp's printed warnings of overflows, which `Engine.step` returns."""
     return model.replace(opt=model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0)))
