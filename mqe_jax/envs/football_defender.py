@@ -32,16 +32,8 @@ class DefenderRewards:
     """Per m of decrease of the ball's distance to the goal's midpoint. Not in the paper: shaping."""
     approach: float = 0.0
     """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper: shaping."""
-    both_touched: float = 0.0
-    """In steps in which the ball is in the goal, if both robots touched it before the first goal. Not in the paper."""
-    join: float = 0.0
-    """As `approach`, of the robot that is farther from the ball. Not in the paper: shaping."""
-    first_touch: float = 0.0
-    """Per robot that touches the ball for the first time in the episode. Not in the paper: shaping."""
     first_goal: float = 0.0
     """In the step of an episode's first goal. Not in the paper: for training, where `goal` favours early goals."""
-    joint_goal: float = 0.0
-    """As `first_goal`, if both robots touched the ball before. Not in the paper."""
 
 
 @record
@@ -105,10 +97,10 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.asarray(GOALS[0]), jnp.array([True, True, False])
 
-    def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Returns the ball's distances to the goal's midpoint and to the nearer and the farther robot (), m."""
+    def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array]:
+        """Returns the ball's distances to the goal's midpoint and to the nearest robot (), m."""
         apart = jnp.linalg.norm(now.robots.position_w[:2, :2] - self.ball(now.state.data)[:2], axis=-1)
-        return self.goal_distance(now.state.data)[0], jnp.min(apart), jnp.max(apart)
+        return self.goal_distance(now.state.data)[0], jnp.min(apart)
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -124,19 +116,13 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     def rewards(
         self, before: Moment[DefenderState], after: Moment[DefenderState], collision: jax.Array
     ) -> dict[str, jax.Array]:
-        (goal_before, near_before, far_before), (goal, near, far) = self.distances(before), self.distances(after)
-        scoring, touched = self.in_goal(after.state.data)[0], after.state.task.touched
-        first = after.state.task.scored & ~before.state.task.scored
+        (goal_before, near_before), (goal, near) = self.distances(before), self.distances(after)
         return {
-            "goal": scoring,
+            "goal": self.in_goal(after.state.data)[0],
             "nearness": jnp.exp(-goal / 3.0),
             "progress": goal_before - goal,
             "approach": near_before - near,
-            "both_touched": scoring & jnp.all(touched),
-            "join": far_before - far,
-            "first_touch": jnp.sum(touched & ~before.state.task.touched),
-            "first_goal": first,
-            "joint_goal": first & jnp.all(touched),
+            "first_goal": after.state.task.scored & ~before.state.task.scored,
         }
 
     def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
