@@ -24,6 +24,7 @@ CSV, PICTURE = "tournament.csv", "tournament.png"
 
 _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 500
+_LONG = 28  # characters of a name in the picture, at most
 
 
 class Ratings(NamedTuple):
@@ -116,15 +117,16 @@ def _draw(names: Sequence[str], results: NDArray[np.int64], path: Path) -> None:
     from matplotlib.figure import Figure
 
     share = scores(results) / np.maximum(results.sum(axis=-1) + results.sum(axis=-1).T, 1)
-    size = 2.2 + 0.6 * len(names)
+    size = 2.6 + 0.6 * len(names)
     figure = Figure((size + 0.8, size), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     axes.imshow(share, cmap="RdYlGn", vmin=0, vmax=1)
     for (row, column), value in np.ndenumerate(share):
         if row != column:
             axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=9)
-    axes.set_xticks(range(len(names)), names, rotation=45, ha="right")
-    axes.set_yticks(range(len(names)), names)
-    axes.set_title("points of 100 games, row against column", loc="left", fontsize=10)
+    shown = [name if len(name) <= _LONG else f"...{name[3 - _LONG :]}" for name in names]  # the end names a run
+    axes.set_xticks(range(len(names)), shown, rotation=45, ha="right")
+    axes.set_yticks(range(len(names)), shown)
+    figure.suptitle("points of 100 games, row against column", fontsize=10)
     with replacing(path) as temporary:
         figure.savefig(temporary)
