@@ -1,9 +1,8 @@
-"""Publishes sweeps: curves and evaluations as two compressed tables, best policies, and the page with their figures.
+"""Publishes sweeps: curves and evaluations as two compressed tables, and the page with their figures.
 
 `python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and evaluations.csv.gz in
-results/paper, thinned, and writes the policies of their cells' best seeds (by the absolute metric) that match
-`--policies` to results/paper/policies, with parameters as float16. It then regenerates the figures and tables of
-docs/results/paper.md from results/ alone; without a SWEEP only this.
+results/paper, thinned. It then regenerates the figures and tables of docs/results/paper.md from results/ alone; without
+a SWEEP only this.
 
 `python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.
 """
@@ -13,7 +12,6 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
-import fnmatch
 import gzip
 import io
 import itertools
@@ -30,7 +28,6 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import absolute
 from mqe_jax.study.runs import REWARD, Cell, Curve, Run, number, read_runs, table
-from mqe_jax.train.policy import read_policy, save_policy
 
 ROOT = Path(__file__).parents[1]
 MEASUREMENTS = ROOT / "results" / "measurements.json"
@@ -124,37 +121,21 @@ def _numbers(point: Mapping[str, Any], names: Sequence[str] | None = None) -> di
     return columns
 
 
-def publish(sweeps: Sequence[Path], target: Path, policies: Sequence[str]) -> list[str]:
-    """Adds finished runs to the tables below `target`, and the best policies of their cells that match `policies`.
+def publish(sweeps: Sequence[Path], target: Path) -> None:
+    """Adds finished runs to the tables below `target`.
 
-    Returns the best runs whose policies are in none of the sweeps. InputError for a sweep without finished runs, or
-    with other results of a run that is published.
+    Raises:
+        InputError: for a sweep without finished runs, or with other results of a run that is published.
     """
     runs = {(run.cell, run.seed): run for run in read_tables(target)} if (target / CURVES).is_file() else {}
-    folders: dict[Key, Path] = {}
     for sweep in sweeps:
         for run in read_runs(sweep):
             key = run.cell, run.seed
             other = runs.setdefault(key, run)
             if number(absolute(other, REWARD), DIGITS) != number(absolute(run, REWARD), DIGITS):
                 raise InputError(f"{sweep}: {_name(run)} differs from the one that is published; remove one of them")
-            folders[key] = sweep / "runs" / _name(run)
-    if folders:
+    if sweeps:
         write_tables(target, sorted(runs.values(), key=_order))
-    missing = []
-    for cell in dict.fromkeys(cell for cell, _ in folders):
-        if not any(fnmatch.fnmatch(cell.path.as_posix(), pattern) for pattern in policies):
-            continue
-        best = max((run for run in runs.values() if run.cell == cell), key=_score)
-        folder = folders.get((cell, best.seed))
-        if folder is None or best.absolute is None:
-            missing.append(_name(best))
-            continue
-        policy = read_policy(folder / "best" / f"step_{best.absolute['env_steps']:012d}.safetensors")
-        path = target / "policies" / cell.task / f"{cell.path.name}.safetensors"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_policy(path.parent, policy, path.name, half=True)
-    return missing
 
 
 def _name(run: Run) -> str:
@@ -163,10 +144,6 @@ def _name(run: Run) -> str:
 
 def _order(run: Run) -> tuple[str, int]:
     return run.cell.path.as_posix(), run.seed
-
-
-def _score(run: Run) -> float:
-    return float(np.nan_to_num(absolute(run, REWARD), nan=-math.inf))
 
 
 def add_measurement(name: str, file: Path, target: Path = MEASUREMENTS) -> None:
@@ -195,20 +172,17 @@ def main() -> int:
     parser.add_argument("sweeps", nargs="*", type=Path, metavar="SWEEP")
     parser.add_argument("--target", type=Path, default=ROOT / "results" / "paper")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "paper.md")
-    parser.add_argument("--policies", nargs="*", default=("*+tuned",), metavar="PATTERN", help="of cells")
     parser.add_argument("--measurement", nargs=2, metavar=("NAME", "FILE"))
     arguments = parser.parse_args()
     try:
         if arguments.measurement:
             add_measurement(arguments.measurement[0], Path(arguments.measurement[1]))
             return 0
-        missing = publish(arguments.sweeps, arguments.target, arguments.policies)
+        publish(arguments.sweeps, arguments.target)
         paper_page.update(read_tables(arguments.target), arguments.target, arguments.page)
     except InputError as error:
         parser.exit(2, f"error: {error}\n")
-    for name in missing:
-        print(f"no policy found: {name}")
-    return 1 if missing else 0
+    return 0
 
 
 if __name__ == "__main__":
