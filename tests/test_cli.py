@@ -213,7 +213,7 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
 
 
 def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
-    env = FakeEnv()
+    env: Any = FakeEnv()
     obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs
     for deterministic in (False, True):
         policy = load_policy(run_folder, env, deterministic=deterministic)

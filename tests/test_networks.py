@@ -327,7 +327,9 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
 
 def export_error(policy: TrainedPolicy, env: Any) -> float:
     """The largest error of the exported graph for random inputs of five environments."""
-    described = SimpleNamespace(name="probe", control=env.control, robot=env.robot, observation_size=policy.dims[1])
+    described: Any = SimpleNamespace(
+        name="probe", control=env.control, robot=env.robot, observation_size=policy.dims[1]
+    )
     random, shapes = np.random.default_rng(0), input_shapes(policy, described)
     inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
     step = functools.partial(policy_step, policy, described)
