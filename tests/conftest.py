@@ -94,7 +94,7 @@ def shared_programs() -> Iterator[None]:
 
     learners, seeds, seeds_map = _kept_programs()
     make_learner = start.make_learner
-    others = {"seed": 0, "start": None, "evaluation": None, "checkpoint": None, "loggers": (), "task": None, "env": None}
+    others = dict.fromkeys(("seed", "start", "evaluation", "checkpoint", "loggers", "task", "env"))
 
     def shared_learner(env: Any, config: Any, trace: Any = None, processes: int = 1) -> Any:
         key = env, repr(vars(config) | others), getattr(trace, "__func__", None), processes
