@@ -38,7 +38,6 @@ from mqe_jax.train.types import NetworkMemory, Params, VectorEnv
 from mqe_jax.view.session import Session
 from mqe_jax.walk import network as walk_network  # registers it
 from mqe_jax.walk_policy import OBSERVATION_SIZE
-from tests import engines
 from tests import training as probes
 from tests.training import Probe, assert_same
 
@@ -207,7 +206,7 @@ def test_settings_that_do_not_fit_are_named() -> None:
         Mat().build(dims(3)._replace(values=1))
 
 
-# -- every registered network in every use; every task with robots, controls -------------------------------------------
+# -- every registered network in every use -----------------------------------------------------------------------------
 
 
 VARIANTS: dict[str, list[dict[str, Any]]] = {
@@ -333,9 +332,3 @@ def export_error(policy: TrainedPolicy, env: Any) -> float:
     step = functools.partial(policy_step, policy, described)
     expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
     return max(errors(translate.translate(step, shapes, "probe"), inputs, expected).values())
-
-
-@pytest.mark.parametrize(("task", "robot", "control"), engines.covering(), ids=str)
-def test_a_robot_takes_a_step_in_a_task_under_a_control_mode(task: str, robot: str, control: str) -> None:
-    """Every pair of robot and control mode, each in two tasks, on the C engine."""
-    assert engines.one_step(task, robot, control, "c")[1] == []
