@@ -27,10 +27,9 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import score
-from mqe_jax.train.networks import EnvDims, NetworkSettings
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
-from tests.training import assert_same_run
+from tests.training import assert_same_run, random_params
 
 KEY = jax.random.PRNGKey(0)
 MATCHES = ("go1revolvingdoor", "go1tug", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
@@ -57,14 +56,8 @@ def new_policy(env: Any, seed: int = 0, **settings: Any) -> TrainedPolicy:
     config = build(TrainConfig, {**SETTINGS, "task": env.name, "num_envs": env.num_envs, **settings})
     dims = env_dims(env, config)
     network = config.network.build(dims)
-    params = network.policy_params(initial_params(config.network, dims)(jax.random.PRNGKey(seed)))
+    params = network.policy_params(random_params(network, seed))
     return TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": env.name})
-
-
-@functools.cache
-def initial_params(settings: NetworkSettings, dims: EnvDims) -> Any:
-    """The compiled `init` of a network."""
-    return jax.jit(settings.build(dims).init)
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from mqe_jax.walk.env import WalkEnv
 from mqe_jax.walk.network import WalkNetwork, mirror_action, mirror_history, symmetry_loss, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
-from tests.training import Probe
+from tests.training import Probe, random_params
 
 DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
 
@@ -97,7 +97,7 @@ def test_only_the_critic_learns_at_first(history: Any) -> None:
 
 def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> None:
     network = WalkNetwork(symmetry_coef=0.0).build(DIMS)
-    params = jax.jit(network.init)(jax.random.PRNGKey(0))
+    params = random_params(network)
     obs = jax.random.normal(jax.random.PRNGKey(1), (3, 2, 1, 70))
     privileged = jax.random.normal(jax.random.PRNGKey(2), (3, 2, 5))
     rest = NetworkMemory(jnp.zeros((2, 29, 70)), ()), jnp.zeros((3, 2), bool), obs, privileged, jnp.zeros((3, 2, 1, 12))
