@@ -6,6 +6,7 @@ Its `mj_model` has two jointed boxes that rendering treats as robots, between a 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -135,6 +136,12 @@ class FakeVectorEnv:
 
 def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
     """Replaces `mqe_jax.cli.setup.make_env`."""
+    return made(num_envs)
+
+
+@functools.cache
+def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
+    """The task and a batch of it, made once, so that programs are shared (see the fixture `shared_programs`)."""
     env = FakeEnv()
     return env, FakeVectorEnv(env, num_envs)
 

@@ -29,11 +29,11 @@ from mqe_jax.train.mat import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import WALK
 
-pytestmark = pytest.mark.usefixtures("fake_tasks")
+pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 
 
 @pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     with pytest.MonkeyPatch.context() as patch:
