@@ -74,12 +74,6 @@ class OneTeam(Outer):
         match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
         return self.inner.step(match, action)
 
-    def check_action(self, action: jax.Array) -> None:
-        """Raises an InputError for actions of another shape than (M, T, action_size)."""
-        shape = (self.num_envs, self.num_agents, self.action_size)
-        if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
-
 
 class Versus(OneTeam):
     """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`.

@@ -57,14 +57,7 @@ class Render(PolicyOptions):
 
 
 def draw(
-    env: QuadrupedEnv,
-    policy: Policy,
-    path: Path,
-    *,
-    seed: int,
-    episodes: int = 1,
-    seconds: float = 20.0,
-    **options: Any,
+    env: QuadrupedEnv, policy: Policy, path: Path, *, seed: int, episodes: int = 1, seconds: float = 20, **options: Any
 ) -> dict[str, Any]:
     """Runs `episodes` episodes of a policy of all agents and renders the best one, with options of `render_episode`.
 
