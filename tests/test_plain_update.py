@@ -87,11 +87,11 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
     env = dataclasses.replace(env, teacher=Teacher(), show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
     made = learning.make_learner(env, config)
-    normal = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
+    normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
     shapes = jax.eval_shape(made.init, jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     size = env.observation_size, env.privileged_observation_size
-    statistics = [RunningStatistics(0.3 * normal(n), np.exp(normal(n)), jnp.float32(30.0)) for n in size]
+    statistics = [RunningStatistics(0.3 * normal(n), normal(n) ** 2, jnp.float32(30.0)) for n in size]
     state = dataclasses.replace(
         state,
         params=jax.tree.map(lambda x: 0.5 * normal(*x.shape), state.params),
@@ -107,10 +107,10 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         else value_init(False),
         updates=jnp.int32(updates),
     )
-    done = random.random((T, N)) < 0.4
+    done: Any = random.random((T, N)) < 0.4
     memory = made.network.initial_memory(N)
     length = made.network.chunk_length
-    first = random.random((T, N)) < 0.3
+    first: Any = random.random((T, N)) < 0.3
     first[::length] = False  # the state of memory before a first step is zero in a rollout
     transitions = Transition(
         memory=NetworkMemory(
