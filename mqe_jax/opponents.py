@@ -15,7 +15,7 @@ from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Number
-from mqe_jax.policies import load_opponent, team_size
+from mqe_jax.policies import load_opponent
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
@@ -65,7 +65,7 @@ class OneTeam(Outer):
         if len(check("env", matches, AnyBatch).teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
         super().__init__(matches)
-        self.num_envs, self.num_agents = num_envs, team_size(matches)
+        self.num_envs, self.num_agents = num_envs, len(matches.teams[0])
         self.teams = (tuple(range(self.num_agents)),)
 
     def _stepped(self, state: TeamState, action: jax.Array) -> EnvironmentState:
@@ -73,12 +73,6 @@ class OneTeam(Outer):
         every = self.num_envs // self.inner.num_envs
         match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
         return self.inner.step(match, action)
-
-    def check_action(self, action: jax.Array) -> None:
-        """Raises an InputError for actions of another shape than (M, T, action_size)."""
-        shape = (self.num_envs, self.num_agents, self.action_size)
-        if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
 
 
 class Versus(OneTeam):

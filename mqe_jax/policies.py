@@ -6,13 +6,13 @@ import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 import jax
 import jax.numpy as jnp
 
 from mqe_jax import zoo
-from mqe_jax.envs import TaskParams
+from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
@@ -82,9 +82,9 @@ class BothTeams:
 @overload
 def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
 @overload
-def load_policy(source: str | Path, env: Any, *, deterministic: bool = False) -> Policy: ...
+def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy: ...
 @checked(source=PathText, env=AnyEnvironment | None)
-def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = False) -> Policy:
+def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False) -> Policy:
     """Returns the policy of a name, a run folder or a policy file.
 
     Args:
@@ -105,7 +105,7 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
     if str(source) in (*NAMES, *further):
         if env is None:
             raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
-        return SimplePolicy(env.name, team_size(env), _plan(str(source), env))
+        return SimplePolicy(env.name, len(env.teams[0]), _plan(str(source), env))
     if str(source) in zoo.names():
         policy = zoo.load(str(source))
     elif not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
@@ -120,7 +120,7 @@ def load_policy(source: str | Path, env: Any = None, *, deterministic: bool = Fa
     return policy
 
 
-def load_opponent(source: str | Path, env: Any, *, deterministic: bool = False) -> Policy:
+def load_opponent(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
     """Returns `load_policy` for an opponent, which errors name so."""
     try:
         return load_policy(source, env, deterministic=deterministic)
@@ -128,12 +128,7 @@ def load_opponent(source: str | Path, env: Any, *, deterministic: bool = False) 
         raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
 
 
-def team_size(env: Any) -> int:
-    """Returns the number of agents for which one policy acts: those of a team."""
-    return len(env.teams[0])
-
-
-def check_policy(policy: TrainedPolicy, env: Any, name: str = "policy") -> None:
+def check_policy(policy: TrainedPolicy, env: QuadrupedEnv, name: str = "policy") -> None:
     """Checks that a trained policy is of this task, with its sizes, which depend on the task's parameters.
 
     Raises:
@@ -141,7 +136,7 @@ def check_policy(policy: TrainedPolicy, env: Any, name: str = "policy") -> None:
     """
     if policy.task != env.name:
         raise InputError(f"policy: {name} was trained on {policy.task or 'no named task'}, not on {env.name}")
-    sizes = (team_size(env), env.observation_size, env.action_size)
+    sizes = (len(env.teams[0]), env.observation_size, env.action_size)
     trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
     if sizes != trained:
         raise InputError(
@@ -149,7 +144,7 @@ def check_policy(policy: TrainedPolicy, env: Any, name: str = "policy") -> None:
         )
 
 
-def all_agents(env: Any, policy: Policy, opponent: Policy | None = None) -> Policy:
+def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:
     """Returns the policy of all agents of a task: of a match, that of both teams; without opponent, team 1 is idle.
 
     Raises:
@@ -162,12 +157,12 @@ def all_agents(env: Any, policy: Policy, opponent: Policy | None = None) -> Poli
     return BothTeams(policy, opponent or load_policy("idle", env))
 
 
-def _plan(name: str, env: Any) -> Callable[[jax.Array, jax.Array], jax.Array]:
+def _plan(name: str, env: QuadrupedEnv) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Returns the function of observations (N, A, O) and a key that is the policy of a name."""
     if name not in NAMES or name == "scripted":
         scripted = _scripted(env, name)
         return lambda obs, key: scripted(obs)
-    shape = (team_size(env), env.action_size)
+    shape = (len(env.teams[0]), env.action_size)
     if name == "random":
 
         def uniform(obs: jax.Array, key: jax.Array) -> jax.Array:
@@ -178,7 +173,7 @@ def _plan(name: str, env: Any) -> Callable[[jax.Array, jax.Array], jax.Array]:
     return lambda obs, key: jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
 
 
-def _scripted(env: Any, name: str) -> Callable[[jax.Array], jax.Array]:
+def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array], jax.Array]:
     """Returns a scripted policy of the task for a batch: observations (N, A, O) to actions (N, A, 3)."""
     plan = scripted_policy(env, name)
     if env.control != "command":

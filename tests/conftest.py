@@ -78,24 +78,32 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(setup, "make_env", make_env)
 
 
+@functools.cache
+def _kept_programs() -> tuple[dict[Any, Any], Any, Any]:
+    """Learners by what they are made from, and `Seeds` with its `map`, kept until the process ends."""
+    from mqe_jax.train.seeds import Seeds
+
+    return {}, functools.cache(Seeds), functools.cache(Seeds.map)
+
+
 @pytest.fixture(scope="module")
 def shared_programs() -> Iterator[None]:
-    """Trainings of one environment with the same settings share their learner and its compiled programs."""
+    """Trainings of one environment share their learner and its programs, where settings of the learner are the same."""
     from mqe_jax.train import runner, start
     from mqe_jax.train.seeds import Seeds
 
-    learners, make_learner = {}, start.make_learner
+    learners, seeds, seeds_map = _kept_programs()
+    make_learner = start.make_learner
+    others = dict.fromkeys(("seed", "start", "evaluation", "checkpoint", "loggers", "task", "env"))
 
     def shared_learner(env: Any, config: Any, trace: Any = None, processes: int = 1) -> Any:
-        key = env, repr(config), trace, processes
+        key = env, repr(vars(config) | others), getattr(trace, "__func__", None), processes
         if key not in learners:
             learners[key] = make_learner(env, config, trace, processes)
         return learners[key]
 
-    class SharedSeeds(Seeds):
-        map = functools.cache(Seeds.map)
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(start, "make_learner", shared_learner)
-        patch.setattr(runner, "Seeds", functools.cache(SharedSeeds))
+        patch.setattr(Seeds, "map", seeds_map)
+        patch.setattr(runner, "Seeds", seeds)
         yield

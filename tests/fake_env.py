@@ -6,6 +6,7 @@ Its `mj_model` has two jointed boxes that rendering treats as robots, between a 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.cli import launch, main, setup
+from mqe_jax.envs import EnvironmentState
 from mqe_jax.train import devices
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
@@ -54,20 +56,10 @@ class FakeData:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class FakeState:
+class FakeState(EnvironmentState):
     """As the environments' State, for one environment or (in FakeVectorEnv) many."""
 
     data: FakeData
-    obs: jax.Array
-    privileged_obs: jax.Array
-    final_obs: jax.Array
-    final_privileged_obs: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    metrics: dict[str, jax.Array]
-    key: jax.Array
-    step: jax.Array
 
 
 class FakeEnv:
@@ -77,23 +69,23 @@ class FakeEnv:
     num_agents, observation_size, privileged_observation_size, action_size = 2, 1, 2, 3
     teams = ((0, 1),)
     dt = 0.02
+    robot_x = np.array([0, 19])
     overflow_x = 1.21  # m; a step that ends with the first robot beyond it overflows
 
     def __init__(self) -> None:
         self.mj_model = mujoco.MjModel.from_xml_string(XML)
         self.physics = SimpleNamespace(impl="none", step=lambda data, ctrl: (data, False))
-        self.robot_x = np.array([0, 19])
 
     def reset(self, key: jax.Array) -> FakeState:
         model, false = self.mj_model, jnp.zeros((), bool)
         mocap = np.flatnonzero(model.body_mocapid >= 0)
         start = model.qpos0, model.body_pos[mocap], model.body_quat[mocap], np.zeros(model.nu), np.zeros(model.nv)
         data: FakeData = FakeData(*(jnp.asarray(x, jnp.float32) for x in start))
-        zero = jnp.zeros(())
-        metrics = {"reward/progress": zero, "average_step_reward": zero, "success": zero, "diverged": zero}
-        metrics["overflow"] = zero
-        obs = data.qpos[self.robot_x][:, None]
-        return FakeState(data, obs, obs[:, 0], obs, obs[:, 0], jnp.zeros(2), false, false, metrics, key, jnp.int32(0))
+        zero, obs = jnp.zeros(()), data.qpos[self.robot_x][:, None]
+        names = ("reward/progress", "average_step_reward", "success", "diverged", "overflow")
+        metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
+        seen = obs, obs[:, 0], obs, obs[:, 0]
+        return FakeState(*seen, jnp.zeros(2), false, false, metrics, jnp.int32(0), zero, key, data)
 
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
         move = 0.1 * jnp.clip(action[:, 0], -1.0, 1.0)
@@ -144,6 +136,12 @@ class FakeVectorEnv:
 
 def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
     """Replaces `mqe_jax.cli.setup.make_env`."""
+    return made(num_envs)
+
+
+@functools.cache
+def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
+    """The task and a batch of it, made once, so that programs are shared (see the fixture `shared_programs`)."""
     env = FakeEnv()
     return env, FakeVectorEnv(env, num_envs)
 

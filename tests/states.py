@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import Moment, QuadrupedEnv, State, make
+from mqe_jax.envs.reward import weigh
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
@@ -47,59 +48,85 @@ def placed(
     Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the reset.
     """
     state = initial(env) if state is None else state
-    index, position = env.index, jnp.asarray(position, jnp.float32)
-    turn = euler_to_quaternion(jnp.zeros_like(position) if euler is None else jnp.asarray(euler, jnp.float32))
-    qpos = state.data.qpos.at[index.base_qpos].set(jnp.concatenate([position, turn], axis=-1))
-    qpos = qpos.at[index.joint_qpos].set(jnp.asarray(env.robot.default_joints))
+    index, position = env.index, np.asarray(position, np.float32)
+    qpos = np.array(state.data.qpos)
+    qpos[index.base_qpos] = np.c_[position, _quaternion(np.zeros_like(position) if euler is None else euler)]
+    qpos[index.joint_qpos] = env.robot.default_joints
     for name, coordinates in (objects or {}).items():
-        qpos = qpos.at[env.objects[name].qpos].set(jnp.asarray(coordinates, jnp.float32))
-    return dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=jnp.zeros_like(state.data.qvel)))
+        qpos[env.objects[name].qpos] = coordinates
+    return _with(state, qpos=qpos, qvel=np.zeros_like(state.data.qvel))
+
+
+# Hand-built states are made by NumPy: JAX would compile a program for every single operation.
+_turned = jax.jit(euler_to_quaternion)
+
+
+def _quaternion(euler: Any) -> jax.Array:
+    return _turned(np.asarray(euler, np.float32))
+
+
+def _with(state: State, **fields: np.ndarray) -> State:
+    data = state.data.replace(**{name: jnp.asarray(x, jnp.float32) for name, x in fields.items()})
+    return dataclasses.replace(state, data=data)
 
 
 def moving(env: Any, state: State, velocity: Sequence[float | jax.Array]) -> State:
     """The state with the first robot's trunk moving at a velocity (3,), m/s, world frame."""
-    qvel = state.data.qvel.at[env.index.base_qvel[0, :3]].set(jnp.asarray(velocity))
-    return dataclasses.replace(state, data=state.data.replace(qvel=qvel))
+    qvel = np.array(state.data.qvel)
+    qvel[env.index.base_qvel[0, :3]] = velocity
+    return _with(state, qvel=qvel)
 
 
-def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0)) -> jax.Array:
+def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0)) -> np.ndarray:
     """Roll, pitch, yaw (R, 3), rad, from one row each."""
-    return jnp.stack([jnp.asarray(angle, jnp.float32) for angle in (roll, pitch, yaw)], axis=-1)
+    return np.stack([np.asarray(angle, np.float32) for angle in (roll, pitch, yaw)], axis=-1)
 
 
 def robot_state(position: Any, **euler: Any) -> RobotState:
     """The state of two robots at rest at positions (2, 3), m, with the default joints; see `angles`."""
-    joints = jnp.tile(jnp.asarray(GO1.default_joints, jnp.float32), (2, 1))
-    none = jnp.zeros((2, 3))
-    turn = euler_to_quaternion(angles(**euler))
+    joints = jnp.asarray(np.tile(GO1.default_joints, (2, 1)), jnp.float32)
+    none, turn = jnp.zeros((2, 3)), _quaternion(angles(**euler))
     return RobotState(jnp.asarray(position), turn, none, none, joints, jnp.zeros((2, 12)), jnp.zeros(2))
 
 
 def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()) -> State:
     """The state with an object's first coordinates, and its first velocities, as given."""
-    index, data = env.objects[name], state.data
-    qpos = data.qpos.at[index.qpos[: len(position)]].set(jnp.asarray(position, jnp.float32))
-    qvel = data.qvel.at[index.qvel[: len(velocity)]].set(jnp.asarray(velocity, jnp.float32))
-    return dataclasses.replace(state, data=data.replace(qpos=qpos, qvel=qvel))
+    index, qpos, qvel = env.objects[name], np.array(state.data.qpos), np.array(state.data.qvel)
+    qpos[index.qpos[: len(position)]] = position
+    qvel[index.qvel[: len(velocity)]] = velocity
+    return _with(state, qpos=qpos, qvel=qvel)
+
+
+@functools.cache
+def _programs(env: QuadrupedEnv) -> tuple[Any, Any, Any]:
+    """Compiled: a state's observations, its moment, and the reward terms and rewards from one state to another."""
+
+    def observe(state: State) -> jax.Array:
+        return env.observation_layout.pack(env.observe(state, env.read(state.data)))
+
+    def moment(state: State) -> Moment:
+        return Moment(state, env.read(state.data))
+
+    def terms(before: State, after: State) -> tuple[dict[str, jax.Array], jax.Array]:
+        terms = env.rewards(moment(before), moment(after), jnp.array(False))
+        return terms, weigh(terms, env.params.rewards, env.num_agents)[0]
+
+    return jax.jit(observe), jax.jit(moment), jax.jit(terms)
 
 
 def observation(env: QuadrupedEnv, state: State) -> np.ndarray:
     """The agents' observations (A, O) of a state."""
-    return np.asarray(env.observation_layout.pack(env.observe(state, env.read(state.data))))
+    return np.asarray(_programs(env)[0](state))
 
 
 def moment(env: QuadrupedEnv, state: State) -> Moment:
     """A state with its robots' states."""
-    return Moment(state, env.read(state.data))
+    return _programs(env)[1](state)
 
 
 def terms_of(env: QuadrupedEnv, before: State, after: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The unweighted terms and the agents' rewards (A,) of a step without collision."""
-    from mqe_jax.envs.reward import weigh
-
-    terms = env.rewards(moment(env, before), moment(env, after), jnp.array(False))
-    reward, _ = weigh(terms, env.params.rewards, env.num_agents)
-    return {name: np.asarray(value) for name, value in terms.items()}, np.asarray(reward)
+    return jax.device_get(_programs(env)[2](before, after))
 
 
 def still(env: QuadrupedEnv) -> jax.Array:

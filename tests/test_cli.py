@@ -29,11 +29,11 @@ from mqe_jax.train.mat import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import WALK
 
-pytestmark = pytest.mark.usefixtures("fake_tasks")
+pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 
 
 @pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     with pytest.MonkeyPatch.context() as patch:
@@ -213,7 +213,7 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
 
 
 def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
-    env = FakeEnv()
+    env: Any = FakeEnv()
     obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs
     for deterministic in (False, True):
         policy = load_policy(run_folder, env, deterministic=deterministic)

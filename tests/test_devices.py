@@ -102,11 +102,8 @@ def test_two_shares_are_one_batch(network: str) -> None:
     share = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
 
     def run(init: Callable[[Any], Any], update: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        def both(key: jax.Array) -> Any:
-            first, _ = update(init(key))
-            return update(first)
-
-        return jax.jit(both)
+        init, update = jax.jit(init), jax.jit(update)
+        return lambda key: update(update(init(key))[0])
 
     expected, metrics = run(whole.init, whole.update)(KEY)
     found, found_metrics = run(together(share.init), together(share.update))(jnp.tile(KEY, (2, 1)))

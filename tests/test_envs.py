@@ -18,6 +18,7 @@ from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.errors import InputError
+from tests import engines
 from tests.states import initial, made, stepper
 
 Array = jax.Array
@@ -39,10 +40,13 @@ def gate_step(gate: QuadrupedEnv) -> Any:
 
 
 @pytest.mark.parametrize(("count", "steps"), [(8, 200), pytest.param(32, 1000, marks=pytest.mark.soak)])
-@pytest.mark.parametrize("task", list(TASKS))
-def test_contract(task: str, count: int, steps: int) -> None:
-    """Random steps: shapes, finite numbers, same key same result, one trace, clean auto-reset."""
-    env = made(task)
+@pytest.mark.parametrize(("task", "robot", "control"), engines.covering(), ids=str)
+def test_contract(task: str, robot: str, control: str, count: int, steps: int) -> None:
+    """Random steps: shapes, finite numbers, same key same result, one trace, clean auto-reset.
+
+    Every pair of robot and control mode is used in two tasks.
+    """
+    env: Any = make(task, impl="c", robot=robot, control=control, num_envs=count)
     batch = VectorEnv(env, count)
     shape = (count, env.num_agents, env.action_size)
     traces = []
@@ -66,6 +70,8 @@ def test_contract(task: str, count: int, steps: int) -> None:
 
     state = play()
     jax.tree.map(np.testing.assert_array_equal, state, play())
+    one, other = (np.asarray(step(state, key)[0].data.qvel[:, env.index.joint_qvel]) for key in keys[10:12])
+    assert np.abs(one - other).max() > 1e-3, "actions have no effect"
     assert env.observation_size == sum(block.width for block in env.observation_layout.blocks)
     assert [agent for team in env.teams for agent in team] == list(range(env.num_agents))
     assert state.obs.shape == (count, env.num_agents, env.observation_size)

@@ -24,6 +24,7 @@ from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.types import NetworkMemory
+from tests.training import random_params
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("jax2onnx")
@@ -47,7 +48,7 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> TrainedPol
     dims = EnvDims(agents, env.observation_size, 0, env.action_size, agents)
     net = config.network.build(dims)
     keys = jax.random.split(jax.random.PRNGKey(3), 3)
-    params = jax.tree.map(lambda x: x + 0.1, net.policy_params(jax.jit(net.init)(keys[0])))
+    params = jax.tree.map(lambda x: x + 0.1, net.policy_params(random_params(net)))
     mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
     return TrainedPolicy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), dims, config, {})
 

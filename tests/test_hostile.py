@@ -95,7 +95,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
     ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
     ("source: ", lambda x, v: mqe_jax.load_policy(v), (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)),
-    ("env: ", lambda x, v: mqe_jax.load_policy("scripted", "go1gate"), (None,)),
+    ("env: ", lambda x, v: mqe_jax.load_policy("scripted", v), ("go1gate",)),
     ("not a regular file", lambda x, v: mqe_jax.load_policy("/dev/zero"), (None,)),
     ("opponents: ", lambda x, v: versus(x["matches"], v), ([], "idle", 3, [3], None)),
     ("draw_reward: ", lambda x, v: versus(x["matches"], ["idle"], draw_reward=v), (NAN, "x", 1e300)),

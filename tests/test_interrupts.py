@@ -85,8 +85,7 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
 @pytest.mark.usefixtures("shared_programs")
 def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped between its regular checkpoints, it equals an uninterrupted one bit for bit."""
-    environments = fake_env.make_env("fake", "none", {}, 4)
-    monkeypatch.setattr(setup, "make_env", lambda *_, **__: environments)
+    monkeypatch.setattr(setup, "make_env", fake_env.make_env)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])
     wait_for(lambda: updates(stopped) >= 3, process)

@@ -38,7 +38,6 @@ from mqe_jax.train.types import NetworkMemory, Params, VectorEnv
 from mqe_jax.view.session import Session
 from mqe_jax.walk import network as walk_network  # registers it
 from mqe_jax.walk_policy import OBSERVATION_SIZE
-from tests import engines
 from tests import training as probes
 from tests.training import Probe, assert_same
 
@@ -82,14 +81,12 @@ def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, coope
 
 
 def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
-    """The loss is two variances for independent agents, and one if the second is conditioned on the first."""
+    """The loss is at least two variances for independent agents, and one if the second is conditioned on the first."""
     log_std = -1.2
     fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
     env = Probe(probes.show_hidden, probes.pay_meeting, num_envs=32)
     small = {"network": {"width": 16, "deviation": "free"}, "optimizer": {"learning_rate": 3e-3}}
-    variance = math.exp(2 * log_std)
-    assert -learn(env, settings("mat", small, fixed), 100, 20) / variance <= 1.2
-    assert -learn(env, settings("mappo", PLAIN, fixed), 30, 10) / variance >= 1.8
+    assert -learn(env, settings("mat", small, fixed), 100, 20) / math.exp(2 * log_std) <= 1.2
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -209,7 +206,7 @@ def test_settings_that_do_not_fit_are_named() -> None:
         Mat().build(dims(3)._replace(values=1))
 
 
-# -- every registered network in every use; every task with robots, controls -------------------------------------------
+# -- every registered network in every use -----------------------------------------------------------------------------
 
 
 VARIANTS: dict[str, list[dict[str, Any]]] = {
@@ -327,15 +324,11 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
 
 def export_error(policy: TrainedPolicy, env: Any) -> float:
     """The largest error of the exported graph for random inputs of five environments."""
-    described = SimpleNamespace(name="probe", control=env.control, robot=env.robot, observation_size=policy.dims[1])
+    described: Any = SimpleNamespace(
+        name="probe", control=env.control, robot=env.robot, observation_size=policy.dims[1]
+    )
     random, shapes = np.random.default_rng(0), input_shapes(policy, described)
     inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
     step = functools.partial(policy_step, policy, described)
     expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
     return max(errors(translate.translate(step, shapes, "probe"), inputs, expected).values())
-
-
-@pytest.mark.parametrize(("task", "robot", "control"), engines.covering(), ids=str)
-def test_a_robot_takes_a_step_in_a_task_under_a_control_mode(task: str, robot: str, control: str) -> None:
-    """Every pair of robot and control mode, each in two tasks, on the C engine."""
-    assert engines.one_step(task, robot, control, "c")[1] == []

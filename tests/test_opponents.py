@@ -21,13 +21,15 @@ from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, Versus, versus
 from mqe_jax.policies import BothTeams, all_agents, load_policy
 from mqe_jax.settings import build
+from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import score
-from mqe_jax.train.policy import TrainedPolicy, policy_of
-from tests.training import assert_same_run
+from mqe_jax.train.normalize import running_init
+from mqe_jax.train.policy import TrainedPolicy
+from tests.training import assert_same_run, random_params
 
 KEY = jax.random.PRNGKey(0)
 MATCHES = ("go1revolvingdoor", "go1tug", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
@@ -52,8 +54,10 @@ def matches(task: str = "go1revolvingdoor", num_envs: int = 4, **params: Any) ->
 def new_policy(env: Any, seed: int = 0, **settings: Any) -> TrainedPolicy:
     """An untrained policy of a team."""
     config = build(TrainConfig, {**SETTINGS, "task": env.name, "num_envs": env.num_envs, **settings})
-    state = jax.jit(make_learner(env, config).init)(jax.random.PRNGKey(seed))
-    return policy_of(state, env_dims(env, config), config, task=env.name)
+    dims = env_dims(env, config)
+    network = config.network.build(dims)
+    params = network.policy_params(random_params(network, seed))
+    return TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": env.name})
 
 
 @pytest.fixture(scope="module")
@@ -156,14 +160,15 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
     env = versus(door, ["idle", policies[0]])
     with pytest.raises(InputError, match="block 0 is fixed"):
         env.change(env.reset(KEY), 0, policies[0])
-    other = new_policy(env, network={"hidden_sizes": [16]})
+    config = dataclasses.replace(policies[0].config, network=ActorCritic(hidden_sizes=(16,)))
+    other = dataclasses.replace(policies[0], config=config)
     with pytest.raises(InputError, match="another architecture"):
         env.change(env.reset(KEY), 1, other)
 
 
 @pytest.mark.parametrize("kind", ["versus", "mirror"])
 def test_the_trainer_sees_one_team(kind: str) -> None:
-    """One joint value and one ratio for the team; outcomes of matches are among the metrics."""
+    """One joint value and one ratio for the team; outcomes are among the metrics. `versus` is only traced."""
     inner = matches("go1football-2vs2", 2)
     env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)
     settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
@@ -171,6 +176,10 @@ def test_the_trainer_sees_one_team(kind: str) -> None:
     learner = make_learner(env, config)
     dims = env_dims(env, config)
     assert (dims.agents, dims.values) == (inner.num_agents // 2, 1)
+    if kind == "versus":
+        metrics = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))[1]
+        assert {"team0/win", "team0/draw", "team0/loss"} <= metrics.keys()
+        return
     _, metrics = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
     assert float(metrics["episodes"]) >= 2
     outcomes = [float(metrics[f"team0/{name}"]) for name in ("win", "draw", "loss")]

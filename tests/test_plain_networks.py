@@ -19,6 +19,7 @@ from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.types import NetworkMemory
+from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
 
@@ -54,9 +55,7 @@ def test_the_transformer_is_that_of_a_plain_implementation() -> None:
     settings, agents = Mat(blocks=2, heads=2, width=8), 3
     network = settings.build(EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents))
     random = np.random.default_rng(0)
-    params = jax.tree.map(
-        lambda x: jnp.asarray(x + 0.4 * random.normal(size=x.shape), jnp.float32), jax.jit(network.init)(KEY)
-    )
+    params = random_params(network)
     obs, action = random.normal(size=(4, agents, 5)), random.normal(size=(4, agents, 2))
     arrays = jnp.zeros(4, bool), jnp.asarray(obs), jnp.zeros((4, 1)), jnp.asarray(action)
     found = jax.jit(network.evaluate)(params, NetworkMemory((), ()), *arrays)

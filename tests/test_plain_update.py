@@ -15,7 +15,7 @@ from mqe_jax.settings import build
 from mqe_jax.train import learner as learning
 from mqe_jax.train import nn
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.normalize import RunningStatistics, ValueStatistics
+from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_init
 from mqe_jax.train.optim import AdamState
 from mqe_jax.train.rollout import ObservationNormalizer
 from mqe_jax.train.types import NetworkMemory, Transition
@@ -87,34 +87,37 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
     env = dataclasses.replace(env, teacher=Teacher(), show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
     made = learning.make_learner(env, config)
-    normal = lambda *shape: jnp.asarray(random.normal(size=shape), jnp.float32)  # noqa: E731
-    state = jax.jit(made.init)(jax.random.PRNGKey(0))
+    normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
+    shapes = jax.eval_shape(made.init, jax.random.PRNGKey(0))
+    state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     size = env.observation_size, env.privileged_observation_size
-    statistics = [RunningStatistics(0.3 * normal(n), jnp.exp(normal(n)), jnp.float32(30.0)) for n in size]
+    statistics = [RunningStatistics(0.3 * normal(n), normal(n) ** 2, jnp.float32(30.0)) for n in size]
     state = dataclasses.replace(
         state,
-        params=jax.tree.map(lambda x: x + 0.3 * normal(*x.shape), state.params),
+        params=jax.tree.map(lambda x: 0.5 * normal(*x.shape), state.params),
+        learning_rate=np.float32(config.optimizer.learning_rate),
         optimizer=AdamState(
             jax.tree.map(lambda x: 0.1 * normal(*x.shape), state.params),
-            jax.tree.map(lambda x: 0.1 * jnp.square(normal(*x.shape)), state.params),
+            jax.tree.map(lambda x: 0.1 * np.square(normal(*x.shape)), state.params),
             jnp.int32(3),
         ),
         obs_normalizer=ObservationNormalizer(*statistics),
         value_normalizer=ValueStatistics(jnp.float32(0.3), jnp.float32(0.8), jnp.float32(0.6))
         if config.normalization.values
-        else state.value_normalizer,
+        else value_init(False),
         updates=jnp.int32(updates),
     )
-    done = random.random((T, N)) < 0.4
+    done: Any = random.random((T, N)) < 0.4
     memory = made.network.initial_memory(N)
     length = made.network.chunk_length
-    first = jnp.asarray(random.random((T, N)) < 0.3)
+    first: Any = random.random((T, N)) < 0.3
+    first[::length] = False  # the state of memory before a first step is zero in a rollout
     transitions = Transition(
         memory=NetworkMemory(
             jax.tree.map(lambda x: normal(T // length, *x.shape), memory.actor),
             jax.tree.map(lambda x: normal(T, *x.shape), memory.critic),
         ),
-        is_first=first.at[::length].set(False),  # the state of memory before a first step is zero in a rollout
+        is_first=first,
         obs=normal(T, N, A, size[0]),
         privileged_obs=normal(T, N, size[1]),
         final_obs=normal(T, N, A, size[0]),
@@ -122,9 +125,10 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         action=normal(T, N, A, D),
         log_prob=-1.0 + 0.2 * normal(T, N, A, D),
         reward=normal(T, N, A),
-        terminated=jnp.asarray(done & (random.random((T, N)) < 0.6)),
-        done=jnp.asarray(done),
+        terminated=done & (random.random((T, N)) < 0.6),
+        done=done,
     )
+    state, transitions = jax.tree.map(jnp.asarray, (state, transitions))
     return (env, made, state), transitions
 
 
@@ -297,8 +301,8 @@ class Plain:
         gradient_of = jax.jit(jax.grad(self.loss, has_aux=True))
         for _ in range(self.config.ppo.epochs):
             for minibatch in minibatches:
-                gradient, parts = gradient_of(params, minibatch)
-                norm = math.sqrt(sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(gradient)))
+                gradient, parts = jax.device_get(gradient_of(params, minibatch))
+                norm = math.sqrt(sum(float(np.sum(x**2)) for x in jax.tree.leaves(gradient)))
                 if optimizer.max_grad_norm is not None and norm > optimizer.max_grad_norm:
                     gradient = jax.tree.map(lambda x: x * optimizer.max_grad_norm / norm, gradient)  # noqa: B023
                 if optimizer.target_kl is not None:
@@ -313,7 +317,7 @@ class Plain:
                 moments[1] = jax.tree.map(lambda s, g: 0.999 * s + 0.001 * g**2, moments[1], gradient)
                 mean = jax.tree.map(lambda m: m / (1 - 0.9**count), moments[0])  # noqa: B023
                 square = jax.tree.map(lambda s: s / (1 - 0.999**count), moments[1])  # noqa: B023
-                move = lambda p, m, s: p - rate * factor * m / (jnp.sqrt(s) + optimizer.eps)  # noqa: B023, E731
+                move = lambda p, m, s: p - rate * factor * m / (np.sqrt(s) + optimizer.eps)  # noqa: B023, E731
                 params = jax.tree.map(move, params, mean, square)
                 seen.append({**parts, "norm": norm})
         self.metrics |= {name: float(np.mean([row[name] for row in seen])) for name in seen[0]}

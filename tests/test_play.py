@@ -183,7 +183,7 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="did you mean 'go1gate'"):
         entries(["go1gaet"])
     with pytest.raises(InputError, match="position"):
-        TaskFunctions(SimpleNamespace(control="position"))
+        TaskFunctions(SimpleNamespace(control="position"))  # type: ignore[arg-type]
 
 
 def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:

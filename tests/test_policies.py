@@ -50,11 +50,11 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
 
 
 def test_a_shipped_policy_does_what_its_card_says() -> None:
-    """64 episodes of the gate: within four standard errors of the rate on the card."""
-    env = VectorEnv(make("go1gate", impl="c", num_envs=64), 64)
-    policy = load_policy("go1gate", env)
-    result = evaluate(env, policy.act, 64, jax.random.PRNGKey(0), memory=policy.initial_memory(64))
-    assert result.success_rate > zoo.card("go1gate").results["success"] - 4 * 0.014
+    """32 episodes of the gate: within four standard errors of the rate on the card."""
+    env = VectorEnv(make("go1gate", impl="c", num_envs=32), 32)
+    policy = load_policy("go1gate", env.env)
+    result = evaluate(env, policy.act, 32, jax.random.PRNGKey(0), memory=policy.initial_memory(32))
+    assert result.success_rate > zoo.card("go1gate").results["success"] - 4 * 0.02
 
 
 def policy_of(target: str, **options: Any) -> Any:

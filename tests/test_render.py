@@ -28,17 +28,17 @@ from tests.states import initial, made, placed
 
 
 @pytest.fixture(scope="module")
-def env() -> FakeEnv:
+def env() -> Any:
     return FakeEnv()
 
 
 @pytest.fixture(scope="module")
-def episode(env: FakeEnv) -> recording.Episode:
+def episode(env: Any) -> recording.Episode:
     act = load_policy("forward", env).act
     return recording.record(env, act, (), jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
 
 
-def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: FakeEnv, episode: recording.Episode) -> None:
+def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: Any, episode: recording.Episode) -> None:
     assert len(episode) == 11  # the reset and ten steps
     np.testing.assert_allclose(episode.qpos[:, 0], 1.0 + 0.025 * np.arange(11), rtol=1e-5)
     assert episode.success == 1.0
@@ -52,7 +52,7 @@ def test_the_typical_episode_is_the_median_of_the_successful_ones(episode: recor
     assert recording.typical(episodes[1:2]) is episodes[1]
 
 
-def test_success_is_settled_from_its_last_change_on(env: FakeEnv, episode: recording.Episode) -> None:
+def test_success_is_settled_from_its_last_change_on(env: Any, episode: recording.Episode) -> None:
     """Both robots are beyond x 1.2 from the ninth step on."""
     assert episode.settled == pytest.approx(9 * env.dt)
     assert episode.cut(slice(2, None)).settled == episode.settled
@@ -72,7 +72,7 @@ def test_the_legend_names_teams_and_scripted_robots() -> None:
     assert framing.legend(env, (40, 20))(frame[:20, :40]).shape == (20, 40, 3)  # larger than the frame
 
 
-def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: FakeEnv, episode: recording.Episode) -> None:
+def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: Any, episode: recording.Episode) -> None:
     assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
     drawn = geometry.rendering_model(env.mj_model, episode)
     low, high = geometry.extent(drawn, episode)
@@ -94,7 +94,7 @@ def in_image(model: Any, camera: framing.Camera, point: np.ndarray, aspect: floa
 
 
 @pytest.mark.parametrize("aspect", [1.0, 16 / 9])
-def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: recording.Episode, aspect: float) -> None:
+def test_the_default_camera_holds_the_whole_track(env: Any, episode: recording.Episode, aspect: float) -> None:
     model = geometry.rendering_model(env.mj_model, episode)
     camera = cameras.default_camera(model, episode, aspect)
     low, high = geometry.extent(model, episode)
@@ -104,7 +104,7 @@ def test_the_default_camera_holds_the_whole_track(env: FakeEnv, episode: recordi
     assert max(reach) > 0.85  # and no farther away than it must be
 
 
-def test_following_cameras_hold_all_robots_in_every_frame(env: FakeEnv, episode: recording.Episode) -> None:
+def test_following_cameras_hold_all_robots_in_every_frame(env: Any, episode: recording.Episode) -> None:
     model, data = env.mj_model, mujoco.MjData(env.mj_model)
     whole = cameras.cameras(model, episode, "scene", 1.5)[0]
     followed = cameras.cameras(model, episode, "follow", 1.5)
@@ -142,7 +142,7 @@ def test_no_robot_of_a_match_is_cut_by_the_image() -> None:
     assert whole >= 2 * frames
 
 
-def test_the_side_view_follows_the_first_robot(env: FakeEnv, episode: recording.Episode) -> None:
+def test_the_side_view_follows_the_first_robot(env: Any, episode: recording.Episode) -> None:
     model, data = env.mj_model, mujoco.MjData(env.mj_model)
     camera = cameras.cameras(model, episode, "side", 1.5)[-1]
     geometry.pose(model, data, episode, len(episode) - 1)
@@ -151,7 +151,7 @@ def test_the_side_view_follows_the_first_robot(env: FakeEnv, episode: recording.
         cameras.cameras(model, episode, "sid", 1.5)
 
 
-def test_slow_motion_lasts_longer(env: FakeEnv, episode: recording.Episode, tmp_path: Path) -> None:
+def test_slow_motion_lasts_longer(env: Any, episode: recording.Episode, tmp_path: Path) -> None:
     seconds = {}
     for speed in (1.0, 0.5):
         file = tmp_path / f"{speed}.gif"
@@ -163,7 +163,7 @@ def test_slow_motion_lasts_longer(env: FakeEnv, episode: recording.Episode, tmp_
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4"])
 def test_clips_land_whole_without_gl(
-    env: FakeEnv, episode: recording.Episode, tmp_path: Path, capsys: Any, suffix: str
+    env: Any, episode: recording.Episode, tmp_path: Path, capsys: Any, suffix: str
 ) -> None:
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
@@ -176,7 +176,7 @@ def test_clips_land_whole_without_gl(
     assert errors.count("\n") == 1 and "libegl1" in errors
 
 
-def test_gl_draws_robots_walls_and_floor(env: FakeEnv, episode: recording.Episode) -> None:
+def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -> None:
     if render.gl_backend() is None:
         pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
     loading = threading.Thread(target=render.load_gl)  # another thread loads the library, this one draws

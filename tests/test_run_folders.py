@@ -153,8 +153,8 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def seeded(seed: int, **values: Any) -> TrainConfig:
-    """Settings of a training of four updates, a checkpoint after each."""
-    return settings(seed=seed, **{"total_steps": 4 * 16, "checkpoint__every": 1, **values})
+    """Settings of a training of five updates, a checkpoint after each."""
+    return settings(seed=seed, **{"checkpoint__every": 1, **values})
 
 
 class Stop(Exception):
@@ -190,17 +190,17 @@ def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path, alone: tuple[Path
     pairs = zip(jax.tree.leaves(states[1].params), jax.tree.leaves(alone[2].params), strict=True)
     for together, single in pairs:
         np.testing.assert_allclose(together, single, rtol=1e-4, atol=1e-5)
-    assert int(states[1].updates) == 4
-    assert [len((folder / "metrics.csv").read_text().splitlines()) for folder in (folders[1], alone[0])] == [5, 5]
-    assert read_policy(folders[2]).metadata["env_steps"] == 64
-    longer = [override(config, {"total_steps": 80}) for config in configs]
-    assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 5  # one seed resumes separately
+    assert int(states[1].updates) == 5
+    assert [len((folder / "metrics.csv").read_text().splitlines()) for folder in (folders[1], alone[0])] == [6, 6]
+    assert read_policy(folders[2]).metadata["env_steps"] == 80
+    longer = [override(config, {"total_steps": 96}) for config in configs]
+    assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 6  # one seed resumes separately
 
 
 def test_seeds_together_are_recorded_and_learn_as_alone(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
     recorder, folders = Traces(), [tmp_path / "0", tmp_path / "1"]
     train_seeds(PROBE, [seeded(0), seeded(1)], folders, recorder=recorder)
-    assert len(recorder.all) == len(alone[1].all) == 4
+    assert len(recorder.all) == len(alone[1].all) == 5
     for together, single in zip(recorder.all, alone[1].all, strict=True):
         assert together.snapshot.shape == together.diverged.shape == (4, 8)
         np.testing.assert_array_equal(together.snapshot[:, 4:], single.snapshot)
@@ -225,16 +225,16 @@ def test_a_checkpoint_without_environments_is_small_and_resumes(
     small, large = (list_checkpoints(folder)[-1].stat().st_size for folder in (tmp_path, alone[0]))
     assert small < large
     state = train(PROBE, config, tmp_path, resume=True)
-    assert int(state.updates) == 4
+    assert int(state.updates) == 5
     assert np.all(np.asarray(state.rollout.env_state.step) >= 0)
 
 
 def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_path: Path) -> None:
-    configs = [seeded(seed, evaluation__every=2, evaluation__episodes=4, total_steps=5 * 16) for seed in (0, 1)]
+    configs = [seeded(seed, evaluation__every=2, evaluation__episodes=4) for seed in (0, 1)]
     folders = [tmp_path / f"seed{config.seed}" for config in configs]
     with pytest.raises(Stop):
-        train_seeds(PROBE, configs, folders, on_update=stop_after(4), eval_env=PROBE)
-    train_seeds(PROBE, configs, folders, resume=True, eval_env=PROBE)
+        train_seeds(PROBE, configs, folders, on_update=stop_after(4), eval_env=PROBE, recorder=Traces())
+    train_seeds(PROBE, configs, folders, resume=True, eval_env=PROBE, recorder=Traces())
     for folder in folders:
         record = json.loads((folder / "evaluations.json").read_text())
         assert [e["env_steps"] for e in record["evaluations"]] == [32, 64, 80]

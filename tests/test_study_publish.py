@@ -23,6 +23,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
+from tests.training import random_params
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -39,14 +40,11 @@ def policy_of(seed: int, **network: Any) -> TrainedPolicy:
     settings = {"normalization": {"observations": True}, "evaluation": {"every": 1}, "total_steps": 100_000}
     config = override(TrainConfig(task=CELL.task, seed=seed), {**settings, **network})
     built = config.network.build(DIMS)
-    params = built.policy_params(jax.jit(built.init)(jax.random.PRNGKey(seed)))
-    leaves, structure = jax.tree.flatten(params)
-    random = np.random.default_rng(seed)
-    moved = [x + jnp.asarray(random.normal(0.0, 0.05, x.shape), x.dtype) for x in leaves]
+    params = built.policy_params(random_params(built, seed))
     statistics = running_init(DIMS.observation)._replace(samples=jnp.float32(4e7), mean=jnp.full(16, 0.123))
     steps = config.num_updates * config.steps_per_update
     metadata = {"task": CELL.task, "env_steps": steps}
-    return TrainedPolicy(jax.tree.unflatten(structure, moved), statistics, DIMS, config, metadata)
+    return TrainedPolicy(params, statistics, DIMS, config, metadata)
 
 
 def make_sweep(folder: Path, scores: dict[int, float]) -> Path:

@@ -25,6 +25,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import adam
 from mqe_jax.train.schedules import next_assistance, scheduled
+from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
 
@@ -227,7 +228,7 @@ def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
     )
     dims = EnvDims(agents=1, observation=2, privileged=0, action=3, values=1)
     network = settings.build(dims)
-    params = jax.jit(network.init)(KEY)
+    params = random_params(network)
     obs, first, action = jnp.zeros((1, 1, 1, 2)), jnp.zeros((1, 1), bool), jnp.zeros((1, 1, 1, 3))
 
     @jax.jit
@@ -261,7 +262,7 @@ def test_normalised_layers_by_hand(recurrent: bool) -> None:
     dims = EnvDims(agents=2, observation=3, privileged=0, action=2, values=2)
     network = settings.build(dims)
     obs = jax.random.normal(KEY, (6, 2, 3))
-    params = jax.tree.map(lambda x: x + 0.1, jax.jit(network.init)(KEY))
+    params = random_params(network)
     memory = network.initial_memory(6)
     mean, _, after = jax.jit(network.act)(params, memory.actor, obs, None)
 

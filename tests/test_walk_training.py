@@ -18,14 +18,14 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import JOINT_NAMES
 from mqe_jax.settings import override
-from mqe_jax.train.learner import make_learner
+from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.types import NetworkMemory
 from mqe_jax.walk.env import WalkEnv
 from mqe_jax.walk.network import WalkNetwork, mirror_action, mirror_history, symmetry_loss, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
-from tests.training import Probe
+from tests.training import Probe, random_params
 
 DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
 
@@ -68,31 +68,36 @@ def settings(**changes: Any) -> Any:
     return override(WALK, {**small, "curriculum.assistance": 0.0, **changes})
 
 
-def test_a_chunk_repeats_the_rollout() -> None:
-    """The first gradient step reproduces the rollout's log-densities: histories, chunks and resets are the same."""
-    learner = make_learner(probe(), settings(ppo={"epochs": 1, "minibatches": 1}))
-    update, state = jax.jit(learner.update), jax.jit(learner.init)(jax.random.PRNGKey(0))
-    for _ in range(4):
-        state, metrics = update(state)
-        assert abs(float(metrics["approx_kl"])) < 1e-5 and float(metrics["clip_fraction"]) == 0.0
-    assert state.rollout.memory.actor.shape == (4, 29, 70)
-
-
-def test_only_the_critic_learns_at_first() -> None:
-    config = settings(total_steps=3 * 48, ppo={"epochs": 1, "minibatches": 1, "critic_warmup": 0.5})
+@pytest.fixture(scope="module")
+def history() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
+    """States and metrics of four updates of one gradient step, the first two of the critic alone."""
+    config = settings(total_steps=4 * 48, ppo={"epochs": 1, "minibatches": 1, "critic_warmup": 0.5})
     learner = make_learner(probe(), config)
-    update, states = jax.jit(learner.update), [jax.jit(learner.init)(jax.random.PRNGKey(0))]
-    for _ in range(3):
-        states.append(update(states[-1])[0])
-    for number, (before, after) in enumerate(itertools.pairwise(states)):
-        for name, moves in (("critic", True), ("policy", number == 2)):
+    update, states, rows = jax.jit(learner.update), [jax.jit(learner.init)(jax.random.PRNGKey(0))], []
+    for _ in range(4):
+        state, metrics = update(states[-1])
+        states.append(state)
+        rows.append(metrics)
+    return states, rows
+
+
+def test_a_chunk_repeats_the_rollout(history: Any) -> None:
+    """The first gradient step reproduces the rollout's log-densities: histories, chunks and resets are the same."""
+    for metrics in history[1]:
+        assert abs(float(metrics["approx_kl"])) < 1e-5 and float(metrics["clip_fraction"]) == 0.0
+    assert history[0][-1].rollout.memory.actor.shape == (4, 29, 70)
+
+
+def test_only_the_critic_learns_at_first(history: Any) -> None:
+    for number, (before, after) in enumerate(itertools.pairwise(history[0])):
+        for name, moves in (("critic", True), ("policy", number >= 2)):
             pairs = zip(*(jax.tree.leaves(state.params[name]) for state in (before, after)), strict=True)
             assert any(np.any(a != b) for a, b in pairs) == moves
 
 
 def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> None:
     network = WalkNetwork(symmetry_coef=0.0).build(DIMS)
-    params = jax.jit(network.init)(jax.random.PRNGKey(0))
+    params = random_params(network)
     obs = jax.random.normal(jax.random.PRNGKey(1), (3, 2, 1, 70))
     privileged = jax.random.normal(jax.random.PRNGKey(2), (3, 2, 5))
     rest = NetworkMemory(jnp.zeros((2, 29, 70)), ()), jnp.zeros((3, 2), bool), obs, privileged, jnp.zeros((3, 2, 1, 12))

@@ -20,7 +20,8 @@ import numpy as np
 from safetensors.numpy import load_file
 
 from mqe_jax.train.checkpoint import latest
-from mqe_jax.train.types import Trace
+from mqe_jax.train.networks import Network
+from mqe_jax.train.types import Params, Trace
 
 
 @jax.tree_util.register_dataclass
@@ -175,6 +176,14 @@ class Traces:
 
     def add(self, trace: Trace) -> None:
         self.all.append(trace)
+
+
+def random_params(network: Network, seed: int = 0) -> Params:
+    """Parameters of a network drawn by NumPy, matrices of gain 1; the network's `init` takes long to compile."""
+    random = np.random.default_rng(seed)
+    scale = lambda x: x.shape[-2] ** -0.5 if x.ndim > 1 else 0.1  # noqa: E731
+    shapes = jax.eval_shape(network.init, jax.random.PRNGKey(0))
+    return jax.tree.map(lambda x: jnp.asarray(scale(x) * random.normal(size=x.shape), x.dtype), shapes)
 
 
 def assert_same(one: Any, other: Any) -> None:

@@ -76,7 +76,7 @@ class HostEnvs:
         self.state: State | None = None
         self._mode, self._size = render_mode, (width, height)
         self._camera: Camera | None = None
-        match = self.env.match if isinstance(self.env, TeamEnv) else self.env
+        self._task = match = self.env.match if isinstance(self.env, TeamEnv) else self.env
         opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
         key = (type(match), match.params, match.impl, match.control, match.physics.num_envs, opponent)
         try:
@@ -131,11 +131,11 @@ class HostEnvs:
             raise InputError("render: reset the environment first")
         data = self.state.data
         pose = (np.asarray(x)[index : index + 1] for x in (data.qpos, data.mocap_pos, data.mocap_quat))
-        episode = Episode(*pose, dt=self.env.dt)
+        episode = Episode(*pose, dt=self._task.dt)
         if self._camera is None:
-            model = rendering_model(self.env.mj_model, episode)
+            model = rendering_model(self._task.mj_model, episode)
             self._camera = default_camera(model, episode, self._size[0] / self._size[1])
-        return np.array(next(iter(render_frames(self.env, episode, [self._camera], self._size))))
+        return np.array(next(iter(render_frames(self._task, episode, [self._camera], self._size))))
 
 
 @functools.lru_cache(maxsize=16)

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.files import append, check_folder, read_rows
 
@@ -49,7 +50,7 @@ def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, f
 
 
 def programs(
-    env: Any, vector: Any, steps: int, seen: Callable[[Any], Any]
+    env: QuadrupedEnv, vector: VectorEnv, steps: int, seen: Callable[[Any], Any]
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """Returns what is timed, neither jitted: whole environment steps, and physics alone.
 
@@ -72,7 +73,7 @@ def programs(
 
 
 def bench(
-    env: Any, vector_env: Any, key: jax.Array, *, steps: int = 50, repeats: int = 5
+    env: QuadrupedEnv, vector_env: VectorEnv, key: jax.Array, *, steps: int = 50, repeats: int = 5
 ) -> dict[str, str | int | float]:
     """Measures one task on one engine.
 

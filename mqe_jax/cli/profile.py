@@ -24,6 +24,7 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from mqe_jax.cli import setup
 from mqe_jax.cli.bench import device_name, programs
 from mqe_jax.cli.options import print_table
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.files import replacing
 from mqe_jax.settings import override
 from mqe_jax.train.learner import make_learner
@@ -154,7 +155,7 @@ def contacts(model: mujoco.MjModel, states: dict[str, np.ndarray]) -> dict[str, 
     }
 
 
-def profile(env: Any, vector: Any, key: jax.Array, *, steps: int, repeats: int) -> dict[str, Any]:
+def profile(env: QuadrupedEnv, vector: VectorEnv, key: jax.Array, *, steps: int, repeats: int) -> dict[str, Any]:
     """Measures the environment step of a batch: rates in turn with the bare engine, shares, compilation, memory."""
     count, start = vector.num_envs, (jax.jit(vector.reset)(key), key)
     run, bare = programs(env, vector, steps, lambda state: sampled(state.data))

@@ -13,6 +13,7 @@ from mqe_jax.limits import Candidates, ClipLength, FrameRate, Pixels, Speed, Tim
 from mqe_jax.settings import record
 
 if TYPE_CHECKING:
+    from mqe_jax.envs import QuadrupedEnv
     from mqe_jax.train.policy import Policy
 
 
@@ -56,7 +57,7 @@ class Render(PolicyOptions):
 
 
 def draw(
-    env: Any, policy: Policy, path: Path, *, seed: int, episodes: int = 1, seconds: float = 20.0, **options: Any
+    env: QuadrupedEnv, policy: Policy, path: Path, *, seed: int, episodes: int = 1, seconds: float = 20, **options: Any
 ) -> dict[str, Any]:
     """Runs `episodes` episodes of a policy of all agents and renders the best one, with options of `render_episode`.
 

@@ -12,7 +12,7 @@ import jax
 
 from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
-from mqe_jax.envs import ALIASES, PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
@@ -125,7 +125,7 @@ def check_start(config: TrainConfig) -> None:
             load_policy(name, env)
 
 
-def _check_teams(env: Any, config: TrainConfig) -> None:
+def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
     if len(env.teams) < 2 and config.opponents:
         fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
     if config.both_sides and not config.opponents:
@@ -134,7 +134,7 @@ def _check_teams(env: Any, config: TrainConfig) -> None:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 
 
-def anchors(env: Any) -> list[str]:
+def anchors(env: QuadrupedEnv) -> list[str]:
     """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
     return [*(["scripted"] if env.name in PLANNERS and env.control == "command" else []), "idle", "random"]
 

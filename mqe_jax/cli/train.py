@@ -15,7 +15,7 @@ import tyro
 from mqe_jax import interrupts, robots, walk_policy
 from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
 from mqe_jax.cli.setup import base_config, environments, for_task
-from mqe_jax.envs import ALIASES, TASKS
+from mqe_jax.envs import ALIASES, TASKS, QuadrupedEnv
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.envs.wrappers import WrappedState
 from mqe_jax.files import check_folder
@@ -166,7 +166,7 @@ class DivergenceRecorder:
     written: list[Path]
     """Files written."""
 
-    def __init__(self, env: Any, folder: Path) -> None:
+    def __init__(self, env: QuadrupedEnv, folder: Path) -> None:
         check_folder(folder, "dump_diverged")
         self.written: list[Path] = []
         self._env, self._folder = env, folder

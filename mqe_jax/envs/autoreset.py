@@ -51,19 +51,34 @@ def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> St
     return dataclasses.replace(state, data=data, key=key, **merged)
 
 
-class VectorEnv:
-    """A batch of environments with automatic reset, as used for training and evaluation."""
+class Batch:
+    """What all batches of environments of tasks have."""
 
     env: QuadrupedEnv
     """The task."""
     num_envs: int
     """Number of environments N."""
-    copies: int
-    """Batches for which buffers are sized."""
+    num_agents: int
+    """Number of agents A of each."""
     teams: tuple[tuple[int, ...], ...]
     """Agents of each team."""
+    action_size: int
+    """Length of an agent's action."""
     max_episode_steps: int
     """Environment steps until the time limit."""
+
+    def check_action(self, action: jax.Array) -> None:
+        """Raises an InputError for actions of another shape than (N, A, action_size)."""
+        shape = (self.num_envs, self.num_agents, self.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
+
+
+class VectorEnv(Batch):
+    """A batch of environments with automatic reset, as used for training and evaluation."""
+
+    copies: int
+    """Batches for which buffers are sized."""
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
         """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
@@ -107,9 +122,3 @@ class VectorEnv:
             return autoreset(self.env, self.env.step(state, action))
 
         return jax.vmap(one)(state, action)
-
-    def check_action(self, action: jax.Array) -> None:
-        """Raises an InputError for actions of another shape than (N, A, action_size)."""
-        shape = (self.num_envs, self.num_agents, self.action_size)
-        if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")

@@ -9,6 +9,7 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.envs.autoreset import Batch
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.train import devices
 
@@ -24,8 +25,8 @@ class WrappedState(EnvironmentState):
     """Actions that the wrapped batch received in the last step (N, A, D)."""
 
 
-class Outer:
-    """A batch of environments around another: the attributes of `VectorEnv`, by default those of the inner one."""
+class Outer(Batch):
+    """A batch of environments around another, whose attributes it has by default."""
 
     inner: Any
     """The wrapped batch."""
@@ -47,10 +48,6 @@ class Outer:
 
 class Wrapper(Outer):
     """A batch of environments around another; subclasses change what is seen."""
-
-    def check_action(self, action: jax.Array) -> None:
-        """Raises an InputError for actions of another shape than (N, A, action_size)."""
-        self.inner.check_action(action)
 
     def reset(self, key: jax.Array) -> WrappedState:
         """Returns the initial states of all environments."""

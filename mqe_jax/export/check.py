@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
@@ -25,7 +26,7 @@ CYCLES = {"next_walk_gait": 1.0, "obs": 2 * np.pi}
 Arrays = dict[str, np.ndarray]
 
 
-def checked_onnx(policy: TrainedPolicy, env: Any) -> tuple[onnx.ModelProto, float]:
+def checked_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of a policy and its largest error against JAX in `STEPS` steps of the task.
 
     Raises:
@@ -54,7 +55,7 @@ def _largest(errors: Mapping[str, float], where: str) -> float:
     return error
 
 
-def record(policy: TrainedPolicy, env: Any, steps: int) -> tuple[Arrays, Arrays]:
+def record(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
     """Returns inputs and outputs of `policy_step` by name, leading axis T, of episodes with mean actions.
 
     The opponents of a match are idle.

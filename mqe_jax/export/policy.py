@@ -27,6 +27,7 @@ import onnx
 
 import mqe_jax
 from mqe_jax import skills
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.policies import check_policy
 from mqe_jax.robots.index import Proprioception
@@ -38,7 +39,7 @@ SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JO
 """Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
 
 
-def to_onnx(policy: TrainedPolicy, env: Any) -> onnx.ModelProto:
+def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy on its task, which defines control mode, robot and walk policy.
 
     Raises:
@@ -49,7 +50,7 @@ def to_onnx(policy: TrainedPolicy, env: Any) -> onnx.ModelProto:
     return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
 
 
-def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
+def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
@@ -59,7 +60,7 @@ def input_shapes(policy: TrainedPolicy, env: Any) -> dict[str, tuple[int, ...]]:
     return shapes | {name: x.shape for name, x in named("memory", policy.initial_memory()).items()}
 
 
-def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+def policy_step(policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
     action, memory = policy.act(inputs["obs"], filled("memory", policy.initial_memory(), inputs))
     outputs = {"action": action} | named("next_memory", memory)
@@ -75,7 +76,7 @@ def policy_step(policy: TrainedPolicy, env: Any, inputs: Mapping[str, jax.Array]
     return outputs | {"commands": commands, "joint_target": target} | named(f"next_{skill.name}", memory)
 
 
-def skill_of(env: Any) -> tuple[Skill, Any]:
+def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
     """Returns the skill of a task's robots for any commands, with its parameters as they are in the file."""
     skill = skills.make(env.controller.skill.name, env.robot)
     return skill, skill.load_params(env.params.skill_weights)
@@ -101,7 +102,7 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
 
 
-def _properties(policy: TrainedPolicy, env: Any) -> dict[str, str]:
+def _properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of the model as strings, JSON-encoded where structured."""
     layout = [[block.name, block.width, block.meaning] for block in env.observation_layout.blocks]
     return {

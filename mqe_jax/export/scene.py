@@ -7,11 +7,12 @@ from typing import Any
 import mujoco
 
 from mqe_jax.appearance import ROBOT_COLORS
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.robots import motors
 from mqe_jax.scene import build_spec
 
 
-def scene_xml(env: Any) -> str:
+def scene_xml(env: QuadrupedEnv) -> str:
     """Returns the MJCF of the task's rendering model, which has the physics of the task's model.
 
     MuJoCo writes six significant digits, so inertias and inertial frames differ by less than 1e-6 after recompilation.
@@ -21,7 +22,7 @@ def scene_xml(env: Any) -> str:
     return spec.to_xml()
 
 
-def scene_settings(env: Any) -> dict[str, Any]:
+def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     """Returns plain numbers, lists and mappings, in m, rad, s and N.
 
     | entry | content |
@@ -56,7 +57,7 @@ def scene_settings(env: Any) -> dict[str, Any]:
     }
 
 
-def _motors(env: Any) -> dict[str, Any]:
+def _motors(env: QuadrupedEnv) -> dict[str, Any]:
     model, table = env.compiled.model, env.compiled.motors
     arrays = ("speed", "torque", "stall", "response")
     return {

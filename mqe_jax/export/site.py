@@ -20,7 +20,7 @@ import numpy as np
 import onnx
 
 from mqe_jax import zoo
-from mqe_jax.envs import ALIASES, PLANNERS, TASKS, make
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, make
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.export.check import checked
@@ -45,7 +45,7 @@ class Entry:
 
     name: str
     """Name of its folder."""
-    env: Any
+    env: QuadrupedEnv
     """The task."""
     policies: dict[str, Policy]
     """Policies of a team; `idle` is always possible on the page."""
@@ -145,7 +145,7 @@ def _title(entry: Entry) -> str:
     return f"{entry.env.title} {number}".strip()
 
 
-def start_states(env: Any) -> dict[str, np.ndarray]:
+def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:
     """Returns `STARTS` initial states by name, leading axis `STARTS`: the state, `mocap_pos` and `obs`."""
 
     def start(key: jax.Array) -> dict[str, jax.Array]:
@@ -169,7 +169,7 @@ def packed(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
     return rows[:, varying], {"fields": fields, "constant": constant, "varying": varying.tolist()}
 
 
-def write_skill(env: Any, folder: Path) -> dict[str, Any]:
+def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
     """Writes the skill of a task's robots unless it is there; returns its file and the shapes of its graph."""
     graph = _graph(*skill_function(env), env.controller.skill.name, {})
     content = graph.SerializeToString()

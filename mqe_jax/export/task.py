@@ -27,6 +27,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.errors import InputError
 from mqe_jax.export.policy import SENSED, filled, named, skill_of
@@ -48,12 +49,12 @@ class TaskFunctions:
         InputError: for another control mode than `command`, or an actuator network.
     """
 
-    env: Any
+    env: QuadrupedEnv
     """The task."""
     outcomes: list[str]
     """Names of the entries of the output `outcome`."""
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: QuadrupedEnv) -> None:
         if env.control != "command":
             raise InputError(f"control: {env.control!r} is not allowed; graphs of tasks need 'command'")
         if env.params.actuator_network is not None:
@@ -142,7 +143,7 @@ def state_arrays(state: State) -> dict[str, jax.Array]:
     return {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if x.size}
 
 
-def skill_function(env: Any) -> tuple[Function, Shapes]:
+def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     """Returns the skill of a task's robots as a function of one robot, and the shapes of its inputs."""
     skill, params = skill_of(env)
     memory = named(skill.name, skill.init_memory())

@@ -16,9 +16,9 @@ from mqe_jax.train.checkpoint import load_checkpoint, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.learner import Learner, TrainState, make_learner
-from mqe_jax.train.policy import read_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.types import PyTree, Recorder, VectorEnv
+from mqe_jax.train.types import Params, PyTree, Recorder, VectorEnv
 
 CONFIG_FILE = "config.yaml"
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -52,7 +52,12 @@ def first_state(
     """
     init = processes.compile(learner.init, start=True)
     if checkpoint is None:
-        return _from_policy(env, init(initial_key(config)), config), 0.0
+        policy = None if config.start is None else _policy_of(env, processes.whole.params, config.start)
+        state = init(initial_key(config))
+        if policy is not None:
+            normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
+            state = dataclasses.replace(state, params={**state.params, **policy.params}, obs_normalizer=normalizer)
+        return state, 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
@@ -75,18 +80,15 @@ def first_state(
     return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
-def _from_policy(env: VectorEnv, state: TrainState, config: TrainConfig) -> TrainState:
-    """Returns an initial state with the policy that `config.start` names."""
-    if config.start is None:
-        return state
-    policy = read_policy(config.start)
-    shapes = jax.tree.map(jnp.shape, {name: state.params.get(name) for name in policy.params})
+def _policy_of(env: VectorEnv, params: Params, start: str) -> TrainedPolicy:
+    """Returns the policy that `start` names; InputError unless it fits parameters, given their shapes, and the task."""
+    policy = read_policy(start)
+    shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != env.name:
         raise InputError(
-            f"start: {config.start} has a policy of {policy.task}; allowed: one of {env.name} with this run's network"
+            f"start: {start} has a policy of {policy.task}; allowed: one of {env.name} with this run's network"
         )
-    normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
-    return dataclasses.replace(state, params={**state.params, **policy.params}, obs_normalizer=normalizer)
+    return policy
 
 
 def without_environments(state: TrainState) -> dict[str, Any]:

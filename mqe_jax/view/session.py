@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.policy import Policy
+from mqe_jax.train.types import VectorEnv
 from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")
@@ -77,7 +79,7 @@ class Drive:
 class Session:
     """N environments stepped under a policy, with a history of recent steps."""
 
-    env: Any
+    env: QuadrupedEnv
     """The task."""
     num_envs: int
     """N."""
@@ -100,7 +102,9 @@ class Session:
     last: list[str]
     """Outcome of the last finished episode of each environment, empty before its end and where none applies."""
 
-    def __init__(self, env: Any, vector_env: Any, policy: Policy, seed: int = 0, history: float = 20.0) -> None:
+    def __init__(
+        self, env: QuadrupedEnv, vector_env: VectorEnv, policy: Policy, seed: int = 0, history: float = 20.0
+    ) -> None:
         """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
         self.paused, self.speed, self.drive = False, 1.0, Drive(np.zeros(3))

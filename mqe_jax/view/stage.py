@@ -11,6 +11,7 @@ import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
 from mqe_jax.appearance import GROUND_GROUP
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
@@ -150,7 +151,7 @@ def seen(look_at: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
     return look_at + distance * np.array([-0.62, -0.28, 0.73]), look_at
 
 
-def start_frame(env: Any, num_envs: int) -> Episode:
+def start_frame(env: QuadrupedEnv, num_envs: int) -> Episode:
     """Returns the robots at their start, in `num_envs` frames: the mean of the initial states, without compilation."""
     index, data = env.index, mujoco.MjData(env.compiled.model)
     qpos = data.qpos.copy()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
 import viser
 
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 from mqe_jax.view.menu import Menu
 from mqe_jax.view.overlay import Overlay
@@ -43,7 +43,7 @@ class Viewer:
         self._menu = menu
         self._announced = False
 
-    def announce(self, env: Any, num_envs: int) -> None:
+    def announce(self, env: QuadrupedEnv, num_envs: int) -> None:
         """Shows a task with its robots at their start, before the session that `run` opens: that compiles."""
         self._build(env.mj_model, start_frame(env, num_envs))
         self.server.gui.add_markdown(f"**{env.name}** is being compiled")

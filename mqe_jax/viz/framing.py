@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mqe_jax.appearance import GOAL_SITE, HIDDEN_GROUP
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, posed, robot_bases, robot_color
 from mqe_jax.viz.recording import Episode
 
@@ -78,7 +78,7 @@ def smoothed(views: Sequence[Camera], width: int) -> list[Camera]:
 _INK, _PAPER = (28, 32, 40), (246, 246, 242)
 
 
-def entries(env: Any) -> list[tuple[str, list[tuple[int, ...]]]]:
+def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
     """Returns labels and the colours, 0 to 255, of their robots: teams in the order of `env.teams`, then others."""
     bases = robot_bases(env.mj_model)
     colors = [tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases]
@@ -88,7 +88,7 @@ def entries(env: Any) -> list[tuple[str, list[tuple[int, ...]]]]:
     return [*rows, ("scripted", scripted)] if scripted else rows
 
 
-def legend(env: Any, size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
+def legend(env: QuadrupedEnv, size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8.
 
     One robot alone needs none.

@@ -10,12 +10,13 @@ from typing import Any
 
 import jax
 
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.evaluate import Act
 from mqe_jax.viz.recording import Episode, best, record
 from mqe_jax.viz.render import render_episode
 
 
-def clip(env: Any, episode: Episode, size: tuple[int, int] = (480, 270), fps: float = 25.0) -> Any:
+def clip(env: QuadrupedEnv, episode: Episode, size: tuple[int, int] = (480, 270), fps: float = 25.0) -> Any:
     """Returns an episode as inline HTML: H.264 with imageio-ffmpeg (extra `render`), else a GIF."""
     from IPython.display import HTML
 
@@ -30,7 +31,14 @@ def clip(env: Any, episode: Episode, size: tuple[int, int] = (480, 270), fps: fl
 
 
 def play(
-    env: Any, act: Act, memory: Any = (), *, episodes: int = 1, seconds: float = 20.0, seed: int = 0, **options: Any
+    env: QuadrupedEnv,
+    act: Act,
+    memory: Any = (),
+    *,
+    episodes: int = 1,
+    seconds: float = 20.0,
+    seed: int = 0,
+    **options: Any,
 ) -> Any:
     """Runs episodes under a batched policy, as `record`, and returns the best one as `clip`, with its options."""
     recorded = record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)

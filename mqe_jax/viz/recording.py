@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.settings import checked, fail
 from mqe_jax.train.evaluate import Act
@@ -45,7 +46,7 @@ class Episode:
 
 @checked(act=Callable, key=RandomKey, episodes=Candidates, seconds=ClipLength)
 def record(
-    env: Any, act: Act, memory: Any, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
+    env: QuadrupedEnv, act: Act, memory: Any, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
 ) -> list[Episode]:
     """Records one episode in each of several environments, without automatic reset.
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from mqe_jax.appearance import GROUND_GROUP
 from mqe_jax.appearance.grounds import GROUND_MATERIAL
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 from mqe_jax.interrupts import child
 from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
@@ -142,7 +143,7 @@ _BACKEND = Literal["auto", "egl", "osmesa"] | None
 
 @checked(size=_SIZE, backend=_BACKEND)
 def render_frames(
-    env: Any,
+    env: QuadrupedEnv,
     episode: Episode,
     views: Sequence[Camera] | None = None,
     size: tuple[int, int] = (960, 540),
@@ -163,7 +164,7 @@ def render_frames(
 
 @checked(path=PathText, size=_SIZE | None, fps=FrameRate | None, speed=Speed, at=Time | None, backend=_BACKEND)
 def render_episode(
-    env: Any,
+    env: QuadrupedEnv,
     episode: Episode,
     path: Path,
     *,
