@@ -254,6 +254,15 @@ def test_a_small_archive_is_read(tmp_path: Path) -> None:
     assert read_torchscript(tmp_path / "good.jit") == {"weight": np.array([3.0], np.float32)}
 
 
+@pytest.mark.parametrize("name", ["task", "impl", "num_envs", "control"])
+def test_a_recording_whose_parameters_are_none(name: str, tmp_path: Path) -> None:
+    """They would be arguments of `make`."""
+    about = {"task": "go1plane", "params": {name: 1}, "impl": "c", "control": "position"}
+    np.savez(tmp_path / "a.npz", about=json.dumps(about), actions=np.zeros((1, 1, 12)))
+    with pytest.raises(InputError, match=name):
+        load_recording(tmp_path / "a.npz")
+
+
 @pytest.mark.parametrize("case", ARCHIVES)
 def test_bad_archives(case: str, tmp_path: Path) -> None:
     path, before = tmp_path / "bad.jit", peak()
