@@ -85,7 +85,7 @@ def record(cls: type[T]) -> type[T]:
         except pydantic.ValidationError as error:
             raise _one_line(made, error) from None
 
-    made.__init__ = checked_init
+    made.__init__ = checked_init  # pyright: ignore[reportAttributeAccessIssue]
     return typing.cast(type[T], made)
 
 
