@@ -56,6 +56,17 @@ Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered)]
 Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered)]
 
 
+def _parameters(value: Mapping[str, Any]) -> Mapping[str, Any]:
+    for name, place in {"task": "as TASK", "impl": "by --impl", "num_envs": "by --num-envs"}.items():
+        if name in value:
+            raise InputError(f"{name}: is not a task parameter; it is given {place}")
+    return value
+
+
+Parameters = Annotated[Mapping[str, Any], pydantic.AfterValidator(_parameters)]
+"""A task's parameters by name; the control mode may be among them."""
+
+
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
 def record(cls: type[T]) -> type[T]:
     """Makes a class a frozen, keyword-only dataclass that validates its fields.
@@ -66,16 +77,15 @@ def record(cls: type[T]) -> type[T]:
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
-    init = made.__init__
 
-    @functools.wraps(init)
-    def checked_init(self: Any, **values: Any) -> None:
-        try:
-            init(self, **values)
+    @functools.wraps(made.__init__)
+    def checked_init(self: Any, /, **values: Any) -> None:
+        try:  # as pydantic's own `__init__`, which has no value named as its argument
+            self.__pydantic_validator__.validate_python(pydantic_core.ArgsKwargs((), values), self_instance=self)
         except pydantic.ValidationError as error:
             raise _one_line(made, error) from None
 
-    made.__init__ = checked_init
+    made.__init__ = checked_init  # pyright: ignore[reportAttributeAccessIssue]
     return typing.cast(type[T], made)
 
 

@@ -123,7 +123,8 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
         field = draw(st.sampled_from(sorted(fields)))
         value = draw(refused(fields[field]).filter(lambda x: not isinstance(x, list | bytes)))
         return [*words, f"--{field.replace('_', '-')}={value}"]
-    flag = draw(st.sampled_from(["--set=", "--set=gate_width=", "--seed=", "--policy=", "--config=", "--nope=", ""]))
+    texts = "--set= --set=gate_width= --set=task= --set=self= --seed= --policy= --config= --nope=".split()
+    flag = draw(st.sampled_from([*texts, ""]))
     return [*words, flag + "nothing " * (not flag) + draw(text)]
 
 
@@ -133,7 +134,7 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
 @st.composite
 def yaml_text(draw: st.DrawFn, record: Any) -> str:
     """YAML of a record's names with hostile values, as text since a value may be a fragment."""
-    names = [*hints_of(record), *(name for name, _ in numbers(record)), "nothing", "[a]", "1", "null"]
+    names = [*hints_of(record), *(name for name, _ in numbers(record)), *"nothing [a] 1 null self env.task".split()]
     value = st.sampled_from(TEXTS) | st.text(max_size=30) | st.floats().map(str) | st.integers().map(str)
     lines = draw(st.lists(st.tuples(st.sampled_from(names), value), min_size=1, max_size=4))
     return "\n".join(f"{name}: {text}" for name, text in lines)

@@ -135,6 +135,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("action: ", lambda x, v: x["task"].step(x["state"], v), (np.zeros((1, 2, 12)), 3, [])),
     ("unknown name", lambda x, v: build(TrainConfig, {v: 1}), ("", 3, b"a", "a" * 100, "\0")),
     ("ppo: ", lambda x, v: override(TrainConfig(), {"ppo": v}), (3, "x", [], None)),
+    ("unknown name", lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}), ("self", "__dataclass_self__", "init")),
     ("path: ", lambda x, v: load_yaml(v), (None, 3, "", "\0", [])),
     ("path: ", lambda x, v: read_torchscript(v), (None, 3, {}, [])),
     ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),

@@ -102,7 +102,8 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
         before = sorted(Path(folder).rglob("*"))
         for resume in ([], ["--resume"]):
             assert cli.main(["train", "fake", "--run-dir", folder, *SMALL, *flags, *resume]) == 2
-            assert "holds another run" in capfd.readouterr().err
+            error = capfd.readouterr().err
+            assert "holds another run" in error and error.count("\n") == 1
             assert sorted(Path(folder).rglob("*")) == before
 
 

@@ -21,8 +21,11 @@ from mqe_jax.league.league import MOVING, League
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
-from mqe_jax.settings import fail, load_yaml, override
+from mqe_jax.settings import Parameters, check, fail, load_yaml, override
+from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.learner import env_dims
+from mqe_jax.train.policy import read_policy
 
 CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
 
@@ -58,10 +61,7 @@ def make_env(
     task: str, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
 ) -> tuple[Any, VectorEnv]:
     """Returns a task and its vectorised environment with automatic reset; `copies` as in `VectorEnv`."""
-    for name in ("impl", "num_envs"):
-        if name in overrides:
-            flag = name.replace("_", "-")
-            raise InputError(f"set: {name} is not a task parameter; use --{flag}")
+    check("set", overrides, Parameters)
     device = platform()
     if impl == "warp" and device != "gpu":
         raise InputError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax")
@@ -110,14 +110,17 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
 
 
 def check_start(config: TrainConfig) -> None:
-    """Raises an InputError where a training could not start: for parameters, rewards or policies of its task.
+    """Raises an InputError where a training could not start: for parameters, rewards, policies, or sizes of rollouts.
 
     It makes the task with the parameters of training and of evaluation, for one environment.
     """
-    env, _ = make_env(config.task or "", "auto", config.training_env, 1)
+    env, single = make_env(config.task or "", "auto", config.training_env, 1)
     if config.train_env:
         make_env(config.task or "", "auto", config.env, 1)
     _check_teams(env, config)
+    check_divisible(config, config.network.build(env_dims(single, config)))
+    if config.start is not None and read_policy(config.start).task != env.name:
+        fail("start", config.start, f"a policy of {env.name}")
     for name in {*config.opponents} - {*MOVING}:
         load_opponent(name, env)
     for name in (config.curriculum.demonstrator, config.imitation.teacher):

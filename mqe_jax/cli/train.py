@@ -23,7 +23,7 @@ from mqe_jax.limits import Seeds
 from mqe_jax.opponents import TeamState
 from mqe_jax.settings import override, record
 from mqe_jax.train import runner
-from mqe_jax.train.checkpoint import latest
+from mqe_jax.train.checkpoint import check_alone, check_run, latest
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.types import Trace
 from mqe_jax.viz import curves
@@ -87,6 +87,9 @@ class Train(TaskOptions):
         vector_env, eval_env = environments(self.impl, config, len(configs))
         recorder = None if self.dump_diverged is None else DivergenceRecorder(vector_env.env, self.dump_diverged)
         if self.resume and not any(map(latest, folders)):
+            for folder in folders:  # as the trainer does later, after this line would have been wrong
+                check_alone(folder)
+                check_run(folder, True, (runner.CONFIG_FILE, runner.CSV_FILE, runner.POLICY_FILE))
             echo(f"mqe: {run_dir} has no checkpoint to resume from; starting a new run")
         with interrupts.before_exit(lambda: _HINT.format(run_dir)):
             try:

@@ -18,7 +18,7 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 from mqe_jax.files import archive, parse_json, write_atomically
-from mqe_jax.settings import PathText, checked, to_mapping
+from mqe_jax.settings import Parameters, PathText, check, checked, to_mapping
 
 # Fields on which a step depends; the others are recomputed by it.
 _FIELDS = ("step", "anchors", "control", "actuators", "randomized", "task", "assistance", "frozen_steps", "key")
@@ -77,6 +77,8 @@ def load_recording(file: str | pathlib.Path) -> Recording:
         made = Recording(**about, states=states, actions=arrays["actions"])
         if [type(about[name]) for name in ("task", "params", "impl", "control")] != [str, dict, str, str]:
             raise ValueError("its task, parameters, engine or control are of another type")
+        if "control" in check("params", made.params, Parameters):
+            raise ValueError("its control mode is among the parameters")
         if any(values.dtype.kind not in "fiub" for values in (made.actions, *states.values())):
             raise ValueError("its arrays are not numbers")
         if made.actions.ndim != 3 or not all(len(made.actions) == len(values) > 0 for values in states.values()):

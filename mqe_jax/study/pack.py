@@ -6,15 +6,15 @@ the environments, which are reset where it resumes. `tar xzf FILE -C FOLDER` unp
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import tarfile
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from mqe_jax import limits
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, replacing
+from mqe_jax.files import check_file, check_folder, read_text
 from mqe_jax.settings import fail
 from mqe_jax.study.sweep import SWEEP_FILE
 from mqe_jax.train.checkpoint import copy_without, latest
@@ -32,35 +32,46 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
     """Packs sweeps into files `part0.tar.gz`, `part1.tar.gz`, ... of the folder `output`; returns the files.
 
     Runs may be in training meanwhile. In the files a sweep has the name of its folder; these names differ. There are at
-    most `parts` files, of at most so many MiB each. InputError for a folder without a run, or where runs do not fit.
+    most `parts` files, of at most so many MiB each, which take the place of earlier ones when all are written.
+    InputError for no folder, a folder without a run, a file that cannot be read, or where runs do not fit.
     """
+    if not folders:
+        fail("folders", [], "at least one folder")
     if len({folder.resolve().name for folder in folders}) < len(folders):
         fail("folder", [str(folder) for folder in folders], "folders of different names")
+    runs_of = {folder: _runs(folder) for folder in folders}
     check_folder(output, "output")
     with tempfile.TemporaryDirectory(dir=output) as temporary:
-        root = Path(temporary)
-        sizes = {run: _size(run) for folder in folders for run in _staged(folder, root / folder.resolve().name)}
+        root, packed = Path(temporary, "sweeps"), []
+        staged = [_staged(folder, runs, root / folder.resolve().name) for folder, runs in runs_of.items()]
+        sizes = {run: _size(run) for copies in staged for run in copies}
         bins: list[list[Path]] = [[] for _ in range(parts)]
         for run in sorted(sizes, key=lambda run: -sizes[run]):
             min(bins, key=lambda runs: sum(sizes[each] for each in runs)).append(run)
-        files = []
         for i, runs in enumerate(filter(None, bins)):
-            files.append(output / f"part{i}.tar.gz")
-            with replacing(files[-1]) as path, tarfile.open(path, "w:gz", compresslevel=1) as archive:
+            packed.append(Path(temporary, f"part{i}.tar.gz"))
+            with tarfile.open(packed[-1], "w:gz", compresslevel=1) as archive:
                 for run in runs:
                     archive.add(run, run.relative_to(root))
-            if (size := files[-1].stat().st_size / 2**20) > megabytes:
-                raise InputError(f"output: {files[-1]} has {size:.1f} MiB; allowed: {megabytes:g}; pack fewer runs")
+            if (size := packed[-1].stat().st_size / 2**20) > megabytes:
+                name = output / packed[-1].name
+                raise InputError(f"output: {name} has {size:.1f} MiB; allowed: {megabytes:g}; pack fewer runs")
+        files = [file.replace(output / file.name) for file in packed]
     for old in set(output.glob("part*.tar.gz")) - set(files):
         old.unlink()
     return files
 
 
-def _staged(folder: Path, target: Path) -> list[Path]:
-    """Copies what is packed of a sweep into a folder; returns the copies of its runs, and of its settings."""
+def _runs(folder: Path) -> list[Path]:
+    """Returns the runs of a sweep; InputError where it has none."""
     runs = sorted(path.parent for path in folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}"))
     if not runs:
         raise InputError(f"folder: {folder} has no run runs/TASK/ALGORITHM/seed*; it must be a sweep's folder")
+    return runs
+
+
+def _staged(folder: Path, runs: Sequence[Path], target: Path) -> list[Path]:
+    """Copies what is packed of a sweep into a folder; returns the copies of its runs, and of its settings."""
     copies = []
     for run in runs:
         copies.append(target / run.relative_to(folder))
@@ -78,7 +89,8 @@ def _staged(folder: Path, target: Path) -> list[Path]:
 
 
 def _copy(source: Path, target: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):
+    if source.exists():
+        check_file(source, limits.POLICY_BYTES)
         shutil.copyfile(source, target)
 
 
@@ -97,10 +109,11 @@ def _checkpoint(run: Path, target: Path) -> None:
 
 
 def thin(source: Path, target: Path) -> None:
-    """Copies a table with about `ROWS` of its rows."""
-    if not source.is_file():
+    """Copies a table, if there is one, with about `ROWS` of its rows."""
+    lines = read_text(source, limits.CSV_BYTES, "a CSV file").splitlines() if source.exists() else []
+    if not lines:
         return
-    header, *rows = source.read_text(encoding="utf-8").splitlines()
+    header, *rows = lines
     stride = max(1, len(rows) // ROWS)
     kept = rows[::-1][::stride][::-1]
     target.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
