@@ -77,6 +77,15 @@ def test_csv(tmp_path: Path) -> None:
     ]
 
 
+def test_a_table_that_was_removed_begins_anew(tmp_path: Path) -> None:
+    """Later rows have names above them."""
+    log = logs.CsvLog(tmp_path, 0)
+    log.write({"env_steps": 100, "success": 0.5})
+    (tmp_path / logs.CSV_FILE).unlink()
+    log.write({"env_steps": 200, "success": 0.75})
+    assert (tmp_path / logs.CSV_FILE).read_text() == "env_steps,success\n200,0.75\n"
+
+
 def test_tensorboard(tmp_path: Path) -> None:
     """Finite numbers at their steps."""
     pytest.importorskip("tensorboardX", reason="needs the extra log")

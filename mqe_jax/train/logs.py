@@ -54,9 +54,9 @@ class CsvLog:
             self._path.unlink(missing_ok=True)
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Appends one row; a new name adds a column."""
+        """Appends one row; a new name adds a column, and a file that somebody removed begins anew."""
         new = [name for name in row if name not in self._columns]
-        if new:
+        if new or not self._path.exists():
             _, rows = _read_rows(self._path, self._key, None)
             self._columns += new
             self._rewrite(rows)
