@@ -251,6 +251,9 @@ def test_a_taken_or_missing_id_is_refused() -> None:
         register_task(type("Other", (TASKS["go1plane"],), {"name": "go1gate"}))
     with pytest.raises(ValueError, match="its `name` is empty"):
         register_task(type("Nameless", (TASKS["go1plane"],), {"name": ""}))
+    for other in (3, int):
+        with pytest.raises(ValueError, match="must be a class derived from QuadrupedEnv"):
+            register_task(other)  # pyright: ignore[reportArgumentType]
     assert [task.name for task in TASKS.values()] == list(TASKS)
 
 

@@ -96,9 +96,11 @@ def register_planner(task: str, name: str, planner: Planner | str) -> None:
 def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
-    Usable as a class decorator for a task without a scripted policy. InputError if the class has no name, or another
-    class is registered under it.
+    Usable as a class decorator for a task without a scripted policy. InputError if it is no class of tasks, has no
+    name, or another class is registered under it.
     """
+    if not (isinstance(task, type) and issubclass(task, QuadrupedEnv)):
+        raise InputError(f"task: {task!r} is not allowed; it must be a class derived from QuadrupedEnv")
     if not task.name:
         raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
     known = TASKS.get(task.name)
