@@ -25,7 +25,7 @@ from mqe_jax.settings import Parameters, check, fail, load_yaml, override
 from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import env_dims
-from mqe_jax.train.policy import read_policy
+from mqe_jax.train.start import initial_key, policy_to_start
 
 CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
 
@@ -118,9 +118,10 @@ def check_start(config: TrainConfig) -> None:
     if config.train_env:
         make_env(config.task or "", "auto", config.env, 1)
     _check_teams(env, config)
-    check_divisible(config, config.network.build(env_dims(single, config)))
-    if config.start is not None and read_policy(config.start).task != env.name:
-        fail("start", config.start, f"a policy of {env.name}")
+    network = config.network.build(env_dims(single, config))
+    check_divisible(config, network)
+    if config.start is not None:
+        policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config.start)
     for name in {*config.opponents} - {*MOVING}:
         load_opponent(name, env)
     for name in (config.curriculum.demonstrator, config.imitation.teacher):

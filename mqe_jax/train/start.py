@@ -52,7 +52,7 @@ def first_state(
     """
     init = processes.compile(learner.init, start=True)
     if checkpoint is None:
-        policy = None if config.start is None else _policy_of(env, processes.whole.params, config.start)
+        policy = None if config.start is None else policy_to_start(env.name, processes.whole.params, config.start)
         state = init(initial_key(config))
         if policy is not None:
             normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
@@ -80,13 +80,13 @@ def first_state(
     return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
-def _policy_of(env: VectorEnv, params: Params, start: str) -> TrainedPolicy:
+def policy_to_start(task: str, params: Params, start: str) -> TrainedPolicy:
     """Returns the policy that `start` names; InputError unless it fits parameters, given their shapes, and the task."""
     policy = read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
-    if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != env.name:
+    if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != task:
         raise InputError(
-            f"start: {start} has a policy of {policy.task}; allowed: one of {env.name} with this run's network"
+            f"start: {start} has a policy of {policy.task}; allowed: one of {task} with this run's network"
         )
     return policy
 
