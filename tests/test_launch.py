@@ -323,3 +323,22 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     assert members("--processes", "4", "--coordinator", "h:1", "--index", "3") == [{launch.MEMBER: "3/4@h:1"}]
     monkeypatch.setenv("SLURM_PROCID", "1")
     assert members() == [{launch.MEMBER: "auto"}]
+
+
+def test_lines_of_the_coordination_service_are_not_shown(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What JAX writes where process 0 of a training that has ended leaves before the others."""
+    said = """go1gate: 1,024 of 1,024 steps
+W1126 00:01:02.123456     123 grpc_client.cc:1] lost
+Additional GRPC error information from remote target coordination_service while calling /xla.x/WatchTasks:
+:CANCELLED:CANCELLED [type.googleapis.com/tensorflow.DerivedStatus='']
+=== Source Location Trace: ===
+external/xla+/xla/tsl/distributed_runtime/rpc/grpc_util.h:89
+
+mqe: runs/gate has the policy
+"""
+    monkeypatch.setattr(launch, "PROGRAM", [sys.executable, "-c"])
+    script = f"import sys; sys.stderr.write({said!r})"
+    assert launch._supervise((script,), [{}], together=True) == 0
+    assert capfd.readouterr().err.splitlines() == [said.splitlines()[0], said.splitlines()[-1]]

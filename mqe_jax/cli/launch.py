@@ -35,7 +35,11 @@ PROGRAM = [sys.executable, "-m", "mqe_jax.cli"]
 _COMMANDS = ("train", "walk", "sweep")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _RESUME = "the same command with --resume goes on"
-_NOISE = re.compile(r"([IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo)")
+_NOISE = re.compile(
+    r"[IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo"
+    r"|Additional GRPC error|:[A-Z_]+:|=== Source Location Trace|external/xla|\s*$"
+)
+"""Lines of JAX's coordination service and collectives; several of a lost connection where the training has ended."""
 
 
 @record
