@@ -60,7 +60,7 @@ class MjxEngine(Engine):
         position, velocity = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
         gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
         ctrl, armature = motors.limit(jnp, ctrl, position, velocity, gain, bias)
-        added = _spread(armature, motors.joint_qvel, self.model.nv)
+        added = _taken(armature, np.arange(len(motors.joint_qvel)), motors.joint_qvel, self.model.nv)
         return model.replace(dof_armature=model.dof_armature + added), data.replace(ctrl=ctrl)
 
     def _clamped(self, data: mjx.Data) -> mjx.Data:
@@ -68,12 +68,11 @@ class MjxEngine(Engine):
         motors = self.motors
         if motors is None:
             return data
-        old = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
-        position, velocity = motors.clamp(jnp, *old)
-        return data.replace(
-            qpos=data.qpos + _spread(position - old[0], motors.joint_qpos, self.model.nq),
-            qvel=data.qvel + _spread(velocity - old[1], motors.joint_qvel, self.model.nv),
-        )
+        limit = np.full(self.model.nv, np.inf, np.float32)
+        limit[motors.joint_qvel] = motors.fastest
+        clamped = jnp.clip(data.qvel, -limit, limit)
+        excess = _taken(data.qvel - clamped, motors.joint_qvel, motors.joint_qpos, self.model.nq)
+        return data.replace(qpos=data.qpos - motors.timestep * excess, qvel=clamped)
 
 
 class JaxEngine(MjxEngine):
@@ -148,8 +147,8 @@ class WarpEngine(MjxEngine):
         return self._mjx.step(model, data), jnp.zeros((), bool)
 
 
-def _spread(values: jax.Array, addresses: np.ndarray, size: int) -> jax.Array:
-    """Returns an array (size,) with the values (J,) at their addresses and zeros elsewhere, by a gather."""
-    source = np.full(size, len(addresses))
-    source[addresses] = np.arange(len(addresses))
+def _taken(values: jax.Array, sources: np.ndarray, addresses: np.ndarray, size: int) -> jax.Array:
+    """Returns an array (size,) with the values at `sources` (J,) at `addresses` (J,) and zeros elsewhere."""
+    source = np.full(size, len(values))
+    source[addresses] = sources
     return jnp.concatenate([values, jnp.zeros(1)])[source]

@@ -115,24 +115,37 @@ class Motors:
         effort = np.abs(_force(ctrl, position, velocity, gain, bias))
         idle = effort <= np.minimum(self._line * (self.speed - pace), self.torque)
         idle &= pace <= self._slow
-        pace += self._kick(effort)
+        pace += self._kick(np, effort)
         idle &= pace <= self._near
         return idle.all(axis=-1)
 
-    def _kick(self, effort: Any) -> Any:
+    def _kick(self, xp: Any, effort: Any) -> Any:
         """Returns the speeds (..., J), rad/s, that torques of magnitude `effort` can add in a physics step."""
-        return (effort.reshape(-1, len(self.response)) @ (self.timestep * self.response)).reshape(effort.shape)
+        size = len(self.response)
+        legs, added = effort.reshape(-1, size), self.timestep * self.response
+        if xp is np:
+            return (legs @ added).reshape(effort.shape)
+        # A GPU computes sums of products together with what precedes and follows them, a matrix product on its own.
+        total = legs[:, :1] * added[0]
+        for i in range(1, size):
+            total += legs[:, i : i + 1] * added[i]
+        return total.reshape(effort.shape)
 
     def _armature(self, xp: Any, pace: Any, effort: Any) -> Any:
         """Returns the armature (..., J), kg m^2, at speeds of magnitude `pace` and torques of magnitude `effort`."""
         size = len(self.response)
         fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
         near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
-        reach = (pace + self._kick(effort)) / self.speed
+        reach = (pace + self._kick(xp, effort)) / self.speed
         if xp is np and near.max() <= 0.0 and reach.max() <= REACH:
             return np.zeros_like(pace)
         needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH)
         return xp.maximum(xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1) * self._full, needed)
+
+    @functools.cached_property
+    def fastest(self) -> np.ndarray:
+        """Greatest speeds after a physics step (..., J), rad/s."""
+        return np.float32(CLAMP) * self.speed
 
     @functools.cached_property
     def _line(self) -> np.ndarray:
@@ -176,7 +189,7 @@ class Motors:
 
     def clamp(self, xp: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
         """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `CLAMP` V."""
-        clamped = xp.clip(velocity, -CLAMP * self.speed, CLAMP * self.speed)
+        clamped = xp.clip(velocity, -self.fastest, self.fastest)
         return position - self.timestep * (velocity - clamped), clamped
 
 
