@@ -25,6 +25,8 @@ class MjxEngine(Engine):
     """The model on the device."""
     unroll = 1
     """Physics steps in one iteration of the loop over them; more compile longer."""
+    last_apart = False
+    """Whether the last physics step is not in the loop, and the others compute no sensors, which nothing reads."""
 
     @abc.abstractmethod
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
@@ -43,13 +45,16 @@ class MjxEngine(Engine):
     ) -> tuple[mjx.Data, jax.Array]:
         ctrl = data.ctrl
         model = self.mjx_model.replace(**fields) if fields else self.mjx_model
+        disabled = type(model.opt.disableflags)(model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        loop = model.replace(opt=model.opt.replace(disableflags=disabled)) if self.last_apart else model
 
-        def substep(carry: tuple[mjx.Data, jax.Array], _: None) -> tuple[tuple[mjx.Data, jax.Array], None]:
+        def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
             data, overflow = self.physics_step(*self._driven(model, self._clamped(carry[0]), ctrl))
-            return (data, carry[1] | overflow), None
+            return data, carry[1] | overflow
 
-        carry = data, jnp.zeros((), bool)
-        data, overflow = jax.lax.scan(substep, carry, None, num_substeps, unroll=self.unroll)[0]
+        carry, length = (data, jnp.zeros((), bool)), num_substeps - self.last_apart
+        carry, _ = jax.lax.scan(lambda carry, _: (substep(loop, carry), None), carry, None, length, unroll=self.unroll)
+        data, overflow = substep(model, carry) if self.last_apart else carry
         return self._clamped(data.replace(ctrl=ctrl)), overflow
 
     def _driven(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
@@ -108,7 +113,8 @@ class WarpEngine(MjxEngine):
     """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size."""
 
     impl = "warp"
-    unroll = 4
+    unroll = 3
+    last_apart = True
 
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
