@@ -309,15 +309,13 @@ wait $first && wait $second
 @pytest.mark.soak
 def test_the_slurm_file_of_the_documentation(tmp_path: Path) -> None:
     """With a stand-in for srun; it equals one process."""
-    page = (Path(__file__).parents[1] / "docs" / "several_gpus.md").read_text(encoding="utf-8")
-    batch = page.split("```sh\n#!/bin/bash\n#SBATCH")[1].split("```")[0]
-    (command,) = [line for line in batch.splitlines() if line.startswith("srun ")]
-    srun = tmp_path / "srun"
-    srun.write_text(SRUN)
-    srun.chmod(0o755)
-    words = [*command.split("mqe launch ")[0].split(), *MQE, "launch", *TRAIN, "--total-steps", "16"]
+    file = Path(__file__).parents[1] / "docs" / "slurm.sh"
+    for name, script in (("srun", SRUN), ("mqe", f'#!/bin/sh\nexec {" ".join(MQE)} "$@"\n')):
+        (tmp_path / name).write_text(script)
+        (tmp_path / name).chmod(0o755)
     environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    subprocess.run([*words, "--run-dir", str(tmp_path / "two")], check=True, env=environment, timeout=300)
+    words = ["sh", str(file), *TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "two")]
+    subprocess.run(words, check=True, env=environment, timeout=300)
     assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
     assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-5)
 
