@@ -16,12 +16,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
 from mqe_jax import cli
 from mqe_jax.cli import launch
+from mqe_jax.errors import InputError
 from mqe_jax.train import devices
 from mqe_jax.train.checkpoint import list_checkpoints
 
@@ -50,6 +52,8 @@ def differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dic
         (["--processes", "2", "--devices", "0"], "devices: '0' is not allowed; it must be as many as processes, 2"),
         (["--coordinator", "host:1"], "coordinator and index are given together"),
         (["--coordinator", "host:1", "--index", "2", "--processes", "2"], "index: 2 is not allowed"),
+        (["--coordinator", "host", "--index", "0", "--processes", "2"], "coordinator: 'host' is not allowed"),
+        (["--coordinator", "h:1", "--index", "0", "--processes", "2", "--devices", "0", "1"], "devices: '0, 1' is not"),
     ],
 )
 def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.CaptureFixture[str]) -> None:
@@ -57,9 +61,26 @@ def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.Captur
     assert said in capfd.readouterr().err
 
 
-def test_a_command_that_cannot_be_launched(capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["launch", "--processes", "2"]) == 2
-    assert "command: '' is not allowed; it must be train, walk train or sweep" in capfd.readouterr().err
+@pytest.mark.parametrize("command", [[], ["eval", "go1gate"], ["walk", "eval"]])
+def test_a_command_that_cannot_be_launched(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["launch", "--processes", "2", *command]) == 2
+    said = f"command: {' '.join(command)!r} is not allowed; it must be train, walk train or sweep"
+    assert said in capfd.readouterr().err
+
+
+def test_a_sweep_has_no_coordinator(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["launch", "--coordinator", "h:1", "--index", "0", "--processes", "2", "sweep", "sweep.yaml"]) == 2
+    assert "coordinator: 'h:1' is not allowed; it must be left out for a sweep" in capfd.readouterr().err
+
+
+def test_a_mistake_that_all_processes_find_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Whichever ends first."""
+    for later in range(2):
+        script = f"import os, sys, time; time.sleep({later} ^ int(os.environ['INDEX'])); sys.exit('mqe: num_envs: 3')"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(launch, "PROGRAM", [sys.executable, "-c"])
+            assert launch._supervise((script,), [{"INDEX": "0"}, {"INDEX": "1"}], together=True) == 1
+        assert capfd.readouterr().err.splitlines() == ["mqe: num_envs: 3"]
 
 
 # -- processes ---------------------------------------------------------------------------------------------------------
@@ -104,6 +125,23 @@ def lines(said: str) -> list[str]:
 
 def content(run_dir: Path) -> dict[str, np.ndarray]:
     return load_file(list_checkpoints(run_dir)[-1])
+
+
+SWEEP = """
+tasks: [go1gate]
+seeds: [0, 1]
+seeds_together: 1
+settings:
+  {num_envs: 4, rollout_steps: 4, total_steps: STEPS, env: {control: position}, checkpoint: {every: 1000},
+   network: {hidden_sizes: [8], recurrent: false}, ppo: {minibatches: 2, epochs: 1}}
+"""
+
+
+def sweep(folder: Path, steps: int) -> list[str]:
+    """Writes a sweep of two seeds; returns the words that train it."""
+    folder.mkdir()
+    (folder / "cells.yaml").write_text(SWEEP.replace("STEPS", str(steps)))
+    return ["sweep", str(folder / "cells.yaml"), "--folder", str(folder), "--impl", "c"]
 
 
 def metrics(run_dir: Path) -> list[dict[str, float]]:
@@ -184,6 +222,47 @@ def test_processes_end_with_the_launcher(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
+def test_a_process_of_a_sweep_that_is_killed(tmp_path: Path) -> None:
+    """The other goes on, until the launcher ends: then it ends too."""
+    runs = [tmp_path / "sweep" / "runs" / "go1gate" / "mappo" / f"seed{seed}" for seed in range(2)]
+    words = sweep(tmp_path / "sweep", 16_000_000)
+    with started([*MQE, "launch", "--processes", "2", *words]) as process:
+        wait_until(lambda: all(updates(run) > 2 for run in runs), process)
+        both = children(process)
+        os.kill(both[1], signal.SIGKILL)
+        assert process.stderr is not None
+        line = next(line for line in process.stderr if " steps/s, " not in line)
+        assert line == "mqe: a process of the training was killed by SIGKILL; the same command goes on\n"
+        wait_until(lambda: not Path(f"/proc/{both[1]}").exists(), process)
+        assert Path(f"/proc/{both[0]}").exists()
+        process.kill()
+        end = time.monotonic() + 10
+        while Path(f"/proc/{both[0]}").exists():
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
+
+@pytest.mark.soak
+def test_a_terminal_that_interrupts(tmp_path: Path) -> None:
+    """Ctrl-C is a signal to the whole process group, and one line, also for a sweep."""
+    run = tmp_path / "sweep" / "runs" / "go1gate" / "mappo" / "seed1"
+    for words, where in (
+        ([*TRAIN, "--total-steps", "1600000", "--run-dir", str(tmp_path / "run")], tmp_path / "run"),
+        (sweep(tmp_path / "sweep", 16_000_000), run),
+    ):
+        with started([*MQE, "launch", "--processes", "2", *words], start_new_session=True) as process:
+            wait_until(lambda: updates(where) > 5, process)  # noqa: B023
+            both = children(process)
+            assert {os.getpgid(child) for child in both}.isdisjoint([process.pid])
+            os.killpg(process.pid, signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+        resume = "the same command goes on" if "sweep" in words else "the same command with --resume goes on"
+        assert lines(said) == [f"mqe: interrupted; {resume}"]
+        assert process.returncode == 130
+        assert f"step_{updates(where) * 16:012d}" == list_checkpoints(where)[-1].stem
+
+
+@pytest.mark.soak
 def test_ten_kills_change_nothing(tmp_path: Path) -> None:
     """Killed at random moments, resumed, the run equals an uninterrupted one of two processes bit for bit."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -230,17 +309,71 @@ wait $first && wait $second
 @pytest.mark.soak
 def test_the_slurm_file_of_the_documentation(tmp_path: Path) -> None:
     """With a stand-in for srun; it equals one process."""
-    page = (Path(__file__).parents[1] / "docs" / "several_gpus.md").read_text(encoding="utf-8")
-    batch = page.split("```sh\n#!/bin/bash\n#SBATCH")[1].split("```")[0]
-    (command,) = [line for line in batch.splitlines() if line.startswith("srun ")]
-    srun = tmp_path / "srun"
-    srun.write_text(SRUN)
-    srun.chmod(0o755)
-    words = [*command.split("mqe launch ")[0].split(), *MQE, "launch", *TRAIN, "--total-steps", "16"]
+    file = Path(__file__).parents[1] / "docs" / "slurm.sh"
+    for name, script in (("srun", SRUN), ("mqe", f'#!/bin/sh\nexec {" ".join(MQE)} "$@"\n')):
+        (tmp_path / name).write_text(script)
+        (tmp_path / name).chmod(0o755)
     environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    subprocess.run([*words, "--run-dir", str(tmp_path / "two")], check=True, env=environment, timeout=300)
+    words = ["sh", str(file), *TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "two")]
+    subprocess.run(words, check=True, env=environment, timeout=300)
     assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
     assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-5)
+
+
+@pytest.mark.soak
+def test_a_sweep_of_srun(tmp_path: Path) -> None:
+    """Each process trains other cells, without minding the others."""
+    words = sweep(tmp_path / "sweep", 48)
+    srun = tmp_path / "srun"
+    srun.write_text(SRUN)
+    subprocess.run(["sh", str(srun), *MQE, "launch", *words], check=True, timeout=300)
+    runs = (tmp_path / "sweep" / "runs" / "go1gate" / "mappo").glob("seed*")
+    assert [updates(run) for run in runs] == [3, 3]
+
+
+def by_hand(commands: list[list[str]], act: Callable[[list[subprocess.Popen[str]]], None]) -> list[str]:
+    """Starts the commands of two hosts on this one; returns what they say after `act`."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    flags = ["launch", "--coordinator", f"127.0.0.1:{port}", "--processes", "2"]
+    with contextlib.ExitStack() as stack:
+        both = [
+            stack.enter_context(started([*MQE, *flags, "--index", str(i), *words])) for i, words in enumerate(commands)
+        ]
+        act(both)
+        return [process.communicate(timeout=90)[1] for process in both]
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("what", ["folder", "settings"])
+def test_hosts_with_different_commands(what: str, tmp_path: Path) -> None:
+    """A folder that one host does not see, or other settings: one line each, instead of different trainings."""
+    words = [[*TRAIN, "--total-steps", "64", "--run-dir", str(tmp_path / "0"), "--resume"] for _ in range(2)]
+    if what == "folder":
+        mqe("launch", "--processes", "2", *TRAIN, "--total-steps", "32", "--run-dir", str(tmp_path / "0"))
+        words[1][words[1].index(str(tmp_path / "0"))] = str(tmp_path / "1")
+    else:
+        words[1] += ["--seed", "7"]
+    for said in by_hand(words, lambda both: None):
+        assert said.splitlines()[-1].startswith("mqe: run_dir: processes have different settings or see different")
+        assert "gloo" not in said
+
+
+@pytest.mark.soak
+def test_a_launcher_of_one_host_that_is_killed(tmp_path: Path) -> None:
+    """The other host ends with one line; several times, since JAX raises several kinds of errors."""
+    words = [*TRAIN, "--total-steps", "16000000", "--run-dir", str(tmp_path / "run"), "--resume"]
+    for _ in range(4):
+        before = updates(tmp_path / "run")
+
+        def kill(both: list[subprocess.Popen[str]], before: int = before) -> None:
+            wait_until(lambda: updates(tmp_path / "run") > before + 5, both[0])
+            both[1].kill()
+
+        first, _ = by_hand([words, words], kill)
+        said = [line for line in lines(first) if "starting a new run" not in line]
+        assert said == [f"mqe: {devices.PEER_ENDED}; the same command with --resume goes on"]
 
 
 @pytest.fixture
@@ -321,8 +454,36 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     assert second[launch.MEMBER] == first[launch.MEMBER].replace("0/2", "1/2")
     assert [own["CUDA_VISIBLE_DEVICES"] for own in members("--processes", "2", "--devices", "7", "1")] == ["7", "1"]
     assert members("--processes", "4", "--coordinator", "h:1", "--index", "3") == [{launch.MEMBER: "3/4@h:1"}]
-    monkeypatch.setenv("SLURM_PROCID", "1")
+    device, alone = "CUDA_VISIBLE_DEVICES", {launch.MEMBER: "alone"}
+    by_hand = ("--processes", "4", "--coordinator", "h:1", "--index", "3", "--devices", "1")
+    assert members(*by_hand) == [{launch.MEMBER: "3/4@h:1", device: "1"}]
+    assert members("--processes", "1") == [{**alone, device: "4"}]
+    monkeypatch.setenv("SLURM_PROCID", "5")
+    monkeypatch.setenv("SLURM_LOCALID", "1")
     assert members() == [{launch.MEMBER: "auto"}]
+    with pytest.raises(InputError, match="devices: '1' is not allowed; it must be left out"):
+        members("--devices", "1")
+    cells = launch.Launch(command=("sweep", "sweep.yaml"))
+    assert cells._members() == [{**alone, device: "5"}]
+    monkeypatch.setenv(device, "2")  # srun --gpus-per-task=1
+    assert cells._members() == [{**alone, device: "2"}]
+    monkeypatch.delenv(device)
+    assert cells._members() == [{**alone, device: "1"}]
+    for hidden in ("", "-1"):  # on the CPU
+        monkeypatch.setenv(device, hidden)
+        assert cells._members() == [alone]
+        assert [own.keys() for own in members("--processes", "2")] == [{launch.MEMBER}, {launch.MEMBER}]
+
+
+def test_what_jax_raises_where_another_process_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "UNKNOWN: Gloo AllGather failed: [external/gloo/gloo/transport/tcp/pair.cc:538] Connection reset by peer"
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    for error in (jax.errors.JaxRuntimeError(text), ValueError(text)):
+        with pytest.raises(ConnectionError, match=devices.PEER_ENDED), devices.connected():
+            raise error
+    for other in (ValueError("shapes"), InputError("run_dir: Gloo")):
+        with pytest.raises(type(other), match=str(other)), devices.connected():
+            raise other
 
 
 def test_lines_of_the_coordination_service_are_not_shown(

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from typing import Annotated, Any
 
@@ -25,16 +25,25 @@ from mqe_jax.settings import fail, record
 from mqe_jax.train.devices import PEER, PEER_ENDED
 
 MEMBER = "MQE_PROCESS"
-"""Environment variable of a process of a training: INDEX/COUNT@HOST:PORT, or `auto` where SLURM or MPI knows."""
+"""Environment variable of a process that `launch` started: INDEX/COUNT@HOST:PORT, `AUTO` or `ALONE`."""
+AUTO = "auto"
+"""SLURM or MPI knows the other processes of the training."""
+ALONE = "alone"
+"""The process trains by itself, as those of a sweep do."""
 HEARTBEAT = 30
 """Time after which a process is dead whose host does not answer, s."""
 
 PROGRAM = [sys.executable, "-m", "mqe_jax.cli"]
 """What runs a command in a process of the training."""
 
-_COMMANDS = ("train", "walk", "sweep")
+_DEVICES = "CUDA_VISIBLE_DEVICES"
+_NO_DEVICES = ("", "-1")  # of `_DEVICES`: JAX computes on the CPU
+_RANKS = {"SLURM_PROCID": "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK": "OMPI_COMM_WORLD_LOCAL_RANK"}
+"""Variables of srun and mpirun: a process's index among all, and among those of its host."""
+_ADDRESS = re.compile(r"[^@\s]+:\d{1,5}")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _RESUME = "the same command with --resume goes on"
+_REPEAT = "the same command goes on"  # a sweep
 _NOISE = re.compile(
     r"[IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo"
     r"|Additional GRPC error|:[A-Z_]+:|=== Source Location Trace|external/xla|\s*$"
@@ -68,34 +77,68 @@ class Launch:
             InputError: for flags that do not fit together.
             SystemExit: with the exit code of the first process that failed.
         """
-        code = _supervise(self.command, self._members(), together=self.command[0] != "sweep")
+        code = _supervise(self.command, self._members(), together=not self._sweeps)
         if code:
             raise SystemExit(code)
+
+    @property
+    def _sweeps(self) -> bool:
+        return self.command[0] == "sweep"
 
     def _members(self) -> list[dict[str, str]]:
         """Returns the environment variables that each process of this host has in addition."""
         if (self.coordinator is None) != (self.index is None):
             raise InputError("coordinator and index are given together, or neither of them")
         if self.coordinator is not None and self.index is not None:
-            if self.processes is None or not 0 <= self.index < self.processes:
-                fail("index", self.index, f"from 0 to --processes - 1; --processes is {self.processes}")
-            return [{MEMBER: f"{self.index}/{self.processes}@{self.coordinator}"}]
+            return [self._member_of(self.coordinator, self.index)]
         if self.processes is None:
-            if not {"SLURM_PROCID", "OMPI_COMM_WORLD_RANK"}.intersection(os.environ):
-                raise InputError("processes: missing; give --processes N, or start with srun or mpirun")
-            return [{MEMBER: "auto"}]
-        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-        given = list(map(str, self.devices)) or [word for word in visible.split(",") if word]
-        devices = given or list(map(str, range(self.processes)))
-        if len(devices) < self.processes or (self.devices and len(devices) > self.processes):
-            fail("devices", ", ".join(devices), f"as many as processes, {self.processes}")
-        own = [{"CUDA_VISIBLE_DEVICES": device} for device in devices[: self.processes]]
-        if self.command[0] == "sweep" or self.processes == 1:
-            return own
+            return [self._member_of_job()]
+        own = self._own_devices(self.processes)
+        if self._sweeps or self.processes == 1:
+            return [{**variables, MEMBER: ALONE} for variables in own]
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         return [{**variables, MEMBER: f"{i}/{self.processes}@127.0.0.1:{port}"} for i, variables in enumerate(own)]
+
+    def _member_of(self, coordinator: str, index: int) -> dict[str, str]:
+        """Returns the variables of the only process here of a training on several hosts."""
+        if self._sweeps:
+            fail("coordinator", coordinator, "left out for a sweep: give --processes alone, on every host")
+        if not _ADDRESS.fullmatch(coordinator):
+            fail("coordinator", coordinator, "HOST:PORT")
+        if self.processes is None or not 0 <= index < self.processes:
+            fail("index", index, f"from 0 to --processes - 1; --processes is {self.processes}")
+        return {**(self._own_devices(1)[0] if self.devices else {}), MEMBER: f"{index}/{self.processes}@{coordinator}"}
+
+    def _member_of_job(self) -> dict[str, str]:
+        """Returns the variables of a process that srun or mpirun has started."""
+        local = next((local for rank, local in _RANKS.items() if rank in os.environ), None)
+        if local is None:
+            raise InputError("processes: missing; give --processes N, or start with srun or mpirun")
+        if self.devices:
+            fail("devices", ", ".join(map(str, self.devices)), "left out where srun or mpirun starts the processes")
+        if not self._sweeps:
+            return {MEMBER: AUTO}
+        index, visible = int(os.environ.get(local, "0")), os.environ.get(_DEVICES)
+        if visible in _NO_DEVICES:
+            return {MEMBER: ALONE}
+        devices = _listed(visible) or [str(index)]
+        return {_DEVICES: devices[index % len(devices)], MEMBER: ALONE}
+
+    def _own_devices(self, count: int) -> list[dict[str, str]]:
+        """Returns the variables that give each of `count` processes a device."""
+        visible = os.environ.get(_DEVICES)
+        if not self.devices and visible in _NO_DEVICES:
+            return [{} for _ in range(count)]
+        devices = list(map(str, self.devices)) or _listed(visible) or list(map(str, range(count)))
+        if len(devices) < count or (self.devices and len(devices) > count):
+            fail("devices", ", ".join(devices), f"as many as processes, {count}")
+        return [{_DEVICES: device} for device in devices[:count]]
+
+
+def _listed(visible: str | None) -> list[str]:
+    return [word for word in (visible or "").split(",") if word]
 
 
 def parse_launch(arguments: Sequence[str]) -> Launch:
@@ -105,12 +148,13 @@ def parse_launch(arguments: Sequence[str]) -> Launch:
         InputError: without a command that can be launched, or for its arguments.
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
-    from mqe_jax.cli.arguments import parse
+    from mqe_jax.cli.arguments import COMMANDS, parse
 
-    start = next((i for i, word in enumerate(arguments) if word in _COMMANDS), len(arguments))
+    names = {name.split()[0] for name in COMMANDS}
+    start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
     launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
     command = tuple(arguments[start:])
-    if not command or command[:2] in (("walk", "eval"), ("walk", "convert")):
+    if command[:1] not in (("train",), ("sweep",)) and command[:2] != ("walk", "train"):
         fail("command", " ".join(command[:2]), "train, walk train or sweep: mqe launch --processes 2 train go1gate")
     parse(command)
     return dataclasses.replace(launch, command=command)
@@ -124,14 +168,16 @@ def join() -> None:
     """
     if MEMBER not in os.environ:
         return
-    import jax
-
     threading.Thread(target=_end_with_parent, daemon=True).start()
     member = os.environ[MEMBER]
+    if member == ALONE:
+        return
+    import jax
+
     jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
     timeouts: Any = {"heartbeat_timeout_seconds": HEARTBEAT, "shutdown_timeout_seconds": HEARTBEAT}
     try:
-        if member == "auto":
+        if member == AUTO:
             jax.distributed.initialize(**timeouts)
         else:
             place, address = member.split("@")
@@ -164,6 +210,7 @@ class _Process:
             stdout=None if prefix else subprocess.DEVNULL,  # a training writes none, but JAX does
             text=True,
             errors="replace",
+            process_group=0,  # a terminal's Ctrl-C comes through `launch` alone
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -180,14 +227,18 @@ class _Process:
             if self._shown:
                 print(self._prefix + line, end="", file=sys.stderr, flush=True)
 
-    def verdict(self) -> str:
-        """Returns why the process has failed, in one line, or nothing where it said so itself."""
+    def read(self) -> None:
+        """Waits until what an ended process wrote is read."""
         self._reader.join(1.0)
+
+    def verdict(self, resume: str) -> str:
+        """Returns why the process has failed, in one line, or nothing where it said so itself."""
+        self.read()
         code = self.popen.returncode
         if self.peer:
-            return f"mqe: {PEER_ENDED}; {_RESUME}"
+            return f"mqe: {PEER_ENDED}; {resume}"
         if code < 0:
-            return f"mqe: a process of the training was killed by {signal.Signals(-code).name}; {_RESUME}"
+            return f"mqe: a process of the training was killed by {signal.Signals(-code).name}; {resume}"
         return "" if self._shown else self.last
 
 
@@ -201,14 +252,14 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
             process.popen.send_signal(signal.SIGTERM)
         for process in processes:
             process.popen.wait()
-        return _RESUME
+        return _RESUME if together else _REPEAT
 
     with interrupts.before_exit(forward):
         try:
             for i, variables in enumerate(members):
                 prefix = "" if together else f"[{i}] "
                 processes.append(_Process(command, variables, prefix, not together or i == 0))
-            return _wait(processes) if together else max(abs(process.popen.wait()) for process in processes)
+            return _wait(processes) if together else max(map(_code, _each(processes)))
         finally:
             for process in processes:
                 if process.popen.poll() is None:
@@ -217,7 +268,7 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
 
 
 def _wait(processes: Sequence[_Process]) -> int:
-    """Waits until all processes have ended, or the others `_GRACE` after one that failed."""
+    """Waits until all processes have ended, or the others `_GRACE` after one that failed; returns the exit code."""
     failed, since = None, 0.0
     while any(process.popen.poll() is None for process in processes):
         ended = [process for process in processes if process.popen.poll()]
@@ -232,7 +283,27 @@ def _wait(processes: Sequence[_Process]) -> int:
     if failed is None:
         return 0
     interrupts.settle()
-    if message := failed.verdict():
+    message = failed.verdict(_RESUME)
+    processes[0].read()
+    if message and message != processes[0].last:  # they may have found the same mistake
         echo(message)
-    code = failed.popen.returncode
-    return code if code > 0 else interrupts.exit_code(-code)
+    return _code(failed)
+
+
+def _each(processes: Sequence[_Process]) -> Iterator[_Process]:
+    """Yields the processes of a sweep as they end, after saying which signal has killed one."""
+    running = list(processes)
+    while running:
+        for process in [process for process in running if process.popen.poll() is not None]:
+            running.remove(process)
+            interrupts.settle()
+            if message := process.verdict(_REPEAT):
+                echo(message)
+            yield process
+        time.sleep(0.05)
+
+
+def _code(process: _Process) -> int:
+    """Returns the exit code of a process that has ended, as a shell gives it."""
+    code = process.popen.returncode
+    return code if code >= 0 else interrupts.exit_code(-code)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import Any
@@ -107,8 +108,8 @@ def connected() -> Iterator[None]:
     """Turns JAX's error of a collective, where another process has ended, into a ConnectionError of one line."""
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if jax.process_count() == 1 or not PEER.search(str(error)):
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # either, by where the collective was called
+        if isinstance(error, InputError) or jax.process_count() == 1 or not PEER.search(str(error)):
             raise
         raise ConnectionError(f"{PEER_ENDED}; the same command with --resume goes on") from None
 
@@ -194,6 +195,15 @@ class Processes:
         """Returns numbers of every process (P, n); called by all of them."""
         own = np.array(numbers)
         return own[None] if self.count == 1 else multihost_utils.process_allgather(own)
+
+    def check_equal(self, checked: object) -> None:
+        """Raises an InputError unless the text of an object is that of all processes; called by all of them."""
+        sums = self.gather([zlib.crc32(repr(checked).encode()) >> 1])  # 31 bits
+        if np.any(sums != sums[0]):
+            raise InputError(
+                "run_dir: processes have different settings or see different checkpoints; start the same command on "
+                "all hosts, with a run folder that all of them see"
+            )
 
     def _spec(self, own: Any, whole: Any) -> PartitionSpec:
         """Returns how a leaf is split: along the axis that is longer with all environments."""

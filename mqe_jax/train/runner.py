@@ -113,6 +113,7 @@ def train_seeds(
                 check_run(folder, resume, run_files)
         processes.gather([0])  # the others wait for these checks
         checkpoints = _common_checkpoints(folders)
+        processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
         training = _Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
         return training.run(on_update, stop)
 
