@@ -150,7 +150,7 @@ def test_joint_targets_are_changed_so_that_the_actuators_give_the_motors_torque(
 def test_the_clamp_keeps_angle_and_speed_consistent() -> None:
     motors = motors_of("go1")
     velocity = np.where(np.arange(12) == 2, 3.0, 0.5) * motors.speed
-    position, clamped = motors.clamp(np, np.zeros(12), velocity)
+    position, clamped = motors.clamp(np.zeros(12), velocity)
     assert clamped[2] == pytest.approx(CLAMP * motors.speed[2]) and np.all(np.delete(clamped == velocity, 2))
     assert position[2] == pytest.approx(-0.005 * (3.0 - CLAMP) * motors.speed[2]) and np.count_nonzero(position) == 1
 

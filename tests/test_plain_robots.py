@@ -110,7 +110,7 @@ def test_an_environment_step_of_the_c_engine_is_that_of_plain_mujoco() -> None:
             joints = ctrl[n], data.qpos[angles], data.qvel[speeds], gain, bias
             data.ctrl[:], own.dof_armature[speeds] = motors.limit(np, *(np.float32(x) for x in joints))
             mujoco.mj_step(own, data)
-            data.qpos[angles], data.qvel[speeds] = motors.clamp(np, data.qpos[angles], data.qvel[speeds])
+            data.qpos[angles], data.qvel[speeds] = motors.clamp(data.qpos[angles], data.qvel[speeds])
         np.testing.assert_allclose(after.qpos[n], data.qpos, atol=2e-4, err_msg=str(n))
         np.testing.assert_allclose(after.qvel[n], data.qvel, atol=2e-2, err_msg=str(n))
         np.testing.assert_allclose(after.qacc_warmstart[n], data.qacc_warmstart, rtol=0.02, atol=2.0)

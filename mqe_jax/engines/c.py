@@ -201,7 +201,7 @@ def _clamp(batch: Batch, motors: Motors, rows: Any) -> None:
     angles, speeds = motors.joint_qpos, motors.joint_qvel
     velocity = qvel[rows, speeds]
     if np.any(np.abs(velocity) > CLAMP * float(motors.speed.min())):
-        qpos[rows, angles], qvel[rows, speeds] = motors.clamp(np, qpos[rows, angles], velocity)
+        qpos[rows, angles], qvel[rows, speeds] = motors.clamp(qpos[rows, angles], velocity)
 
 
 def _columns(bias: np.ndarray) -> np.ndarray:

@@ -45,8 +45,7 @@ class MjxEngine(Engine):
     ) -> tuple[mjx.Data, jax.Array]:
         ctrl = data.ctrl
         model = self.mjx_model.replace(**fields) if fields else self.mjx_model
-        disabled = type(model.opt.disableflags)(model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR)
-        loop = model.replace(opt=model.opt.replace(disableflags=disabled)) if self.last_apart else model
+        loop = _without_sensors(model) if self.last_apart else model
 
         def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
             data, overflow = self.physics_step(*self._driven(model, self._clamped(carry[0]), ctrl))
@@ -151,6 +150,12 @@ class WarpEngine(MjxEngine):
 
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         return self._mjx.step(model, data), jnp.zeros((), bool)
+
+
+def _without_sensors(model: mjx.Model) -> mjx.Model:
+    """Returns the model with its sensors disabled."""
+    flags = model.opt.disableflags
+    return model.replace(opt=model.opt.replace(disableflags=type(flags)(flags | mujoco.mjtDisableBit.mjDSBL_SENSOR)))
 
 
 def _taken(values: jax.Array, sources: np.ndarray, addresses: np.ndarray, size: int) -> jax.Array:
