@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import os
 import random
 import shutil
@@ -26,6 +25,8 @@ from mqe_jax.cli import launch
 from mqe_jax.errors import InputError
 from mqe_jax.train import devices
 from mqe_jax.train.checkpoint import list_checkpoints
+from tests.test_interrupts import updates, wait_for
+from tests.training import rows
 
 MQE = [sys.executable, "-m", "mqe_jax.cli"]
 TRAIN = ["train", "go1gate", "--impl", "c", "--control", "position", "--num-envs", "4", "--rollout-steps", "4"]
@@ -101,19 +102,6 @@ def children(process: subprocess.Popen[str]) -> list[int]:
     return list(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
 
 
-def updates(run_dir: Path) -> int:
-    path = run_dir / "metrics.csv"
-    return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
-
-
-def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < end, "took too long"
-        time.sleep(0.02)
-
-
 def mqe(*words: str) -> None:
     subprocess.run([*MQE, *words], check=True, capture_output=True, timeout=300)
 
@@ -145,9 +133,7 @@ def sweep(folder: Path, steps: int) -> list[str]:
 
 
 def metrics(run_dir: Path) -> list[dict[str, float]]:
-    with (run_dir / "metrics.csv").open() as file:
-        rows = [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
-    return [{name: x for name, x in row.items() if name not in ("seconds", "fps")} for row in rows]
+    return [{name: float(x) for name, x in row.items()} for row in rows(run_dir)]
 
 
 def assert_equal_runs(one: Path, other: Path, tolerance: float) -> None:
@@ -191,7 +177,7 @@ def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Pa
     run = tmp_path / "run"
     words = [*MQE, "launch", "--processes", "2", *TRAIN, "--total-steps", "1600000", "--checkpoint.every", "100000"]
     with started([*words, "--run-dir", str(run)]) as process:
-        wait_until(lambda: updates(run) > 5, process)
+        wait_for(lambda: updates(run) > 5, process)
         both = children(process)
         began = time.monotonic()
         os.kill(both[which], number)
@@ -212,7 +198,7 @@ def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Pa
 def test_processes_end_with_the_launcher(tmp_path: Path) -> None:
     run = tmp_path / "run"
     with started([*MQE, "launch", "--processes", "2", *TRAIN, "--run-dir", str(run)]) as process:
-        wait_until(lambda: updates(run) > 2, process)
+        wait_for(lambda: updates(run) > 2, process)
         both = children(process)
         process.kill()
         end = time.monotonic() + 10
@@ -227,13 +213,13 @@ def test_a_process_of_a_sweep_that_is_killed(tmp_path: Path) -> None:
     runs = [tmp_path / "sweep" / "runs" / "go1gate" / "mappo" / f"seed{seed}" for seed in range(2)]
     words = sweep(tmp_path / "sweep", 16_000_000)
     with started([*MQE, "launch", "--processes", "2", *words]) as process:
-        wait_until(lambda: all(updates(run) > 2 for run in runs), process)
+        wait_for(lambda: all(updates(run) > 2 for run in runs), process)
         both = children(process)
         os.kill(both[1], signal.SIGKILL)
         assert process.stderr is not None
         line = next(line for line in process.stderr if " steps/s, " not in line)
         assert line == "mqe: a process of the training was killed by SIGKILL; the same command goes on\n"
-        wait_until(lambda: not Path(f"/proc/{both[1]}").exists(), process)
+        wait_for(lambda: not Path(f"/proc/{both[1]}").exists(), process)
         assert Path(f"/proc/{both[0]}").exists()
         process.kill()
         end = time.monotonic() + 10
@@ -251,7 +237,7 @@ def test_a_terminal_that_interrupts(tmp_path: Path) -> None:
         (sweep(tmp_path / "sweep", 16_000_000), run),
     ):
         with started([*MQE, "launch", "--processes", "2", *words], start_new_session=True) as process:
-            wait_until(lambda: updates(where) > 5, process)  # noqa: B023
+            wait_for(lambda: updates(where) > 5, process)  # noqa: B023
             both = children(process)
             assert {os.getpgid(child) for child in both}.isdisjoint([process.pid])
             os.killpg(process.pid, signal.SIGINT)
@@ -272,7 +258,7 @@ def test_ten_kills_change_nothing(tmp_path: Path) -> None:
     for _ in range(10):
         with started([*MQE, *words, "--run-dir", str(killed), "--resume"]) as process:
             before = updates(killed)
-            wait_until(lambda: updates(killed) != before and len(children(process)) == 2, process)  # noqa: B023
+            wait_for(lambda: updates(killed) != before and len(children(process)) == 2, process)  # noqa: B023
             time.sleep(chance.uniform(0.0, 1.0))
             os.kill(children(process)[chance.randrange(2)], signal.SIGKILL)
             _, said = process.communicate(timeout=60)
@@ -368,7 +354,7 @@ def test_a_launcher_of_one_host_that_is_killed(tmp_path: Path) -> None:
         before = updates(tmp_path / "run")
 
         def kill(both: list[subprocess.Popen[str]], before: int = before) -> None:
-            wait_until(lambda: updates(tmp_path / "run") > before + 5, both[0])
+            wait_for(lambda: updates(tmp_path / "run") > before + 5, both[0])
             both[1].kill()
 
         first, _ = by_hand([words, words], kill)
@@ -413,7 +399,7 @@ def test_two_hosts(vanishes: bool, hosts: list[str], tmp_path: Path) -> None:
     ]
     with started(commands[0]) as first, started(commands[1]) as second:
         if vanishes:
-            wait_until(lambda: updates(run) > 5, first)
+            wait_for(lambda: updates(run) > 5, first)
             subprocess.run(["ip", "-n", hosts[1], "link", "set", hosts[1], "down"], check=True)
         said = [process.communicate(timeout=90 if vanishes else 300)[1] for process in (first, second)]
     if vanishes:
