@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterator
 from typing import Annotated, Any
 
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from mqe_jax import limits
@@ -26,6 +27,14 @@ from mqe_jax.train.networks import NETWORKS
 from mqe_jax.walk.task import WalkTask
 
 Strategy = st.SearchStrategy[Any]
+CASES = settings(
+    max_examples=60,
+    deadline=20_000,
+    derandomize=True,
+    database=None,
+    suppress_health_check=(HealthCheck.too_slow, HealthCheck.filter_too_much),
+)
+"""Hypothesis repeats the same inputs in every run; the soak draws new ones."""
 NO_NUMBERS = ("nan", "many", "", " ", "1,5", "0x10", "{}", "[]", "[1", "*x", "'", "2026-01-01", "1e", "--1", "\u00bd")
 """Texts that are no number."""
 TEXTS = (

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import mqe_jax
@@ -192,14 +192,6 @@ def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeyp
 
 LONGEST = 1200
 """Characters of a message: what is allowed may be a list of names."""
-CASES = settings(
-    max_examples=60,
-    deadline=20_000,
-    derandomize=True,
-    database=None,
-    suppress_health_check=(HealthCheck.too_slow, HealthCheck.filter_too_much),
-)
-"""Hypothesis repeats the same inputs in every run; the soak draws new ones."""
 
 
 @contextlib.contextmanager
@@ -218,7 +210,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@CASES
+@inputs.CASES
 @given(inputs.wrong_settings())
 @example(("training", "ppo.epochs", {}))
 @example(("training", "num_envs", 10**9))
@@ -233,7 +225,7 @@ def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str
     assert field.split(".")[-1] in text and "\n" not in text and len(text) <= LONGEST, text
 
 
-@CASES
+@inputs.CASES
 @given(st.data())
 def test_a_number_within_its_bounds_is_taken_or_refused_for_another_field(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(inputs.records())))
@@ -244,7 +236,7 @@ def test_a_number_within_its_bounds_is_taken_or_refused_for_another_field(data: 
         build(inputs.records()[name], {field: value} | ({"tasks": ("go1gate",)} if name == "sweep" else {}))
 
 
-@CASES
+@inputs.CASES
 @given(inputs.wrong_flags())
 def test_flags_are_parsed_or_refused(words: list[str]) -> None:
     """A number outside its bounds is not parsed; other texts may be allowed where a text belongs."""
@@ -257,7 +249,7 @@ def test_flags_are_parsed_or_refused(words: list[str]) -> None:
             parse_overrides(getattr(command, "set", []))
 
 
-@CASES
+@inputs.CASES
 @given(inputs.yaml_text(TrainConfig))
 def test_yaml_of_settings_is_read_or_refused(folder: Path, text: str) -> None:
     file = folder / "settings.yaml"
@@ -266,7 +258,7 @@ def test_yaml_of_settings_is_read_or_refused(folder: Path, text: str) -> None:
         load_config(file)
 
 
-@CASES
+@inputs.CASES
 @given(inputs.yaml_text(Sweep))
 def test_a_sweep_file_is_read_or_refused(folder: Path, text: str) -> None:
     file = folder / "sweep.yaml"
@@ -278,7 +270,7 @@ def test_a_sweep_file_is_read_or_refused(folder: Path, text: str) -> None:
 TREE = {"weights": jnp.arange(12.0).reshape(3, 4), "count": jnp.int32(7)}
 
 
-@CASES
+@inputs.CASES
 @given(data=st.data(), kind=st.sampled_from(["policy", "checkpoint"]))
 def test_a_damaged_policy_or_checkpoint_is_refused(folder: Path, data: st.DataObject, kind: str) -> None:
     file = folder / f"{kind}.safetensors"
@@ -293,7 +285,7 @@ def test_a_damaged_policy_or_checkpoint_is_refused(folder: Path, data: st.DataOb
         assert all(bool((read[name] == TREE[name]).all()) for name in TREE), "read with other values"
 
 
-@CASES
+@inputs.CASES
 @given(data=st.data())
 def test_a_damaged_torchscript_archive_is_refused(folder: Path, data: st.DataObject) -> None:
     file = folder / "body.jit"
@@ -305,7 +297,7 @@ def test_a_damaged_torchscript_archive_is_refused(folder: Path, data: st.DataObj
         assert all(value.size < 2**21 for value in weights.values())
 
 
-@CASES
+@inputs.CASES
 @given(inputs.messages())
 def test_a_message_to_the_viewer_is_understood_or_refused(message: Any) -> None:
     frame = msgspec.msgpack.encode(message)
@@ -315,7 +307,7 @@ def test_a_message_to_the_viewer_is_understood_or_refused(message: Any) -> None:
         assert all(map(math.isfinite, (*camera.position, *camera.look_at, camera.fov)))
 
 
-@settings(CASES, max_examples=30)
+@settings(inputs.CASES, max_examples=30)
 @given(st.binary(max_size=40))
 def test_a_frame_of_any_bytes_is_refused(frame: bytes) -> None:
     with pytest.raises((UnparsableError, RefusedError)):
