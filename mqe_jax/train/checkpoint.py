@@ -222,8 +222,3 @@ def copy_without(path: Path, target: Path, name: str) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     kept = {key: array for key, array in arrays.items() if not key.startswith(f"{name}/")}
     save_tree(target, kept, {**metadata, "environments": False}, kind="checkpoint")
-
-
-def load_checkpoint(path: str | Path, template: Any) -> Checkpoint:
-    """Reads a checkpoint against a template; errors as in `load_tree`."""
-    return load_tree(path, template, kind="checkpoint")

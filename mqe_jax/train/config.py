@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -267,15 +266,10 @@ class TrainConfig:
         return -(-self.total_steps // self.steps_per_update)
 
 
-def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Reads settings from a YAML file, with overrides by nested or dotted names.
-
-    Raises:
-        InputError: naming the file, for invalid content; for an invalid override, naming the setting.
-    """
+def load_config(path: str | Path) -> TrainConfig:
+    """Reads settings from a YAML file; InputError naming the file, for invalid content."""
     values = load_yaml(path)
     try:
-        config = override(TrainConfig(), values)
+        return override(TrainConfig(), values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return override(config, overrides or {})

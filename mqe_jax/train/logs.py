@@ -43,11 +43,11 @@ class MetricsLog(Protocol):
 
 
 class CsvLog:
-    """Rows of `metrics.csv`, one per update; a resumed run drops rows after `step`, a number in the column `key`."""
+    """Rows of `metrics.csv`, one per update; a resumed run drops rows after `env_steps`."""
 
-    def __init__(self, run_dir: Path, step: int, key: str = "env_steps") -> None:
-        self._path, self._key = run_dir / CSV_FILE, key
-        self._columns, rows = _read_rows(self._path, key, step) if step else ([], [])
+    def __init__(self, run_dir: Path, env_steps: int) -> None:
+        self._path = run_dir / CSV_FILE
+        self._columns, rows = _read_rows(self._path, env_steps) if env_steps else ([], [])
         if self._columns:
             self._rewrite(rows)
         else:
@@ -57,7 +57,7 @@ class CsvLog:
         """Appends one row; a new name adds a column, and a file that somebody removed begins anew."""
         new = [name for name in row if name not in self._columns]
         if new or not self._path.exists():
-            _, rows = _read_rows(self._path, self._key, None)
+            _, rows = _read_rows(self._path, math.inf)
             self._columns += new
             self._rewrite(rows)
         append(self._path, (",".join(_text(row.get(name, math.nan)) for name in self._columns) + "\n").encode())
@@ -77,8 +77,8 @@ def _text(value: float) -> str:
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.8g}"
 
 
-def _read_rows(path: Path, key: str, last: int | None) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns columns and complete rows up to `last` in the column `key`; a partial last row is dropped."""
+def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]]:
+    """Returns columns and complete rows up to the environment step `last`; a partial last row is dropped."""
     if not path.is_file():
         return [], []
     lines = read_rows(path)
@@ -87,7 +87,7 @@ def _read_rows(path: Path, key: str, last: int | None) -> tuple[list[str], list[
     for line in lines:
         row = dict(zip(columns, line, strict=False))
         with contextlib.suppress(KeyError, ValueError):
-            if len(line) == len(columns) and (int(row[key]) <= last if last is not None else True):
+            if len(line) == len(columns) and int(row["env_steps"]) <= last:
                 rows.append(row)
     return columns, rows
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import to_mapping
-from mqe_jax.train.checkpoint import load_checkpoint, nonfinite, read_metadata
+from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.learner import Learner, TrainState, make_learner
@@ -68,7 +68,7 @@ def first_state(
     whole = metadata.get("environments", True)
     template = processes.whole
     saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
-    tree = load_checkpoint(checkpoint, saved).tree
+    tree = load_tree(checkpoint, saved, kind="checkpoint").tree
     if wrong := nonfinite(learned(tree) if whole else {name: tree[name] for name in learned(template)}):
         raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
     if not whole:
