@@ -2,7 +2,7 @@
 
 Robots driven hard on flat ground: joint speeds and angles against their limits, in every physics step;
 `python -m tests.soak.play [--robot go1] [--mode saturated] [--control torque] [--steps 1000000]` prints the figures;
-`--mode walk` those of the walk policy under commands, with the histogram of torques against speeds.
+`--mode walk` those of the walk policy under commands.
 """
 
 from __future__ import annotations
@@ -102,7 +102,6 @@ def outside(env: Any, data: Any) -> jax.Array:
 
 MODES = ("saturated", "random")
 WALK = "walk"
-SETTLING = 100  # first environment steps that the histogram leaves out: the robots drop and gather speed
 BINS = 4000  # of the histograms: shares of the speed limit up to 4, angles past the limit up to 1 rad
 
 
@@ -130,58 +129,47 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
     Returns:
         `speed_999`, `speed_max`: 99.9% and the greatest of |speed| / limit, averages over a physics step;
         `excess_999`, `excess_max`: likewise of the angle past a joint limit, rad; `diverged`: environment steps with
-        numbers that are not finite; `steps`. In the mode `walk` also `torque_speed`, the shares of joints and physics
-        steps (11, 11) by |torque| (rows) and |speed| (columns) in tenths of their limits, the last one beyond.
+        numbers that are not finite; `steps`.
     """
     control = "command" if mode == WALK else control
     env: Any = make("go1plane", impl="c", robot=robot, num_agents=1, control=control, num_envs=num_envs)
     vector = VectorEnv(env, num_envs)
     joints, timestep = env.index.joint_qpos[0], env.compiled.model.opt.timestep
     limits = env.robot.joint_lower, env.robot.joint_upper
-    torque_limits = np.asarray(env.robot.torque_limit)
     shape = (num_envs, 1, env.action_size)
 
-    def torque_speed(data: Any, target: jax.Array) -> jax.Array:
-        """Counts joints (11, 11) by the PD controller's |torque| and |speed|, in tenths of their limits."""
-        speed = data.qvel[:, env.index.joint_qvel[0]]
-        torque = env.robot.kp * (target[:, 0] - data.qpos[:, joints]) - env.robot.kd * speed
-        shares = jnp.abs(torque) / torque_limits, jnp.abs(speed) / env.robot.joint_speed_limit
-        rows, columns = (jnp.clip(10 * x, 0, 10).astype(jnp.int32) for x in shares)
-        return jnp.bincount((11 * rows + columns).ravel(), length=121).reshape(11, 11)
-
-    def substeps(state: Any, action: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Shares of the speed limits, angles past the joint limits (4, N, 12) and `torque_speed` of one step's
-        physics steps."""
+    def substeps(state: Any, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Shares of the speed limits and angles past the joint limits (4, N, 12) of one step's physics steps."""
         now = jax.vmap(env.read)(state.data)
         target, _ = jax.vmap(env.controller.targets)(state.control, action, now.proprioception)
 
         def one(data: Any, _: None) -> Any:
-            old, counts = data.qpos[:, joints], torque_speed(data, target) if mode == WALK else 0
+            old = data.qpos[:, joints]
             data = jax.vmap(lambda d, t: env.physics.step(d, t.ravel(), num_substeps=1)[0])(data, target)
-            return data, (jnp.abs(data.qpos[:, joints] - old) / timestep, data.qpos[:, joints], counts)
+            return data, (jnp.abs(data.qpos[:, joints] - old) / timestep, data.qpos[:, joints])
 
-        speed, angle, histogram = jax.lax.scan(one, state.data, None, env.physics.num_substeps)[1]
+        speed, angle = jax.lax.scan(one, state.data, None, env.physics.num_substeps)[1]
         excess = jnp.maximum(jnp.maximum(limits[0] - angle, angle - limits[1]), 0.0)
-        return speed / env.robot.joint_speed_limit, excess, jnp.sum(histogram, axis=0)
+        return speed / env.robot.joint_speed_limit, excess
 
     def advance(carry: Any, key: jax.Array) -> Any:
         state, action = carry
         action = next_action(mode, action, key)
-        speed, excess, histogram = substeps(state, action)
+        speed, excess = substeps(state, action)
         state = vector.step(state, action)
         bins = [jnp.clip(x * BINS / top, 0, BINS - 1).astype(jnp.int32) for x, top in ((speed, 4.0), (excess, 1.0))]
         counts = [jnp.bincount(rows.ravel(), length=BINS) for rows in bins]
-        return (state, action), (*counts, speed.max(), excess.max(), state.metrics["diverged"].sum(), histogram)
+        return (state, action), (*counts, speed.max(), excess.max(), state.metrics["diverged"].sum())
 
     @jax.jit
     def run(state: Any, action: jax.Array, keys: jax.Array) -> Any:
         return jax.lax.scan(advance, (state, action), keys)
 
     keys = jax.random.split(jax.random.PRNGKey(0), max(1, steps // num_envs))
-    _, (speeds, excesses, fastest, furthest, diverged, histograms) = run(
+    _, (speeds, excesses, fastest, furthest, diverged) = run(
         jax.jit(vector.reset)(jax.random.PRNGKey(1)), jnp.zeros(shape), keys
     )
-    figures: dict[str, Any] = {
+    return {
         "speed_999": _quantile(np.asarray(speeds).sum(0), 4.0),
         "speed_max": float(np.max(fastest)),
         "excess_999": _quantile(np.asarray(excesses).sum(0), 1.0),
@@ -189,10 +177,6 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
         "diverged": float(np.sum(diverged)),
         "steps": len(keys) * num_envs,
     }
-    if mode == WALK:
-        counts = np.asarray(histograms)[SETTLING:].sum(0)
-        figures["torque_speed"] = (counts / counts.sum()).round(9).tolist()
-    return figures
 
 
 def _quantile(counts: np.ndarray, top: float) -> float:
