@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import re
 import runpy
 import shlex
@@ -151,20 +150,8 @@ NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 CLIPS = {"tour": 2, "design_a_task": 1, "compare_algorithms": 0}
 
 
-def run(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Runs a notebook in a kernel of its own, in an empty folder; returns its outputs by MIME type."""
-    nbformat, nbclient, _ = map(pytest.importorskip, ("nbformat", "nbclient", "ipykernel"))
-    notebook = nbformat.read(path, as_version=4)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)
-    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
-    resources = {"metadata": {"path": str(tmp_path)}}
-    client = nbclient.NotebookClient(notebook, timeout=900, kernel_name="python3", resources=resources)
-    outputs = [output for cell in client.execute().cells for output in cell.get("outputs", [])]
-    return [output.get("data", {"text/plain": output.get("text", "")}) for output in outputs]
-
-
-def run_here(path: Path) -> list[dict[str, Any]]:
-    """Runs a notebook in this process, which starts faster and keeps compiled programs; returns its outputs."""
+def run(path: Path) -> list[dict[str, Any]]:
+    """Runs a notebook in this process, which keeps compiled programs; returns its outputs by MIME type."""
     base = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell
     traitlets, capture = map(importlib.import_module, ("traitlets.config", "IPython.utils.capture"))
     interactive = type("Shell", (base,), {"enable_gui": lambda self, gui=None: None})
@@ -178,7 +165,9 @@ def run_here(path: Path) -> list[dict[str, Any]]:
                     values.append(shell.display_formatter.format(done.result)[0])
     finally:
         interactive.clear_instance()
-    return values + [output.data for output in captured.outputs]
+        TASKS.pop("go1meet", None)  # of the notebook that designs a task
+        matplotlib.use("agg")
+    return [*values, *(output.data for output in captured.outputs), {"text/plain": captured.stdout}]
 
 
 def check(outputs: list[dict[str, Any]], name: str) -> None:
@@ -204,19 +193,16 @@ def test_notebooks_are_committed_with_the_outputs_of_one_run(path: Path) -> None
 def test_notebooks_run_at_small_size(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MQE_NOTEBOOK_SMALL", "1")
     monkeypatch.chdir(tmp_path)
-    try:
-        check(run_here(path), path.stem)
-    finally:
-        TASKS.pop("go1meet", None)  # of the notebook that designs a task
-        matplotlib.use("agg")
+    check(run(path), path.stem)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_whole_in_under_five_minutes(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MQE_NOTEBOOK_SMALL", raising=False)
+    monkeypatch.chdir(tmp_path)
     start = time.monotonic()
-    outputs = run(path, tmp_path, monkeypatch)
+    outputs = run(path)
     check(outputs, path.stem)
     assert time.monotonic() - start < 300
     if path.stem == "tour":  # the team that it trains has learned
