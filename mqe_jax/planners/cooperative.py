@@ -48,11 +48,6 @@ def plan_seesaw(obs: Observation) -> jax.Array:
     return go_to(position, yaw, goal)
 
 
-def plan_seesaw_alone(obs: Observation) -> jax.Array:
-    """Returns the actions (2, 3) of a climber whose partner stands still."""
-    return plan_seesaw(obs).at[1].set(0.0)
-
-
 # Sheep Dog: drive one sheep from behind, or gather a flock towards the gate.
 _SIDE = jnp.array([-1.0, 1.0])  # side of the sheep's path on which each robot walks
 
