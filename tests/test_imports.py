@@ -40,6 +40,14 @@ def test_imports_follow_the_table_of_modules() -> None:
     assert wrong_imports(PACKAGE, order) == []
 
 
+def test_a_wrong_import_is_named(tmp_path: Path) -> None:
+    """An import of a module further down is found, also inside a function, and reported with its file."""
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "late.py").write_text("def late():\n    from mqe_jax.envs import make\n")
+    (tmp_path / "envs.py").write_text("from mqe_jax import train\nimport mqe_jax.train.late\n")
+    assert wrong_imports(tmp_path, ["train", "envs"]) == ["train/late.py: train may not import envs"]
+
+
 def test_the_learner_imports_no_learning_library() -> None:
     for path in (PACKAGE / "train").glob("*.py"):
         assert not re.search(r"^\s*(import|from) (flax|optax|brax|torch)\b", path.read_text(), re.MULTILINE), path

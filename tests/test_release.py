@@ -1,4 +1,4 @@
-"""Releases: what is tried before one, and versions that agree."""
+"""Releases: what is tried before one, and versions that disagree."""
 
 from __future__ import annotations
 
@@ -15,6 +15,13 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
 import release  # noqa: E402
+
+FILES = {
+    "pyproject.toml": '[project]\nversion = "1.2.0"\n',
+    "mqe_jax/__init__.py": '__version__ = "1.2.0"\n',
+    "CITATION.cff": "cff-version: 1.0.0\nversion: 1.2.0\ndate-released: 2030-01-02\n",
+    "CHANGELOG.md": "# Changelog\n\n## [Unreleased]\n\n## [1.2.0] - 2030-01-02\n- a\n\n## [1.1.0] - 2029-01-01\n",
+}
 
 
 def test_the_release_tries_every_command_of_the_readme() -> None:
@@ -58,6 +65,24 @@ def test_a_bill_of_materials_names_no_folder() -> None:
 
 
 def test_the_versions_of_this_tree_agree() -> None:
-    names = ("pyproject.toml", "CHANGELOG.md", *release.VERSIONS)
-    files = {name: (ROOT / name).read_text(encoding="utf-8") for name in names}
+    files = {name: (ROOT / name).read_text(encoding="utf-8") for name in FILES}
+    assert set(FILES) == {"pyproject.toml", "CHANGELOG.md", *release.VERSIONS}
     assert release.disagreements("", files) == []
+
+
+@pytest.mark.parametrize(
+    ("tag", "name", "old", "new", "said"),
+    [
+        ("v1.2.0", "CHANGELOG.md", "", "", ""),
+        ("", "CHANGELOG.md", "[Unreleased]", "[Unreleased]\n- b", ""),
+        ("v1.2.0", "CHANGELOG.md", "[Unreleased]", "[Unreleased]\n- b", "unreleased changes"),
+        ("1.2.0", "CHANGELOG.md", "", "", "v1.2.0 is needed"),
+        ("", "mqe_jax/__init__.py", "1.2.0", "1.2.1", "mqe_jax/__init__.py: ['1.2.1']; 1.2.0 is needed"),
+        ("", "CITATION.cff", "\nversion: 1.2.0", "\nversion: 1.1.0", "CITATION.cff: ['1.1.0']"),
+        ("", "CITATION.cff", "01-02", "01-03", "CHANGELOG.md: [1.2.0] - 2030-01-02"),
+        ("", "CHANGELOG.md", "## [1.2.0] - 2030-01-02", "", "CHANGELOG.md: [1.1.0] - 2029-01-01"),
+    ],
+)
+def test_versions_that_disagree_are_named(tag: str, name: str, old: str, new: str, said: str) -> None:
+    wrong = release.disagreements(tag, {**FILES, name: FILES[name].replace(old, new) if old else FILES[name]})
+    assert len(wrong) == bool(said) and said in "".join(wrong)

@@ -1,8 +1,9 @@
-"""Publishing sweeps: small tables, and a page that agrees with its committed ones; policies as float16."""
+"""Publishing sweeps: small tables, best policies as float16, and a page that agrees with its committed tables."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ import numpy as np
 import pytest
 import yaml
 
-from mqe_jax.errors import NonFiniteError
+from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import override, to_mapping
+from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.estimates import group
 from mqe_jax.study.runs import REWARD, Cell, load_reference, table
 from mqe_jax.train.config import TrainConfig
@@ -65,6 +67,12 @@ def make_sweep(folder: Path, scores: dict[int, float]) -> Path:
     return folder
 
 
+def tree(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Content and modification time of every file."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+
+
 def test_runs_are_published_thinned(tmp_path: Path) -> None:
     target = tmp_path / "published"
     publish.publish([make_sweep(tmp_path / "first", {0: 1.0, 1: 3.23456789})], target)
@@ -73,8 +81,41 @@ def test_runs_are_published_thinned(tmp_path: Path) -> None:
     (point,) = run.evaluations
     assert point["sampled"] == {REWARD: 3.2346, "success_rate": 0.5} and point["deterministic"] == {"success_rate": 0.5}
     assert run.absolute is not None and run.absolute["sampled"]["episode_return"] == 9.0
+    before = tree(target)
+    publish.publish([], target)
+    assert tree(target) == before
     publish.publish([make_sweep(tmp_path / "later", {3: 4.0})], target)
     assert [run.seed for run in publish.read_tables(target)] == [0, 1, 3]
+
+
+def test_one_run_with_two_results_is_refused(tmp_path: Path) -> None:
+    folders = [make_sweep(tmp_path / name, {0: score}) for name, score in (("a", 1.0), ("b", 2.0))]
+    with pytest.raises(InputError, match=r"b: go1gate/mappo\+tuned/seed0 differs"):
+        publish.publish(folders, tmp_path / "published")
+    assert not (tmp_path / "published").exists()
+
+
+def test_the_tables_bytes_depend_on_the_runs_alone(tmp_path: Path) -> None:
+    runs = publish.read_tables(RESULTS)
+    publish.write_tables(tmp_path, runs)
+    for name in (publish.CURVES, publish.EVALUATIONS):
+        (tmp_path / f"first_{name}").write_bytes((tmp_path / name).read_bytes())
+        (tmp_path / name).unlink()
+    publish.write_tables(tmp_path, publish.read_tables(RESULTS))
+    for name in (publish.CURVES, publish.EVALUATIONS):
+        assert (tmp_path / name).read_bytes() == (tmp_path / f"first_{name}").read_bytes()
+    (tmp_path / publish.CURVES).write_bytes(b"no gzip")
+    with pytest.raises(InputError, match=r"curves\.csv\.gz: is not a table of runs"):
+        publish.read_tables(tmp_path)
+
+
+def test_thinning_keeps_ends_and_means() -> None:
+    curve = {"env_steps": np.arange(1.0, 201.0), REWARD: np.arange(200.0), "success": np.full(200, math.nan)}
+    thinned = publish.thin(curve)
+    assert thinned["env_steps"][0] == 4 and thinned["env_steps"][-1] == 200
+    assert thinned[REWARD][0] == 1.5 and np.isnan(thinned["success"]).all()
+    short = publish.thin({"env_steps": np.array([5.0, 9.0]), REWARD: np.array([1.0, 2.0])})
+    np.testing.assert_array_equal(short[REWARD], [1.0, 2.0])
 
 
 @pytest.mark.parametrize("name", ["mappo", "mat"])
@@ -99,6 +140,14 @@ def test_weights_beyond_float16_are_refused(tmp_path: Path) -> None:
         save_policy(tmp_path, TrainedPolicy(huge, policy.normalizer, DIMS, policy.config, {}), half=True)
 
 
+def test_measurements_are_kept_by_name(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"x": [1, 2]}')
+    (tmp_path / "b.csv").write_text("x,y\n1,a\n")
+    for name in ("a.json", "b.csv", "a.json"):
+        publish.add_measurement(name[0], tmp_path / name, tmp_path / "all.json")
+    assert json.loads((tmp_path / "all.json").read_text()) == {"a": {"x": [1, 2]}, "b": [{"x": "1", "y": "a"}]}
+
+
 # -- what is committed -------------------------------------------------------------------------------------------------
 
 
@@ -107,3 +156,27 @@ def test_the_page_agrees_with_the_committed_tables() -> None:
     reference = load_reference(RESULTS / "reference.yaml")
     cells = group(publish.read_tables(RESULTS), reference)
     assert paper_page.filled(text, paper_page.sections(cells, reference, RESULTS)) == text
+
+
+def test_every_published_run_belongs_to_a_sweep() -> None:
+    planned = set()
+    for part in yaml.safe_load((RESULTS / "sweeps.yaml").read_text()):
+        sweep = sweeps.load_sweep(RESULTS / "sweeps.yaml", part)
+        planned |= {(cell, seed) for cell in sweeps.select(sweep) for seed in sweep.seeds}
+    assert {(run.cell, run.seed) for run in publish.read_tables(RESULTS)} <= planned
+
+
+@pytest.mark.parametrize(
+    ("low", "middle", "high", "seeds", "verdict"),
+    [
+        (3.2, 3.3, 3.4, 3, "above"),
+        (3.0, 3.3, 3.4, 3, "above, within the interval"),
+        (1.0, 2.0, 3.4, 3, "**below**, within the interval"),
+        (1.0, 2.0, 3.0, 3, "**below**"),
+        (1.0, 2.0, 3.0, 2, ""),
+        (math.nan, math.nan, math.nan, 3, ""),
+    ],
+)
+def test_verdicts(low: float, middle: float, high: float, seeds: int, verdict: str) -> None:
+    row = {"paper": 3.1, "seeds": seeds, "x": middle, "x_low": low, "x_high": high}
+    assert paper_page.verdict(row, "x") == verdict

@@ -140,6 +140,14 @@ def test_cells_are_named_by_their_folders() -> None:
 PACKAGE: dict[str, Any] = {
     "seed": 7, "samples": 500, "thresholds": [-1.0, -0.25, 0.0, 0.5, 1.5],
     "cases": [
+        {"x": [[0.13, -0.13, 0.64, 0.1, -0.54, 0.36], [1.3, 0.95, -0.7, -1.27, -0.62, 0.04], [-2.33, -0.22, -1.25,
+        -0.73, -0.54, -0.32], [0.41, 1.04, -0.13, 1.37, -0.67, 0.35], [0.9, 0.09, -0.74, -0.92, -0.46, 0.22]], "y":
+        [[0.13, -0.13, 0.64, 0.1, -0.54, 0.36], [-0.35, 0.17, 1.08, 1.79, -0.96, 1.81], [1.65, 1.08, 0.56, -0.01,
+        1.76, 2.26], [2.1, 1.62, 0.66, -0.91, 0.3, 0.96], [-0.99, 0.7, 0.73, 1.0, -0.88, -0.36]], "iqm":
+        -0.14625000000000002, "probability_of_improvement": 0.30333333333333334, "profile": [0.9, 0.5666666666666667,
+        0.4666666666666667, 0.2, 0.0], "iqm_interval": [-0.34574999999999995, 0.11914062499999992],
+        "improvement_interval": [0.1549166666666667, 0.43], "profile_interval": [[0.8, 1.0], [0.43333333333333335,
+        0.7], [0.3333333333333333, 0.6], [0.06666666666666667, 0.3333333333333333], [0.0, 0.0]]},
         {"x": [[-0.44], [-1.17], [1.74]], "y": [[-0.44], [0.63], [0.04], [1.88]], "iqm": 0.04333333333333337,
         "probability_of_improvement": 0.2916666666666667, "profile": [0.6666666666666666, 0.3333333333333333,
         0.3333333333333333, 0.3333333333333333, 0.3333333333333333], "iqm_interval": [-1.17, 1.74],
@@ -204,6 +212,19 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
 
     profiles = interval([x], profile, PackageRandom(x.shape))
     np.testing.assert_allclose(profiles, case["profile_interval"], rtol=1e-9, atol=1e-12)
+
+
+def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
+    assert statistics.interquartile_mean([[-100.0], [1.0], [2.0], [3.0], [1000.0]]) == 2.0
+    assert statistics.interquartile_mean([[5.0], [7.0]]) == 6.0
+
+
+def test_an_interval_holds_its_statistic_and_repeats() -> None:
+    x = np.random.default_rng(3).normal(size=(8, 2))
+    iqm = statistics.interquartile_mean
+    ends = [statistics.bootstrap_interval([x], iqm, np.random.default_rng(0)) for _ in range(2)]
+    assert ends[0] == ends[1]
+    assert ends[0][0] < iqm(x) < ends[0][1]
 
 
 @pytest.mark.parametrize("scores", [np.zeros(3), np.zeros((0, 2)), np.array([[np.nan]])])
