@@ -248,6 +248,17 @@ def test_a_terminal_that_interrupts(tmp_path: Path) -> None:
         assert f"step_{updates(where) * 16:012d}" == list_checkpoints(where)[-1].stem
 
 
+def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: Any, capfd: Any) -> None:
+    monkeypatch.setattr(launch, "PROGRAM", [sys.executable, "-c"])
+    survivor = f"import sys; print({devices.PEER_ENDED!r}, file=sys.stderr); sys.exit(2)"
+    killed = "import os; os.kill(os.getpid(), 9)"
+    both = [launch._Process([program], {}, "", True) for program in (survivor, killed)]
+    for process in both:
+        process.popen.wait(60)
+    assert launch._wait(both) == 137
+    assert capfd.readouterr().err == "mqe: a process of the training was killed by SIGKILL; " + launch._RESUME + "\n"
+
+
 @pytest.mark.soak
 def test_ten_kills_change_nothing(tmp_path: Path) -> None:
     """Killed at random moments, resumed, the run equals an uninterrupted one of two processes bit for bit."""

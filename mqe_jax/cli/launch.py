@@ -271,15 +271,14 @@ def _wait(processes: Sequence[_Process]) -> int:
     """Waits until all processes have ended, or the others `_GRACE` after one that failed; returns the exit code."""
     failed, since = None, 0.0
     while any(process.popen.poll() is None for process in processes):
-        ended = [process for process in processes if process.popen.poll()]
-        if ended and failed is None:
-            failed, since = min(ended, key=lambda process: process.peer), time.monotonic()
+        if failed is None and (failed := _cause(processes)):
+            since = time.monotonic()
             for process in processes:
                 process.muted |= failed.popen.returncode < 0
         if failed is not None and (failed.popen.returncode < 0 or time.monotonic() - since > _GRACE):
             break
         time.sleep(0.05)
-    failed = failed or next((process for process in processes if process.popen.returncode), None)
+    failed = failed or _cause(processes)
     if failed is None:
         return 0
     interrupts.settle()
@@ -288,6 +287,14 @@ def _wait(processes: Sequence[_Process]) -> int:
     if message and message != processes[0].last:  # they may have found the same mistake
         echo(message)
     return _code(failed)
+
+
+def _cause(processes: Sequence[_Process]) -> _Process | None:
+    """Returns the process that has failed, if any: where another one's end has ended some, the other one."""
+    ended = [process for process in processes if process.popen.poll()]
+    for process in ended:
+        process.read()
+    return min(ended, key=lambda process: process.peer, default=None)
 
 
 def _each(processes: Sequence[_Process]) -> Iterator[_Process]:
