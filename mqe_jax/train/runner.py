@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import yaml
 
@@ -156,8 +157,9 @@ class _Training:
             first_state(env, learner, processes, own, path, seeds.shared)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
-        self._state = seeds.stack([state for state, _ in first])
-        self._update = processes.stacked(seeds.shared).compile(seeds.map(learner.update), more=True)
+        self._stacked = processes.stacked(seeds.shared)
+        self._state = self._stacked.together(seeds.stack([state for state, _ in first]))
+        self._update = self._stacked.compile(seeds.map(learner.update), more=True)
         self._env_steps = int(first[0][0].updates) * self._config.steps_per_update
         self._saved = -1 if checkpoints[0] is None else self._env_steps
         self._start_time = time.perf_counter() - first[0][1]
@@ -197,8 +199,8 @@ class _Training:
                     if self._processes.leads:
                         progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                     if on_update is not None:
-                        for i, row in enumerate(rows):
-                            on_update(self._seeds.take(self._state, i), row)
+                        for state, row in zip(self._own(), rows, strict=True):
+                            on_update(state, row)
                     if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
                         self._save()
                 self._save()
@@ -214,7 +216,12 @@ class _Training:
                 raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
             finally:
                 self._ended.set()
-        return [self._seeds.take(self._state, i) for i in range(len(self._configs))]
+        return self._own()
+
+    def _own(self) -> list[TrainState]:
+        """Returns this process's part of the state of every seed."""
+        own = self._stacked.own(self._state)
+        return [self._seeds.take(own, i) for i in range(len(self._configs))]
 
     def _end(self) -> None:
         """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
@@ -247,14 +254,15 @@ class _Training:
         after, metrics = self._update(self._state)
         if self._recorder is not None:
             self._recorder.add(join_traces(metrics.pop("trace")))
-        metrics = jax.device_get(metrics)
-        rows = []
+        finite = _finite([x for x in jax.tree.leaves(learned(after)) if x.size])
+        metrics, finite = jax.device_get((metrics, finite))
+        updates, rows = self._env_steps // self._config.steps_per_update + 1, []
         for i, folder in enumerate(self._folders):
-            state = self._seeds.take(after, i)
             own = {name: value[i] for name, value in metrics.items()}
-            row = row_of(int(state.updates), own, self._config, self._start_time, began)
+            row = row_of(updates, own, self._config, self._start_time, began)
             row["fps"] *= len(self._folders)
-            _check_finite(state, row, folder)
+            if not finite or not all(math.isfinite(row[name]) for name in _FINITE_METRICS):
+                _check_finite(self._seeds.take(self._stacked.own(after), i), row, folder)
             rows.append(row)
         with self._writing:
             for logs, row in zip(files, rows, strict=True):
@@ -267,8 +275,8 @@ class _Training:
     def _policies(self) -> list[TrainedPolicy]:
         dims = env_dims(self._env, self._config)
         return [
-            policy_of(self._seeds.take(self._state, i), dims, config, task=self._env.name, env_steps=self._env_steps)
-            for i, config in enumerate(self._configs)
+            policy_of(state, dims, config, task=self._env.name, env_steps=self._env_steps)
+            for state, config in zip(self._own(), self._configs, strict=True)
         ]
 
     def _save(self) -> None:
@@ -279,10 +287,9 @@ class _Training:
             seconds = time.perf_counter() - self._start_time
             # A process killed between two seeds' checkpoints has the older one in common.
             kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
-            for i, (config, folder) in enumerate(zip(self._configs, self._folders, strict=True)):
+            for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
                 metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
                 metadata["environments"] = config.checkpoint.environments
-                state = self._seeds.take(self._state, i)
                 if config.checkpoint.environments:
                     tree = self._processes.join(without_shared(state, self._seeds.shared))
                 else:
@@ -330,6 +337,12 @@ class _Training:
         with self._writing:
             for log, result in zip(self._evaluations, results, strict=True):
                 log.end(result, self._env_steps)
+
+
+@jax.jit
+def _finite(arrays: list[jax.Array]) -> jax.Array:
+    """Returns whether all numbers of some arrays are finite ()."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in arrays]))
 
 
 def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) -> None:

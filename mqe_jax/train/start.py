@@ -50,7 +50,11 @@ def first_state(
 
     `env` has the environments of all processes, `learner` the share of one; `shared` as in `Seeds`.
     """
-    init = processes.compile(learner.init, start=True)
+    start = processes.compile(learner.init, start=True)
+
+    def init(key: jax.Array) -> TrainState:
+        return processes.own(start(key))
+
     if checkpoint is None:
         policy = None if config.start is None else policy_to_start(env.name, processes.whole.params, config.start)
         state = init(initial_key(config))
