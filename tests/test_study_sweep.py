@@ -160,8 +160,10 @@ def test_a_sweep_that_is_stopped_and_packed_resumes_elsewhere(
     assert sweeps.run(there / "study", left, lambda config, seeds: (PROBE, PROBE)) == ([], [])
     for run in read_runs(there / "study"):
         assert list(run.curve["env_steps"]) == [16, 32, 48] and len(run.evaluations) == 2
-    assert cli.main(["pack", str(folder), "-o", str(tmp_path / "out"), "--megabytes", "0.001"]) == 2
-    assert "MiB; allowed: 0.001" in capfd.readouterr().err
+    assert cli.main(["pack", str(folder), "-o", str(tmp_path / "out"), "--megabytes", "0.005"]) == 2
+    assert "no room for study/runs/go1gate/mappo/seed" in capfd.readouterr().err
+    (file,) = (tmp_path / "out").glob("*.tar.gz")  # what fits is written
+    assert tarfile.open(file).getnames() == ["study/sweep.yaml"]
 
 
 def test_a_packed_table_keeps_its_last_row(tmp_path: Path) -> None:

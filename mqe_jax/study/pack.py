@@ -33,7 +33,8 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
 
     Runs may be in training meanwhile. In the files a sweep has the name of its folder; these names differ. There are at
     most `parts` files, of at most so many MiB each, which take the place of earlier ones when all are written.
-    InputError for no folder, a folder without a run, a file that cannot be read, or where runs do not fit.
+    InputError for no folder, a folder without a run, or a file that cannot be read; and, after the others are written,
+    for runs that do not fit.
     """
     if not folders:
         fail("folders", [], "at least one folder")
@@ -46,19 +47,24 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
         staged = [_staged(folder, runs, root / folder.resolve().name) for folder, runs in runs_of.items()]
         sizes = {run: _size(run) for copies in staged for run in copies}
         bins: list[list[Path]] = [[] for _ in range(parts)]
+        left: list[str] = []
         for run in sorted(sizes, key=lambda run: -sizes[run]):
-            min(bins, key=lambda runs: sum(sizes[each] for each in runs)).append(run)
+            smallest = min(bins, key=lambda runs: sum(sizes[each] for each in runs))
+            if sum(sizes[each] for each in (run, *smallest)) <= megabytes * 2**20:
+                smallest.append(run)
+            else:
+                left.append(run.relative_to(root).as_posix())
         for i, runs in enumerate(filter(None, bins)):
             packed.append(Path(temporary, f"part{i}.tar.gz"))
             with tarfile.open(packed[-1], "w:gz", compresslevel=1) as archive:
                 for run in runs:
                     archive.add(run, run.relative_to(root))
-            if (size := packed[-1].stat().st_size / 2**20) > megabytes:
-                name = output / packed[-1].name
-                raise InputError(f"output: {name} has {size:.1f} MiB; allowed: {megabytes:g}; pack fewer runs")
         files = [file.replace(output / file.name) for file in packed]
     for old in set(output.glob("part*.tar.gz")) - set(files):
         old.unlink()
+    if left:
+        names = ", ".join(sorted(left))
+        raise InputError(f"parts: {parts} files of {megabytes:g} MiB have no room for {names}; {output} has the others")
     return files
 
 
@@ -120,5 +126,5 @@ def thin(source: Path, target: Path) -> None:
 
 
 def _size(path: Path) -> int:
-    """Returns the size of a file, or of all files below a folder, bytes."""
-    return path.stat().st_size if path.is_file() else sum(_size(each) for each in path.iterdir())
+    """Returns the size in an archive of a file, or of all files below a folder, bytes, before compression."""
+    return path.stat().st_size + 1024 if path.is_file() else sum(_size(each) for each in path.iterdir())
