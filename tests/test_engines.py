@@ -24,6 +24,7 @@ import pytest
 from mqe_jax import engines
 from mqe_jax.engines import Engine, private
 from mqe_jax.engines.host_call import host_call
+from mqe_jax.engines.mjx import WarpEngine
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
 from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
 from mqe_jax.robots.go1 import GO1
@@ -247,6 +248,101 @@ def test_warp_keeps_a_stream_of_jax_when_an_old_handle_to_it_is_collected(monkey
     assert _Stream.known == {new.address}
 
 
+class _Mjx:
+    """A stand-in for MJX in which Warp is MJX-JAX and nothing moves; keeps what Warp gets."""
+
+    def __init__(self) -> None:
+        self.mjx: Any = private.load_mjx()
+        self.models: list[mujoco.MjModel] = []
+        self.flags: list[int] = []
+
+    def put_model(self, model: mujoco.MjModel, device: Any, impl: str) -> Any:
+        self.models.append(model)
+        return self.mjx.put_model(model, device, impl="jax")
+
+    def make_data(self, model: mujoco.MjModel, device: Any, impl: str, **sizes: int) -> Any:
+        self.models.append(model)
+        return self.mjx.make_data(model, device, impl="jax")
+
+    def step(self, model: Any, data: Any) -> Any:
+        self.flags.append(int(model.opt.disableflags))
+        return data
+
+
+@pytest.fixture
+def warp(monkeypatch: pytest.MonkeyPatch) -> _Mjx:
+    stand_in = _Mjx()
+    monkeypatch.setattr(private, "load_mjx", lambda: stand_in)
+    monkeypatch.setattr(private, "keep_streams", lambda: None)
+    for name in ("without_warnings", "without_overflow"):
+        monkeypatch.setattr(private, name, lambda x: x)
+    monkeypatch.setattr(private, "overflow", lambda data: jnp.zeros((), bool))
+    return stand_in
+
+
+def content(model: mujoco.MjModel) -> bytes:
+    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+BIT = mujoco.mjtDisableBit
+FRICTION, PASSIVE = BIT.mjDSBL_FRICTIONLOSS, BIT.mjDSBL_SPRING | BIT.mjDSBL_DAMPER
+
+
+@pytest.mark.parametrize(
+    ("part", "attribute", "fields", "unused"),
+    [
+        ("joint", "", (), FRICTION | PASSIVE),
+        ("joint", "", ("geom_friction", "dof_armature"), FRICTION | PASSIVE),
+        ("joint", "", ("dof_armature", "dof_damping", "dof_frictionloss"), 0),
+        ("joint", "", ("body_gravcomp",), FRICTION),
+        ("joint", "frictionloss='0.1'", (), PASSIVE),
+        ("joint", "damping='0.1'", (), FRICTION),
+        ("joint", "stiffness='0.1'", (), FRICTION),
+        ("fixed", "frictionloss='0.1'", (), PASSIVE),
+        ("fixed", "damping='0.1'", (), FRICTION),
+        ("fixed", "stiffness='0.1'", (), FRICTION),
+        ("motor", "damping='0.1'", (), FRICTION),
+        ("body", "gravcomp='1'", (), FRICTION),
+        ("option", "viscosity='1'", (), FRICTION),
+        ("option", "integrator='implicitfast'", (), FRICTION),
+    ],
+)
+def test_warp_computes_no_terms_that_are_zero(
+    part: str, attribute: str, fields: tuple[str, ...], unused: int, warp: _Mjx
+) -> None:
+    """Those that are zero in the model and in no field that environments override; the model itself stays as it is."""
+    xml = """<mujoco><option/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+      <tendon><fixed><joint joint="j" coef="1"/></fixed></tendon><actuator><motor joint="j"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml.replace(f"<{part}", f"<{part} {attribute}", 1))
+    before = content(model)
+    engine = WarpEngine(model)
+    values = {name: jnp.asarray(getattr(model, name)) for name in fields}
+    jax.eval_shape(lambda data: engine.step(data, data.ctrl, fields=values), engine.blank())
+    assert set(warp.flags) == {unused, unused | BIT.mjDSBL_SENSOR}
+    assert content(model) == before and engine.model is model
+
+
+@pytest.mark.parametrize(
+    ("option", "dofs", "expected"),
+    [("auto", 50, "dense"), ("auto", 51, "auto"), ("sparse", 2, "sparse"), ("dense", 51, "dense")],
+)
+def test_warp_takes_dense_jacobians_up_to_50_degrees_of_freedom(
+    option: str, dofs: int, expected: str, warp: _Mjx
+) -> None:
+    """Where the model leaves the choice; the same for model and data, and the model itself stays as it is."""
+    bodies = "<body><joint/><geom size='0.1' contype='0'/></body>" * dofs
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><option jacobian='{option}'/><worldbody>{bodies}</worldbody></mujoco>"
+    )
+    before = content(model)
+    WarpEngine(model).blank()
+    names = [mujoco.mjtJacobian(given.opt.jacobian).name for given in warp.models]
+    assert names == [f"mjJAC_{expected.upper()}"] * 2
+    assert content(model) == before
+
+
 def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change() -> None:
     seen = []
 
@@ -324,6 +420,7 @@ def test_a_program_that_still_runs_at_the_end_of_the_interpreter_is_awaited() ->
 import time
 import jax, numpy as np
 from mqe_jax.engines.host_call import host_call
+from mqe_jax.engines.mjx import WarpEngine
 class Owner: pass
 owner = Owner()
 def slow(owner, x):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+import copy
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -16,6 +17,21 @@ from mqe_jax.engines.engine import Engine
 
 if TYPE_CHECKING:
     from mujoco import mjx
+
+_BIT, _JACOBIAN = mujoco.mjtDisableBit, mujoco.mjtJacobian
+_FRICTION, _PASSIVE = _BIT.mjDSBL_FRICTIONLOSS, _BIT.mjDSBL_SPRING | _BIT.mjDSBL_DAMPER
+_MAX_DENSE = 50  # degrees of freedom up to which Warp's line search needs no kernels of its own for dense Jacobians
+
+# The model fields of each term of the dynamics; where all are zero, so is the term. Without springs and dampers Warp
+# and MuJoCo compute no passive force at all, so theirs include gravity compensation and adhesion.
+_TERMS: dict[int, tuple[str, ...]] = {
+    _FRICTION: ("dof_frictionloss", "tendon_frictionloss"),
+    _PASSIVE: (
+        *("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
+        *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+        *("actuator_damping", "actuator_dampingpoly", "body_gravcomp", "geom_adhesion", "pair_adhesion"),
+    ),
+}
 
 
 class MjxEngine(Engine):
@@ -40,12 +56,21 @@ class MjxEngine(Engine):
             Data, and whether contacts may have been dropped () bool.
         """
 
+    def unused_terms(self, fields: Collection[str]) -> int:
+        """Returns the disable flags of terms that need no computation.
+
+        Args:
+            fields: names of the model fields that environments override.
+        """
+        return 0
+
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
     ) -> tuple[mjx.Data, jax.Array]:
         ctrl = data.ctrl
         model = self.mjx_model.replace(**fields) if fields else self.mjx_model
-        loop = _without_sensors(model) if self.last_apart else model
+        model = _disabled(model, self.unused_terms(fields))
+        loop = _disabled(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
 
         def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
             data, overflow = self.physics_step(*self._driven(model, self._clamped(carry[0]), ctrl))
@@ -109,7 +134,10 @@ class JaxEngine(MjxEngine):
 
 
 class WarpEngine(MjxEngine):
-    """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size."""
+    """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size.
+
+    It launches each kernel also where it adds zero, so terms that are zero for the whole model are disabled.
+    """
 
     impl = "warp"
     unroll = 3
@@ -119,7 +147,9 @@ class WarpEngine(MjxEngine):
         super().__init__(model, **options)
         self._mjx = private.load_mjx()
         private.keep_streams()
-        self.mjx_model = private.without_warnings(self._mjx.put_model(model, jax.local_devices()[0], impl="warp"))
+        self._model = _with_jacobian(model)
+        device = jax.local_devices()[0]
+        self.mjx_model = private.without_warnings(self._mjx.put_model(self._model, device, impl="warp"))
 
     @classmethod
     def preferred(cls) -> bool:
@@ -139,7 +169,19 @@ class WarpEngine(MjxEngine):
     def blank(self) -> mjx.Data:
         naconmax = self.num_envs * self.contacts_per_env
         sizes = {"naconmax": naconmax, "njmax": self.max_constraints_per_env}
-        return self._mjx.make_data(self.model, jax.local_devices()[0], impl="warp", **sizes)
+        return self._mjx.make_data(self._model, jax.local_devices()[0], impl="warp", **sizes)
+
+    def unused_terms(self, fields: Collection[str]) -> int:
+        """Returns the disable flags of terms that are zero for the model, and that no field of environments changes."""
+        model, flags = self.model, 0
+        for flag, names in _TERMS.items():
+            if not any(name in fields or np.any(getattr(model, name)) for name in names):
+                flags |= flag
+        # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the actuators' derivatives.
+        fluid = (model.opt.density, model.opt.viscosity, *model.opt.wind)
+        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER or model.nflex or any(fluid):
+            flags &= ~_PASSIVE
+        return flags
 
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
@@ -152,10 +194,19 @@ class WarpEngine(MjxEngine):
         return self._mjx.step(model, data), jnp.zeros((), bool)
 
 
-def _without_sensors(model: mjx.Model) -> mjx.Model:
-    """Returns the model with its sensors disabled."""
+def _with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns the model, or a copy with dense Jacobians where it leaves the choice and they take fewer kernels."""
+    if model.opt.jacobian != _JACOBIAN.mjJAC_AUTO or model.nv > _MAX_DENSE:
+        return model
+    model = copy.copy(model)
+    model.opt.jacobian = _JACOBIAN.mjJAC_DENSE
+    return model
+
+
+def _disabled(model: mjx.Model, disable: int) -> mjx.Model:
+    """Returns the model with further disable flags."""
     flags = model.opt.disableflags
-    return model.replace(opt=model.opt.replace(disableflags=type(flags)(flags | mujoco.mjtDisableBit.mjDSBL_SENSOR)))
+    return model.replace(opt=model.opt.replace(disableflags=type(flags)(flags | disable)))
 
 
 def _taken(values: jax.Array, sources: np.ndarray, addresses: np.ndarray, size: int) -> jax.Array:
