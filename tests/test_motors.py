@@ -201,9 +201,22 @@ def test_joint_mechanics_are_in_the_model() -> None:
     joints, model = env.index.joint_qvel[0], env.compiled.model
     np.testing.assert_allclose(model.dof_armature[joints], env.robot.rotor_inertia)
     np.testing.assert_allclose(model.dof_damping[joints], env.robot.joint_damping)
+    assert not model.dof_dampingpoly.any()
     np.testing.assert_allclose(model.dof_frictionloss[joints], env.robot.friction_loss)
     plain: Any = make("go1plane", impl="c", num_agents=1)
     assert not plain.compiled.model.dof_armature.any() and not plain.compiled.model.dof_frictionloss.any()
+
+
+@pytest.mark.parametrize("robot", ["go1", "go2"])
+def test_legs_with_joint_mechanics_stay_finite(robot: str) -> None:
+    settings: dict[str, Any] = {"num_agents": 2, "num_envs": 8, "control": "position", "robot": robot}
+    env: Any = make("go1plane", impl="c", joint_mechanics=True, **settings)
+    step, key = jax.jit(jax.vmap(env.step)), jax.random.PRNGKey(0)
+    state, fastest = jax.jit(jax.vmap(env.reset))(jax.random.split(key, 8)), 0.0
+    for each in jax.random.split(key, 50):
+        state = step(state, 0.3 * jax.random.normal(each, (8, 2, env.action_size)))
+        fastest = max(fastest, float(jnp.abs(state.data.qvel[:, env.index.joint_qvel]).max()))
+    assert 1.0 < fastest < 35.0
 
 
 def test_randomised_joint_mechanics_reach_the_physics() -> None:

@@ -125,7 +125,7 @@ def build_robot(
             )
             if joint_mechanics:
                 hinge.armature = robot.rotor_inertia[index]
-                hinge.damping[:] = robot.joint_damping[index]
+                hinge.damping[0] = robot.joint_damping[index]  # the others are of the speed's square and cube
                 hinge.frictionloss = robot.friction_loss[index]
             add_shapes(body, joint, f"{leg}_", left)
     gain, bias = (1.0, (0.0, 0.0, 0.0)) if torque_control else (robot.kp, (0.0, -robot.kp, -robot.kd))
