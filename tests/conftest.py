@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import importlib.util
 import os
 import subprocess
 from collections.abc import Iterator
@@ -35,10 +36,12 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["XLA_FLAGS"] = f"{UNOPTIMISED} {given}".strip()
 
 
-def _gpu_missing() -> str:
-    """Reason for skipping GPU tests; empty if they can run."""
+def _gpu_missing(config: pytest.Config) -> str:
+    """Reason for skipping GPU tests; empty if they can run. In the soak Warp runs on the CPU, where it is installed."""
     if os.environ["JAX_PLATFORMS"] == "cpu":
-        return "JAX_PLATFORMS=cpu (set JAX_PLATFORMS=cuda,cpu to run the GPU tests)"
+        if _soak_requested(config) and importlib.util.find_spec("warp"):
+            return ""
+        return "JAX_PLATFORMS=cpu (set JAX_PLATFORMS=cuda,cpu, or install warp-lang and run the soak)"
     try:
         subprocess.run(["nvidia-smi", "-L"], check=True, capture_output=True, timeout=20)
     except (OSError, subprocess.SubprocessError):
@@ -52,7 +55,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     `MQE_SOAK=1 pytest` runs all tests, `pytest -m soak` the soak alone.
     """
     marked = [item for item in items if item.get_closest_marker("gpu")]
-    reason = _gpu_missing() if marked else ""
+    reason = _gpu_missing(config) if marked else ""
     for item in marked if reason else []:
         item.add_marker(pytest.mark.skip(reason=reason))
     if _soak_requested(config):

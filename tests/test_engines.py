@@ -32,7 +32,7 @@ from mqe_jax.robots.index import read_robots
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, SpawnArea, Track
 from tests import engines as comparison
-from tests.states import made, moving, placed
+from tests.states import made
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
 # Far apart, so that only the first robot touches them; the second one stands at x = 1.
@@ -199,12 +199,12 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
     """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
     env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
 
-    def start_at(key: jax.Array, height: jax.Array, speed: jax.Array) -> Any:
-        position = jnp.array([[1.0, 0.0, 0.0]]).at[0, 2].set(height)
-        return moving(env, placed(env, position, state=env.reset(key)), [0.0, 0.0, speed])
-
-    keys = jax.random.split(jax.random.PRNGKey(0), 3)
-    start = jax.vmap(start_at)(keys, jnp.array([0.3, 1.3, 0.3]), jnp.array([0.0, 0.0, 3.0]))
+    start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
+    qpos, qvel = np.array(start.data.qpos), np.zeros_like(start.data.qvel)
+    qpos[:, env.index.base_qpos[0]] = [(1, 0, height, 1, 0, 0, 0) for height in (0.3, 1.3, 0.3)]
+    qpos[:, env.index.joint_qpos[0]] = env.robot.default_joints
+    qvel[:, env.index.base_qvel[0, 2]] = 0.0, 0.0, 3.0
+    start = dataclasses.replace(start, data=start.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
     step = jax.jit(jax.vmap(env.step)).lower(start, jnp.zeros((3, 1, 12))).compile(compiler_options=QUICK)
     after = step(start, jnp.zeros((3, 1, 12)))
     assert after.metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
