@@ -216,9 +216,9 @@ class Processes:
         return multihost_utils.host_local_array_to_global_array(state, self._mesh, specs)
 
     def _local(self, x: jax.Array, spec: PartitionSpec) -> jax.Array:
-        """Returns this process's part of an array of all processes; of an empty one JAX gives the whole to each."""
+        """Returns this process's part of an array of all processes; programs give the whole of an empty one to each."""
         own = x.addressable_data(0)
-        return own if x.size or spec == _WHOLE else self._rows(own, spec)
+        return self._rows(own, spec) if not x.size and own.shape == x.shape else own
 
     def _rows(self, x: Any, spec: PartitionSpec) -> Any:
         if _whole(x, spec):
