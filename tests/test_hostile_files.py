@@ -285,7 +285,7 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
         ([], b"", "folders"),
         (["none"], b"", "none has no run"),
         (["study"], b"\xff\xfe", "metrics.csv: damaged, or not a CSV file"),
-        (["study", "--megabytes", "1e-6"], b"a\n1\n", "MiB; allowed: 1e-06"),
+        (["study", "--megabytes", "1e-6"], b"a\n1\n", "files of 1e-06 MiB have no room for study/"),
         (["study"], None, "not a regular file"),
     ],
 )

@@ -60,7 +60,7 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
                 for run in runs:
                     archive.add(run, run.relative_to(root))
         files = [file.replace(output / file.name) for file in packed]
-    for old in set(output.glob("part*.tar.gz")) - set(files):
+    for old in set(output.glob("part*.tar.gz")) - set(files) if files else ():
         old.unlink()
     if left:
         names = ", ".join(sorted(left))
