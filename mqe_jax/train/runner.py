@@ -4,32 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import yaml
 
 from mqe_jax import interrupts
-from mqe_jax.errors import InputError, NonFiniteError
+from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
 from mqe_jax.settings import PathText, check, fail, to_mapping
-from mqe_jax.train.checkpoint import (
-    check_alone,
-    check_run,
-    checkpoint_step,
-    latest,
-    list_checkpoints,
-    nonfinite,
-    save_checkpoint,
-)
+from mqe_jax.train.checkpoint import check_alone, check_run, checkpoint_step, list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.devices import Processes, connected
+from mqe_jax.train.finite import all_finite, check_finite, nonfinite_metrics
 from mqe_jax.train.learner import Learner, TrainState, env_dims
 from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
@@ -39,8 +30,6 @@ from mqe_jax.train.start import CONFIG_FILE, first_state, learned, own_learner, 
 from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
-
-_FINITE_METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
 
 
 def train(
@@ -254,15 +243,14 @@ class _Training:
         after, metrics = self._update(self._state)
         if self._recorder is not None:
             self._recorder.add(join_traces(metrics.pop("trace")))
-        finite = _finite([x for x in jax.tree.leaves(learned(after)) if x.size])
-        metrics, finite = jax.device_get((metrics, finite))
+        metrics, finite = jax.device_get((metrics, all_finite(learned(after))))
         updates, rows = self._env_steps // self._config.steps_per_update + 1, []
         for i, folder in enumerate(self._folders):
             own = {name: value[i] for name, value in metrics.items()}
             row = row_of(updates, own, self._config, self._start_time, began)
             row["fps"] *= len(self._folders)
-            if not finite or not all(math.isfinite(row[name]) for name in _FINITE_METRICS):
-                _check_finite(self._seeds.take(self._stacked.own(after), i), row, folder)
+            if not finite or nonfinite_metrics(row):
+                check_finite(learned(self._seeds.take(self._stacked.own(after), i)), row, folder)
             rows.append(row)
         with self._writing:
             for logs, row in zip(files, rows, strict=True):
@@ -337,23 +325,6 @@ class _Training:
         with self._writing:
             for log, result in zip(self._evaluations, results, strict=True):
                 log.end(result, self._env_steps)
-
-
-@jax.jit
-def _finite(arrays: list[jax.Array]) -> jax.Array:
-    """Returns whether all numbers of some arrays are finite ()."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in arrays]))
-
-
-def _check_finite(state: TrainState, row: Mapping[str, float], run_dir: Path) -> None:
-    """Raises a NonFiniteError naming the first metrics and parameters that an update made NaN or infinite."""
-    wrong = [name for name in _FINITE_METRICS if not math.isfinite(row[name])] + nonfinite(learned(state))
-    if wrong:
-        kept = latest(run_dir)
-        raise NonFiniteError(
-            f"{run_dir}: update {row['updates']:.0f} ({row['env_steps']:.0f} environment steps) made "
-            f"{', '.join(wrong[:3])} NaN or infinite; the last finite checkpoint is {kept.name if kept else 'missing'}"
-        )
 
 
 def load_run_config(run_dir: str | Path) -> TrainConfig:
