@@ -195,7 +195,9 @@ def test_the_shipped_policies_are_remade_with_the_settings_of_train(part: str) -
         default = to_mapping(of_train(job.cell.task, ""))
         own = to_mapping(job.configs[0])
         different = {name for name in own if own[name] != default[name]}
-        assert different <= (changed | {"start", "imitation", "ppo"} if job.cell.variant == "from-champion" else changed)
+        assert different <= (
+            changed | {"start", "imitation", "ppo"} if job.cell.variant == "from-champion" else changed
+        )
         if own["start"]:
             assert zoo.file_of(job.cell.task).name == Path(own["start"]).name
 
