@@ -18,9 +18,8 @@ _METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
 
 def all_finite(tree: PyTree) -> jax.Array:
     """Returns whether all numbers of a pytree are finite (), computed on the device."""
-    return _finite(
-        [x for x in jax.tree.leaves(tree) if x.size]
-    )  # jaxlib cannot compile empty ones of several processes
+    arrays = jax.tree.leaves(tree)
+    return _finite([x for x in arrays if x.size])  # jaxlib cannot compile empty ones of several processes
 
 
 @jax.jit
