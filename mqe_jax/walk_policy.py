@@ -149,14 +149,15 @@ def _rest(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision
 def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> tuple[jax.Array, jax.Array]:
     """Computes unclipped actions (..., 12) and latents (..., 2) from flattened histories (..., n).
 
-    The latent, whose gradient the action does not have, is added to the body's first layer as two columns of weights:
-    no input of other length than the history is written.
+    One product of the history has both first layers. The latent, whose gradient the action does not have, is added to
+    the body's as two columns of weights, so that no input of another length than the history is written.
     """
     adaptation, body = (params[part]["0"] for part in ("adaptation", "body"))
-    weight, columns = body["weight"][:, :-LATENT_SIZE], body["weight"][:, -LATENT_SIZE:]
-    estimated = jnp.matmul(history, adaptation["weight"].T, precision=precision) + adaptation["bias"]
-    latent = _rest(params["adaptation"], estimated, precision)
-    first = jnp.matmul(history, weight.T, precision=precision) + body["bias"]
+    inner, columns = jnp.split(body["weight"], [history.shape[-1]], axis=1)
+    both = jnp.matmul(history, jnp.concatenate([adaptation["weight"], inner]).T, precision=precision)
+    estimated, first = jnp.split(both, [len(adaptation["bias"])], axis=-1)
+    latent = _rest(params["adaptation"], estimated + adaptation["bias"], precision)
+    first += body["bias"]
     for i in range(LATENT_SIZE):
         first += jax.lax.stop_gradient(latent[..., i, None]) * columns[:, i]
     return _rest(params["body"], first, precision), latent
