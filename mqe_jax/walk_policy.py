@@ -234,7 +234,9 @@ class RestrictedWalkPolicy(WalkPolicy):
         return dataclasses.replace(super().init_memory(), history=jnp.zeros(self._size))
 
     def _extended(self, history: jax.Array, observation: jax.Array) -> jax.Array:
-        return jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
+        extended = jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
+        # Written once, not for each of its readers; on a CPU that is slower.
+        return jax.lax.platform_dependent(extended, cpu=lambda x: x, default=jax.lax.optimization_barrier)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
         return self.folded(super().load_params(path))

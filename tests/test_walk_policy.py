@@ -244,6 +244,15 @@ def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, 
         np.testing.assert_allclose(memories[short].action, memories[SKILL].action, atol=1e-6)
 
 
+@pytest.mark.parametrize(("platform", "barriers"), [("cpu", 0), ("cuda", 1)])
+def test_the_history_is_written_once_except_on_a_cpu(platform: str, barriers: int) -> None:
+    short = SKILL.restricted(("vx",), None)
+    sensed = Proprioception(DOWN, jnp.zeros(12), jnp.zeros(12))
+    command, params = jnp.asarray(short.default_commands()), short.load_params()
+    program = jax.jit(short.targets).trace(params, short.init_memory(), command, sensed)
+    assert program.lower(lowering_platforms=(platform,)).as_text().count("optimization_barrier") == barriers
+
+
 def test_environments_store_what_actions_can_change() -> None:
     """All of an observation where a task may give NPC robots any commands."""
     gate, defender = (make(task, impl="c", num_envs=1) for task in ("go1gate", "go1football-defender"))
