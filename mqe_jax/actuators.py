@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.engines import Engine
 from mqe_jax.errors import InputError
 from mqe_jax.files import read_tensors
-from mqe_jax.robots.index import RobotIndex
+from mqe_jax.robots.index import RobotIndex, placed
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class Actuators:
 
     def control(self, values: jax.Array) -> jax.Array:
         """Returns the engine's control (nu,) from values of all robots (R, 12)."""
-        return jnp.zeros(self.physics.model.nu).at[self.index.actuator].set(values)
+        return placed(np.zeros(self.physics.model.nu), self.index.actuator, values)
 
     def init_memory(self) -> Any:
         """Returns the recurrent state after a reset."""

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.robots.index import Proprioception
+from mqe_jax.robots.index import Proprioception, placed
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.skills import Skill
 
@@ -99,8 +99,8 @@ class Controller:
         """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in [-1, 1]."""
         gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
         change = jnp.clip(gain * action, -limit, limit)
-        default = jnp.tile(jnp.asarray(self.default_commands), (action.shape[0], 1))
-        return default.at[:, self.skill.index(self.commands)].add(change)
+        default, columns = self.default_commands, self.skill.index(self.commands)
+        return jax.vmap(lambda change: placed(default, columns, default[columns] + change))(change)
 
     @jax.named_scope("control")
     def targets(

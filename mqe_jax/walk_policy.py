@@ -139,23 +139,28 @@ def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Propr
     ).astype(jnp.float32)
 
 
-def _mlp(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str) -> jax.Array:
-    """Applies a Sequential of linear layers (named 0, 2, 4, ...; weight (out, in)) with ELU between them."""
-    names = sorted(layers, key=int)
-    for name in names:
-        x = jnp.matmul(x, layers[name]["weight"].T, precision=precision) + layers[name]["bias"]
-        x = x if name == names[-1] else jax.nn.elu(x)
+def _rest(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str) -> jax.Array:
+    """Applies the layers after the first one (named 2, 4, ...; weight (out, in)) to its output, each after an ELU."""
+    for name in sorted(layers, key=int)[1:]:
+        x = jnp.matmul(jax.nn.elu(x), layers[name]["weight"].T, precision=precision) + layers[name]["bias"]
     return x
 
 
-def infer_latent(params: Params, history: jax.Array, *, precision: str = "highest") -> jax.Array:
-    """Estimates the latent (..., 2) from flattened histories (..., n)."""
-    return _mlp(params["adaptation"], history, precision)
+def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> tuple[jax.Array, jax.Array]:
+    """Computes unclipped actions (..., 12) and latents (..., 2) from flattened histories (..., n).
 
-
-def infer_action(params: Params, history: jax.Array, latent: jax.Array, *, precision: str = "highest") -> jax.Array:
-    """Computes unclipped actions (..., 12) from flattened histories (..., n) and latents (..., 2)."""
-    return _mlp(params["body"], jnp.concatenate([history, latent], axis=-1), precision)
+    One product of the history has both first layers. The latent, whose gradient the action does not have, is added to
+    the body's as two columns of weights, so that no input of another length than the history is written.
+    """
+    adaptation, body = (params[part]["0"] for part in ("adaptation", "body"))
+    inner, columns = jnp.split(body["weight"], [history.shape[-1]], axis=1)
+    both = jnp.matmul(history, jnp.concatenate([adaptation["weight"], inner]).T, precision=precision)
+    estimated, first = jnp.split(both, [len(adaptation["bias"])], axis=-1)
+    latent = _rest(params["adaptation"], estimated + adaptation["bias"], precision)
+    first += body["bias"]
+    for i in range(LATENT_SIZE):
+        first += jax.lax.stop_gradient(latent[..., i, None]) * columns[:, i]
+    return _rest(params["body"], first, precision), latent
 
 
 @register
@@ -176,9 +181,8 @@ class WalkPolicy(Skill):
     ) -> tuple[jax.Array, WalkMemory]:
         observation = observe(self.robot, memory, command, proprioception)
         history = self._extended(memory.history, observation)
-        flat = history.reshape(-1)
-        latent = infer_latent(params, flat, precision=PRECISION)
-        action = jnp.clip(infer_action(params, flat, latent, precision=PRECISION), -ACTION_CLIP, ACTION_CLIP)
+        action = infer(params, history.reshape(-1), precision=PRECISION)[0]
+        action = jnp.clip(action, -ACTION_CLIP, ACTION_CLIP)
         gait = advance_gait(memory.gait, command)
         return self.robot.joint_targets(action), WalkMemory(history, action, memory.action, gait)
 
@@ -230,7 +234,9 @@ class RestrictedWalkPolicy(WalkPolicy):
         return dataclasses.replace(super().init_memory(), history=jnp.zeros(self._size))
 
     def _extended(self, history: jax.Array, observation: jax.Array) -> jax.Array:
-        return jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
+        extended = jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
+        # Written once, not for each of its readers; on a CPU that is slower.
+        return jax.lax.platform_dependent(extended, cpu=lambda x: x, default=jax.lax.optimization_barrier)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
         return self.folded(super().load_params(path))

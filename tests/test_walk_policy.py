@@ -137,10 +137,9 @@ def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.P
     params = torchscript.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
     latent = apply(adaptation, history)
-    np.testing.assert_allclose(walk_policy.infer_latent(params, jnp.asarray(history)), latent, atol=2e-5)
     action = apply(body, np.concatenate([history, latent], axis=1))
-    found = walk_policy.infer_action(params, jnp.asarray(history), jnp.asarray(latent))
-    np.testing.assert_allclose(found, action, atol=2e-5)
+    for found, expected in zip(walk_policy.infer(params, jnp.asarray(history)), (action, latent), strict=True):
+        np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -174,9 +173,9 @@ def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:
     history = torch.randn(2, 2100)
     latent = nets["a"](history)
     action = nets["b"](torch.cat([history, latent], -1)).detach().numpy()
-    found = walk_policy.infer_latent(params, jnp.asarray(history.numpy()))
-    np.testing.assert_allclose(found, latent.detach().numpy(), atol=1e-5)
-    np.testing.assert_allclose(walk_policy.infer_action(params, jnp.asarray(history.numpy()), found), action, atol=1e-5)
+    found = walk_policy.infer(params, jnp.asarray(history.numpy()))
+    np.testing.assert_allclose(found[0], action, atol=1e-5)
+    np.testing.assert_allclose(found[1], latent.detach().numpy(), atol=1e-5)
 
 
 def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
@@ -243,6 +242,15 @@ def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, 
         for policy, weights in policies.items():
             _, memories[policy] = act[policy](weights, memories[policy], jnp.asarray(command), sensed)
         np.testing.assert_allclose(memories[short].action, memories[SKILL].action, atol=1e-6)
+
+
+@pytest.mark.parametrize(("platform", "barriers"), [("cpu", 0), ("cuda", 1)])
+def test_the_history_is_written_once_except_on_a_cpu(platform: str, barriers: int) -> None:
+    short = SKILL.restricted(("vx",), None)
+    sensed = Proprioception(DOWN, jnp.zeros(12), jnp.zeros(12))
+    command, params = jnp.asarray(short.default_commands()), short.load_params()
+    program = jax.jit(short.targets).trace(params, short.init_memory(), command, sensed)
+    assert program.lower(lowering_platforms=(platform,)).as_text().count("optimization_barrier") == barriers
 
 
 def test_environments_store_what_actions_can_change() -> None:

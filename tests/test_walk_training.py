@@ -113,7 +113,7 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
         gradient, loss = jax.grad(log_prob, has_aux=True)(params)
         return loss, gradient["policy"]["adaptation"]
 
-    latent = walk_policy.infer_latent(params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0]))
+    _, latent = walk_policy.infer(params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0]))
     error = np.square(latent - privileged[..., -2:]).mean()
     loss, policy_gradient = evaluated(params)
     assert float(loss) == pytest.approx(float(error), rel=1e-5)
@@ -191,8 +191,7 @@ def test_descending_the_loss_makes_a_policy_symmetric() -> None:
 
     @jax.jit
     def loss(params: walk_policy.Params) -> jax.Array:
-        mean = walk_policy.infer_action(params, flat, walk_policy.infer_latent(params, flat))
-        return symmetry_loss(params, flat, mean)
+        return symmetry_loss(params, flat, walk_policy.infer(params, flat)[0])
 
     before = float(loss(params))
     for _ in range(30):

@@ -14,6 +14,8 @@ import numpy as np
 
 from mqe_jax.engines import private
 from mqe_jax.engines.engine import Engine
+from mqe_jax.robots.index import placed
+from mqe_jax.robots.motors import Motors
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -73,7 +75,7 @@ class MjxEngine(Engine):
         loop = _disabled(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
 
         def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
-            data, overflow = self.physics_step(*self._driven(model, self._clamped(carry[0]), ctrl))
+            data, overflow = self.physics_step(*self._driven(model, carry[0], ctrl))
             return data, carry[1] | overflow
 
         carry, length = (data, jnp.zeros((), bool)), num_substeps - self.last_apart
@@ -82,26 +84,27 @@ class MjxEngine(Engine):
         return self._clamped(data.replace(ctrl=ctrl)), overflow
 
     def _driven(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
-        """Returns model and data with the armature and the control of the motors for one physics step."""
+        """Returns model and data for one physics step: the motors' armature and control, and the clamped joints."""
         motors = self.motors
         if motors is None:
             return model, data
-        position, velocity = data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel]
         gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
-        ctrl, armature = motors.limit(jnp, ctrl, position, velocity, gain, bias)
-        added = _taken(armature, np.arange(len(motors.joint_qvel)), motors.joint_qvel, self.model.nv)
-        return model.replace(dof_armature=model.dof_armature + added), data.replace(ctrl=ctrl)
+        ctrl, added = motors.limit(jnp, ctrl, *self._joints(data, motors), gain, bias)
+        armature = model.dof_armature + placed(np.zeros(self.model.nv), motors.joint_qvel, added)
+        return model.replace(dof_armature=armature), self._clamped(data).replace(ctrl=ctrl)
 
     def _clamped(self, data: mjx.Data) -> mjx.Data:
         """Returns data with the joint speeds that motors and contacts allow."""
         motors = self.motors
         if motors is None:
             return data
-        limit = np.full(self.model.nv, np.inf, np.float32)
-        limit[motors.joint_qvel] = motors.fastest
-        clamped = jnp.clip(data.qvel, -limit, limit)
-        excess = _taken(data.qvel - clamped, motors.joint_qvel, motors.joint_qpos, self.model.nq)
-        return data.replace(qpos=data.qpos - motors.timestep * excess, qvel=clamped)
+        position, velocity = self._joints(data, motors)
+        qpos, qvel = placed(data.qpos, motors.joint_qpos, position), placed(data.qvel, motors.joint_qvel, velocity)
+        return data.replace(qpos=qpos, qvel=qvel)
+
+    def _joints(self, data: mjx.Data, motors: Motors) -> tuple[jax.Array, jax.Array]:
+        """Returns clamped joint angles and velocities (J,)."""
+        return motors.clamp(data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel])
 
 
 class JaxEngine(MjxEngine):
@@ -207,10 +210,3 @@ def _disabled(model: mjx.Model, disable: int) -> mjx.Model:
     """Returns the model with further disable flags."""
     flags = model.opt.disableflags
     return model.replace(opt=model.opt.replace(disableflags=type(flags)(flags | disable)))
-
-
-def _taken(values: jax.Array, sources: np.ndarray, addresses: np.ndarray, size: int) -> jax.Array:
-    """Returns an array (size,) with the values at `sources` (J,) at `addresses` (J,) and zeros elsewhere."""
-    source = np.full(size, len(values))
-    source[addresses] = sources
-    return jnp.concatenate([values, jnp.zeros(1)])[source]

@@ -29,7 +29,7 @@ from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments
-from mqe_jax.robots.index import RobotState, read_robots
+from mqe_jax.robots.index import RobotState, placed, read_robots
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
 from mqe_jax.settings import check, checked, fail
@@ -305,9 +305,9 @@ class QuadrupedEnv(Task[S, P]):
         velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
         level = jnp.zeros(len(pose))
         turn = euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
-        qpos = jnp.asarray(model.qpos0, jnp.float32).at[index.joint_qpos].set(joints)
-        qpos = qpos.at[index.base_qpos].set(jnp.concatenate([pose[:, :3], turn], axis=-1))
-        return qpos, jnp.zeros(model.nv).at[index.base_qvel].set(velocity)
+        robots = np.concatenate([index.base_qpos, index.joint_qpos], axis=-1)
+        qpos = placed(model.qpos0, robots, jnp.concatenate([pose[:, :3], turn, joints], axis=-1))
+        return qpos, placed(np.zeros(model.nv), index.base_qvel, velocity)
 
     def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array) -> jax.Array:
         agent_key, time_key = jax.random.split(key)

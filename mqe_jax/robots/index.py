@@ -52,6 +52,16 @@ class RobotIndex:
         return len(self.trunk_body)
 
 
+def placed(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
+    """Returns the array `base` (n,) with values at addresses, which are host integers of the same shape.
+
+    A GPU computes this together with what precedes and follows it; a scatter takes kernels of its own.
+    """
+    source = np.full(len(base), -1)
+    source[addresses] = np.arange(addresses.size).reshape(addresses.shape)
+    return jnp.where(source < 0, jnp.asarray(base, values.dtype), jnp.ravel(values)[np.maximum(source, 0)])
+
+
 def prefix(number: int) -> str:
     """Returns the name prefix of robot `number` in a scene."""
     return f"robot{number}/"

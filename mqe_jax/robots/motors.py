@@ -187,9 +187,9 @@ class Motors:
         rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
         return dataclasses.replace(self, **rows)
 
-    def clamp(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def clamp(self, position: Any, velocity: Any) -> tuple[Any, Any]:
         """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `fastest`."""
-        clamped = np.clip(velocity, -self.fastest, self.fastest)
+        clamped = velocity.clip(-self.fastest, self.fastest)
         return position - self.timestep * (velocity - clamped), clamped
 
 

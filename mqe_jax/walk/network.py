@@ -109,8 +109,7 @@ def symmetry_loss(
     `flat` are histories (B, 2100) and `mean` their actions (B, 12); `precision` is that of matrix products.
     """
     mirrored = mirror_history(flat)
-    latent = jax.lax.stop_gradient(walk_policy.infer_latent(params, mirrored, precision=precision))
-    other = walk_policy.infer_action(params, mirrored, latent, precision=precision)
+    other, _ = walk_policy.infer(params, mirrored, precision=precision)
     return jnp.mean(jnp.square(other - mirror_action(mean)))
 
 
@@ -133,16 +132,12 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
     def initial_memory(num_envs: int) -> NetworkMemory:
         return NetworkMemory(jnp.zeros((num_envs, HISTORY - 1, OBSERVATION_SIZE)), ())
 
-    def mean_of(params: Params, flat: jax.Array) -> tuple[jax.Array, jax.Array]:
-        policy = params["policy"]
-        latent = walk_policy.infer_latent(policy, flat, precision=_PRECISION)
-        return walk_policy.infer_action(policy, flat, jax.lax.stop_gradient(latent), precision=_PRECISION), latent
-
     def act(
         params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         window = jnp.concatenate([memory, obs], axis=-2)
-        mean, _ = mean_of(params, window.reshape(*window.shape[:-2], -1))
+        flat = window.reshape(*window.shape[:-2], -1)
+        mean, _ = walk_policy.infer(params["policy"], flat, precision=_PRECISION)
         log_std = settings.bounded_log_std(params["log_std"])
         action = mean if key is None else mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
         return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], window[..., 1:, :]
@@ -161,7 +156,7 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         action: jax.Array,
     ) -> Evaluation:
         flat = windows(memory.actor, is_first, obs[..., 0, :])
-        mean, latent = mean_of(params, flat)
+        mean, latent = walk_policy.infer(params["policy"], flat, precision=_PRECISION)
         log_std = jnp.broadcast_to(settings.bounded_log_std(params["log_std"]), mean.shape)
         error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
         losses = {"adaptation": settings.adaptation_coef * error}
