@@ -103,10 +103,9 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
         ends: dict[str, list[float]] = {}
         for t in range(4):
             actor, critic = (np.where(first, 0.0, x) for x in (actor, critic))
-            got = jax.tree.map(lambda x: np.asarray(x[t]), transitions._replace(memory=transitions.memory.critic))  # noqa: B023
-            np.testing.assert_allclose(got.memory, critic, rtol=1e-5)
-            if t % 2 == 0:
-                np.testing.assert_allclose(transitions.memory.actor[t // 2], actor, rtol=1e-5)
+            got = jax.tree.map(lambda x: np.asarray(x[t]), transitions)  # noqa: B023
+            np.testing.assert_allclose(got.memory.critic, critic, rtol=1e-5)
+            np.testing.assert_allclose(got.memory.actor, actor, rtol=1e-5)
             np.testing.assert_array_equal(got.is_first, first)
             obs, privileged = (np.asarray(now.obs) - 0.2) / 2, (np.asarray(now.privileged_obs) - 0.2) / 2
             action = 0.7 * obs[..., 2:3] + 0.1 * actor[:, None, None]

@@ -18,7 +18,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_init
 from mqe_jax.train.optim import AdamState
 from mqe_jax.train.rollout import ObservationNormalizer
-from mqe_jax.train.types import NetworkMemory, Transition
+from mqe_jax.train.types import Transition
 from tests import training as probes
 from tests.training import Probe
 
@@ -113,10 +113,7 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     first: Any = random.random((T, N)) < 0.3
     first[::length] = False  # the state of memory before a first step is zero in a rollout
     transitions = Transition(
-        memory=NetworkMemory(
-            jax.tree.map(lambda x: normal(T // length, *x.shape), memory.actor),
-            jax.tree.map(lambda x: normal(T, *x.shape), memory.critic),
-        ),
+        memory=jax.tree.map(lambda x: normal(T, *x.shape), memory),
         is_first=first,
         obs=normal(T, N, A, size[0]),
         privileged_obs=normal(T, N, size[1]),
@@ -239,7 +236,7 @@ class Plain:
         ppo, data = self.config.ppo, self.data
         rows: dict[str, list[Any]] = {name: [] for name in ("policy", "value", "entropy", "kl", "clipped")}
         length = self.network.chunk_length if self.network.recurrent else 1
-        actors: Any = jax.tree.map(lambda x: x[start // length, n], data.memory.actor)
+        actors: Any = jax.tree.map(lambda x: x[start, n], data.memory.actor)
         critics: Any = jax.tree.map(lambda x: x[start, n], data.memory.critic)
         advantage, targets, olds = (jnp.asarray(x, jnp.float32) for x in (self.advantage, self.target, self.old))
         for t in [start + step for step in range(length)]:

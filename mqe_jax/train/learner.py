@@ -253,9 +253,8 @@ def _prepare(
         advantage = (advantage - devices.mean(jnp.mean(advantage))) / (deviation + 1e-8)
 
     steps = network.chunk_length
-    memory = transitions.memory._replace(critic=jax.tree.map(lambda x: x[::steps], transitions.memory.critic))
     batch = Batch(
-        memory=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), memory),
+        memory=jax.tree.map(lambda x: x[::steps].reshape(-1, *x.shape[2:]), transitions.memory),
         is_first=chunks(transitions.is_first, steps),
         obs=chunks(obs, steps),
         privileged_obs=chunks(privileged, steps),

@@ -58,8 +58,6 @@ def rollout(
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
-    `length` is a multiple of the network's chunk length.
-
     The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
     steps and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
     episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold
@@ -78,7 +76,7 @@ def rollout(
         trace = () if trace_step is None else trace_step(before, scaled, after)
         done = after.terminated | after.truncated
         transition = Transition(
-            memory=memory._replace(actor=()),
+            memory=memory,
             is_first=state.is_first,
             obs=before.obs,
             privileged_obs=before.privileged_obs,
@@ -101,18 +99,12 @@ def rollout(
             episode_steps=jnp.where(done, 0, episode_steps),
             episode_return=jnp.where(done, 0.0, episode_return),
         )
-        return state, (transition, sums, trace)
+        return state, (transition, jnp.stack([sums[name].astype(jnp.float32) for name in names]), trace)
 
-    def one_chunk(state: RolloutState, keys: jax.Array) -> tuple[RolloutState, tuple[Any, Any]]:
-        start = reset_memory(state.memory, state.is_first).actor
-        state, steps = jax.lax.scan(one_step, state, keys)
-        return state, (start, steps)
-
-    keys = jax.random.split(key, length).reshape(-1, network.chunk_length, *key.shape)
-    state, (starts, steps) = jax.lax.scan(one_chunk, state, keys)
-    transitions, sums, trace = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), steps)
-    transitions = transitions._replace(memory=transitions.memory._replace(actor=starts))
-    metrics: dict[str, Any] = _means(sums, length * env.num_envs * devices.size())
+    names = sorted({*state.env_state.metrics, "episode_length", "episode_return", "episodes"})
+    state, (transitions, sums, trace) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    totals = devices.total(jnp.sum(sums, axis=0))
+    metrics: dict[str, Any] = _means(dict(zip(names, totals, strict=True)), length * env.num_envs * devices.size())
     return state, transitions, metrics if trace_step is None else {**metrics, "trace": trace}
 
 
@@ -128,9 +120,8 @@ def _sums(metrics: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array
     return {**sums, "episodes": jnp.sum(done.astype(jnp.float32))}
 
 
-def _means(sums: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
-    """Returns the metrics of a rollout from its sums per step (T,)."""
-    totals = devices.total({name: jnp.sum(value).astype(jnp.float32) for name, value in sums.items()})
+def _means(totals: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
+    """Returns the metrics of a rollout from its sums over steps and environments ()."""
     episodes = totals["episodes"]
     means = {}
     for name, total in totals.items():

@@ -161,8 +161,7 @@ class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
     memory: NetworkMemory
-    """Recurrent state before this step, zeroed at an episode's first step; the actor's at the first steps of chunks
-    only (T / L)."""
+    """Recurrent state before this step, zeroed at an episode's first step."""
     is_first: jax.Array
     """Whether the step is the first of its episode (N,) bool."""
     obs: jax.Array
