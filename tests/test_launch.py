@@ -455,6 +455,14 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     by_hand = ("--processes", "4", "--coordinator", "h:1", "--index", "3", "--devices", "1")
     assert members(*by_hand) == [{launch.MEMBER: "3/4@h:1", device: "1"}]
     assert members("--processes", "1") == [{**alone, device: "4"}]
+    monkeypatch.delenv(device)
+    monkeypatch.setattr(launch, "_gpus", lambda: 2)
+    assert [own[device] for own in members("--processes", "2")] == ["0", "1"]
+    with pytest.raises(
+        InputError, match="processes: 3 is not allowed; it must be at most the number of this host's GPUs, 2"
+    ):
+        members("--processes", "3")
+    monkeypatch.setenv(device, "4,5,6")
     monkeypatch.setenv("SLURM_PROCID", "5")
     monkeypatch.setenv("SLURM_LOCALID", "1")
     assert members() == [{launch.MEMBER: "auto"}]

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -131,10 +132,19 @@ class Launch:
         visible = os.environ.get(_DEVICES)
         if not self.devices and visible in _NO_DEVICES:
             return [{} for _ in range(count)]
+        if visible is None and not self.devices and 0 < (gpus := _gpus()) < count:
+            fail("processes", count, f"at most the number of this host's GPUs, {gpus}")
         devices = list(map(str, self.devices)) or _listed(visible) or list(map(str, range(count)))
         if len(devices) < count or (self.devices and len(devices) > count):
             fail("devices", ", ".join(devices), f"as many as processes, {count}")
         return [{_DEVICES: device} for device in devices[:count]]
+
+
+def _gpus() -> int:
+    """Returns how many NVIDIA GPUs this host has for JAX; 0 where that is unknown."""
+    if os.environ.get("JAX_PLATFORMS") == "cpu":
+        return 0
+    return len(list(Path("/dev").glob("nvidia[0-9]*")))
 
 
 def _listed(visible: str | None) -> list[str]:
