@@ -315,6 +315,14 @@ def test_ratings_recover_the_strengths_behind_many_games() -> None:
     np.testing.assert_allclose(tournament.scores(games)[0], [0, 6000, 6000])
 
 
+def test_a_round_robin_names_what_is_wrong() -> None:
+    nothing: Any = None
+    with pytest.raises(InputError, match="matches: None is not allowed; it must be an environment"):
+        tournament.round_robin(nothing, {}, KEY)
+    with pytest.raises(InputError, match="policies: None is not allowed"):
+        tournament.round_robin(matches(), nothing, KEY)
+
+
 def test_a_tournament_meets_every_pair_on_both_sides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
