@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -49,7 +48,7 @@ def train_walk(
         fail("opponents", list(config.opponents), "empty: walking is not a match")
     task = task or WalkTask()
     config = override(config, {"env": {"robot": robot.name, **to_mapping(task)}})
-    env: Any = WalkEnv(robot, task, impl=impl, num_envs=config.num_envs)
+    env = WalkEnv(robot, task, impl=impl, num_envs=config.num_envs)
 
     def save(state: TrainState, row: dict[str, float]) -> None:
         updates = int(row["updates"])
@@ -59,4 +58,5 @@ def train_walk(
             about = {"robot": robot.name, "env_steps": int(row["env_steps"])}
             walk_policy.save_params(state.params["policy"], run_dir / "walk.safetensors", about, half=True)
 
-    return train(VectorEnv(env, config.num_envs), config, run_dir, resume, on_update=save)
+    batch = VectorEnv(env, config.num_envs)  # pyright: ignore[reportArgumentType]: no task, but all that a batch uses
+    return train(batch, config, run_dir, resume, on_update=save)
