@@ -8,6 +8,7 @@ import fcntl
 import json
 import os
 import re
+import shutil
 import stat
 import tempfile
 import zipfile
@@ -94,12 +95,12 @@ def check_locks(path: Path) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Removes the temporary files that processes which have ended left in a folder."""
+    """Removes the temporary files and folders that processes which have ended left in a folder."""
     for path in folder.glob(".*.tmp*"):
         match = _TEMPORARY.fullmatch(path.name)
         if match and path not in interrupts.temporaries and not _alive(int(match[1])):
             with contextlib.suppress(OSError):
-                path.unlink()
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _alive(process: int) -> bool:

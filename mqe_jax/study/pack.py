@@ -6,15 +6,16 @@ the environments, which are reset where it resumes. `tar xzf FILE -C FOLDER` unp
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 import tarfile
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from mqe_jax import limits
+from mqe_jax import interrupts, limits
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_file, check_folder, read_text
+from mqe_jax.files import check_file, check_folder, read_text, remove_temporaries
 from mqe_jax.settings import fail
 from mqe_jax.study.sweep import SWEEP_FILE
 from mqe_jax.train.checkpoint import copy_without, latest
@@ -42,8 +43,8 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
         fail("folder", [str(folder) for folder in folders], "folders of different names")
     runs_of = {folder: _runs(folder) for folder in folders}
     check_folder(output, "output")
-    with tempfile.TemporaryDirectory(dir=output) as temporary:
-        root, packed = Path(temporary, "sweeps"), []
+    with _temporary(output) as temporary:
+        root, packed = temporary / "sweeps", []
         staged = [_staged(folder, runs, root / folder.resolve().name) for folder, runs in runs_of.items()]
         sizes = {run: _size(run) for copies in staged for run in copies}
         bins: list[list[Path]] = [[] for _ in range(parts)]
@@ -55,7 +56,7 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
             else:
                 left.append(run.relative_to(root).as_posix())
         for i, runs in enumerate(filter(None, bins)):
-            packed.append(Path(temporary, f"part{i}.tar.gz"))
+            packed.append(temporary / f"part{i}.tar.gz")
             with tarfile.open(packed[-1], "w:gz", compresslevel=1) as archive:
                 for run in runs:
                     archive.add(run, run.relative_to(root))
@@ -66,6 +67,24 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
         names = ", ".join(sorted(left))
         raise InputError(f"parts: {parts} files of {megabytes:g} MiB have no room for {names}; {output} has the others")
     return files
+
+
+@contextlib.contextmanager
+def _temporary(output: Path) -> Iterator[Path]:
+    """Yields a new folder in `output`, removed at the end, when a signal ends the process, or else by the next call."""
+    folder = output / f".pack.{os.getpid()}.tmp"  # as `remove_temporaries` knows it
+
+    def remove() -> None:
+        for _ in range(3):  # while the main thread may still write to a run's copy
+            shutil.rmtree(folder, ignore_errors=True)
+
+    remove_temporaries(output)
+    with interrupts.before_exit(remove):
+        try:
+            folder.mkdir()
+            yield folder
+        finally:
+            remove()
 
 
 def _runs(folder: Path) -> list[Path]:
@@ -80,6 +99,7 @@ def _staged(folder: Path, runs: Sequence[Path], target: Path) -> list[Path]:
     """Copies what is packed of a sweep into a folder; returns the copies of its runs, and of its settings."""
     copies = []
     for run in runs:
+        interrupts.settle()  # or it would make the removed folder again
         copies.append(target / run.relative_to(folder))
         (copies[-1] / "best").mkdir(parents=True)
         for name in (CONFIG_FILE, EVALUATIONS_FILE, POLICY_FILE):
