@@ -441,6 +441,7 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which devices processes have, and how they find each other."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,6")
     monkeypatch.delenv("SLURM_PROCID", raising=False)
+    monkeypatch.setattr(launch, "_gpus", lambda: 0)  # unknown, or no GPU
 
     def members(*flags: str) -> list[dict[str, str]]:
         return launch.parse_launch([*flags, *TRAIN])._members()
@@ -462,6 +463,12 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
         InputError, match="processes: 3 is not allowed; it must be at most the number of this host's GPUs, 2"
     ):
         members("--processes", "3")
+    with pytest.raises(InputError, match="devices: '1, 2' is not allowed; it must be from 0 to 1: this host has 2"):
+        members("--processes", "2", "--devices", "1", "2")
+    with pytest.raises(InputError, match="devices: '1, 1' is not allowed; it must be a GPU of its own for each"):
+        members("--processes", "2", "--devices", "1", "1")
+    shared = launch.Launch(processes=2, devices=[1, 1], command=("sweep", "sweep.yaml"))._members()
+    assert [own[device] for own in shared] == ["1", "1"]
     monkeypatch.setenv(device, "4,5,6")
     monkeypatch.setenv("SLURM_PROCID", "5")
     monkeypatch.setenv("SLURM_LOCALID", "1")

@@ -132,11 +132,16 @@ class Launch:
         visible = os.environ.get(_DEVICES)
         if not self.devices and visible in _NO_DEVICES:
             return [{} for _ in range(count)]
-        if visible is None and not self.devices and 0 < (gpus := _gpus()) < count:
+        gpus = _gpus()
+        if visible is None and not self.devices and 0 < gpus < count:
             fail("processes", count, f"at most the number of this host's GPUs, {gpus}")
         devices = list(map(str, self.devices)) or _listed(visible) or list(map(str, range(count)))
         if len(devices) < count or (self.devices and len(devices) > count):
             fail("devices", ", ".join(devices), f"as many as processes, {count}")
+        if gpus and not all(0 <= device < gpus for device in self.devices):
+            fail("devices", ", ".join(devices), f"from 0 to {gpus - 1}: this host has {gpus} GPUs")
+        if not self._sweeps and len(set(self.devices)) < len(self.devices):
+            fail("devices", ", ".join(devices), "a GPU of its own for each process of a training")
         return [{_DEVICES: device} for device in devices[:count]]
 
 
