@@ -90,7 +90,7 @@ def test_constant_observations_are_divided_by_a_hundredth() -> None:
 
 def test_metrics_of_episodes_are_missing_without_any() -> None:
     step = _sums({"success": jnp.ones(3), "pace": jnp.arange(3.0), "diverged": jnp.ones(3)}, jnp.zeros(3, bool))
-    found = {name: float(x) for name, x in _means({name: x[None] for name, x in step.items()}, 3).items()}
+    found = {name: float(x) for name, x in _means(step, 3).items()}
     assert np.isnan(found.pop("success")) and found == {"pace": 1.0, "diverged": 3.0, "episodes": 0.0}
 
 
