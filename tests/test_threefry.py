@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,3 +32,21 @@ def test_random_numbers_are_compiled_without_loops() -> None:
     draw = jax.jit(jax.vmap(lambda key: jax.random.normal(jax.random.split(key, 3)[1], (5,))))
     text = draw.lower(jax.random.split(jax.random.PRNGKey(0), 4)).compile().as_text()
     assert text and " while(" not in text
+
+
+def test_numbers_of_a_key_after_several_splits_are_compiled() -> None:
+    """jaxlib 0.11 did not finish in 25 minutes, so that no training began on a CPU."""
+    code = """
+import jax
+from mqe_jax import threefry
+
+def draw(key):
+    first, _ = jax.random.split(key)
+    second, _, _ = jax.random.split(first, 3)
+    third, _ = jax.random.split(second, 2)
+    return jax.random.normal(third, (64, 64))
+
+jax.jit(draw).lower(jax.random.PRNGKey(0)).compile()
+"""
+    usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}  # tests optimise less
+    subprocess.run([sys.executable, "-c", code], env=usual, check=True, timeout=100)
