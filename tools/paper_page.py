@@ -49,15 +49,10 @@ def update(runs: Sequence[Run], folder: Path, page: Path) -> None:
     write_atomically(page, text.encode())
 
 
-def from_scratch(variant: str) -> bool:
-    """Returns whether a variant trains without the walk policy."""
-    return variant.partition("-")[0] == SCRATCH
-
-
 def figures(cells: Cells, reference: Reference) -> dict[str, bytes]:
-    """Returns the page's figures as PNG, by file name: curves of the paper's variants, evaluations of the others."""
+    """Returns the page's figures as PNG, by file name: curves of the paper's variants, evaluations of `SHAPED`."""
     drawn = {cell: runs for cell, runs in cells.items() if cell.variant in reference.values}
-    others = {c: runs for c, runs in cells.items() if c not in drawn and not from_scratch(c.variant)}
+    others = {cell: runs for cell, runs in cells.items() if cell.variant in SHAPED}
     return {
         "curves.png": draw_curves(drawn, reference),
         "evaluations.png": draw_evaluations(
@@ -95,22 +90,20 @@ def filled(text: str, contents: Mapping[str, str]) -> str:
 def sections(cells: Cells, reference: Reference, folder: Path) -> dict[str, str]:
     """Returns the generated sections of the page by name: Markdown tables."""
     fresh = json.loads((folder.parent / "measurements.json").read_text(encoding="utf-8"))["paper/fresh_episodes"]
-    rows = final_rows(cells, reference)
+    drawn = {cell: runs for cell, runs in cells.items() if cell.variant in reference.values}
+    rows = final_rows({c: runs for c, runs in cells.items() if c in drawn or c.variant in SHAPED}, reference)
     for row in rows:
         task, variant = row["task"], row["variant"]
-        value = reference.value(SCRATCH if from_scratch(variant) else PAPER, task, row["algorithm"])
-        row["paper"] = max(reference.values[PAPER][task].values()) if variant in SHAPED else value
+        best = max(reference.values[PAPER][task].values())
+        row["paper"] = best if variant in SHAPED else reference.value(variant, task, row["algorithm"])
         row["ours"] = verdict(row, "training" if variant in reference.values else "absolute")
         seeds = sorted(fresh["tasks"][task].items()) if variant == TUNED else []
         row["fresh"] = ", ".join(f"{100 * seed['success_rate']:.1f}" for _, seed in seeds) + "%" * bool(seeds)
     cell = {"task": "task", "algorithm": "algorithm", "seeds": "seeds"}
     reward = {"training": "average step reward", "paper": "paper"}
-    best = {"ours": "ours is", "absolute": "best checkpoint", "success": "success rate"}
-    changes = [row for row in rows if row["variant"] not in (*SHAPED, *reference.values)]
-    drawn = {cell: runs for cell, runs in cells.items() if cell.variant in reference.values}
+    absolute = {"ours": "ours is", "absolute": "best checkpoint", "success": "success rate"}
     return {
-        **{v: markdown([r for r in rows if r["variant"] == v], cell | reward | best) for v in (PAPER, SCRATCH)},
-        "changes": markdown(changes, cell | {"variant": "settings"} | reward),
+        **{v: markdown([r for r in rows if r["variant"] == v], cell | reward | absolute) for v in (PAPER, SCRATCH)},
         "aggregates": "\n\n".join(markdown(table) for table in aggregate_tables(drawn).values()),
         TUNED: markdown(
             [row for row in rows if row["variant"] in SHAPED],
