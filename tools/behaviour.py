@@ -137,12 +137,24 @@ def door(env: Any, episode: Episode) -> dict[str, Any]:
     }
 
 
+def bridge(env: Any, episode: Episode) -> dict[str, Any]:
+    """Whether the opponent is pushed off, and from where; otherwise the winner stands on its platform at the time limit."""
+    position = robots(env, episode)
+    met = int((apart(position[:, 0], position[:, 1]) < 2 * NEAR).argmax())
+    return {
+        "opponent off the bridge": len(episode) * episode.dt < env.params.episode_length,
+        "past the middle where they meet": position[met, 0, 0] > env.center[0],
+        "time": len(episode) * episode.dt,
+    }
+
+
 MEASURES: dict[str, Callable[[Any, Episode], dict[str, Any]]] = {
     "go1seesaw": seesaw,
     "go1pushbox": pushbox,
     "go1sheep-hard": sheep,
     "go1football-defender": football,
     "go1wrestling": sumo,
+    "go1bridge": bridge,
     "go1revolvingdoor": door,
     "go1football-1vs1": football,
     "go1football-2vs2": football,
