@@ -138,7 +138,7 @@ def door(env: Any, episode: Episode) -> dict[str, Any]:
 
 
 def bridge(env: Any, episode: Episode) -> dict[str, Any]:
-    """Whether the opponent is pushed off, and from where; otherwise the winner stands on its platform at the time limit."""
+    """Whether the opponent is pushed off, and where they meet; otherwise the winner ends on its platform."""
     position = robots(env, episode)
     met = int((apart(position[:, 0], position[:, 1]) < 2 * NEAR).argmax())
     return {
