@@ -138,12 +138,13 @@ def door(env: Any, episode: Episode) -> dict[str, Any]:
 
 
 def bridge(env: Any, episode: Episode) -> dict[str, Any]:
-    """Whether the opponent is pushed off, and where they meet; otherwise the winner ends on its platform."""
+    """Where they meet, and how the opponent falls; otherwise the winner ends on its platform."""
     position = robots(env, episode)
-    met = int((apart(position[:, 0], position[:, 1]) < 2 * NEAR).argmax())
+    near = apart(position[:, 0], position[:, 1]) < 2 * NEAR
     return {
-        "opponent off the bridge": len(episode) * episode.dt < env.params.episode_length,
-        "past the middle where they meet": position[met, 0, 0] > env.center[0],
+        "opponent fell": len(episode) * episode.dt < env.params.episode_length,
+        "its trunk is over the edge": abs(position[-1, 1, 1] - env.center[1]) > env.params.bridge_width / 2,
+        "they meet on its own half": near.any() and position[near.argmax(), 0, 0] < env.center[0],
         "time": len(episode) * episode.dt,
     }
 
