@@ -9,7 +9,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,14 @@ def update(runs: Sequence[Run], folder: Path, page: Path) -> None:
     write_atomically(page, text.encode())
 
 
+def of(cells: Cells, variants: Container[str]) -> Cells:
+    """Returns the cells of some variants."""
+    return {cell: runs for cell, runs in cells.items() if cell.variant in variants}
+
+
 def figures(cells: Cells, reference: Reference) -> dict[str, bytes]:
     """Returns the page's figures as PNG, by file name: curves of the paper's variants, evaluations of `SHAPED`."""
-    drawn = {cell: runs for cell, runs in cells.items() if cell.variant in reference.values}
-    others = {cell: runs for cell, runs in cells.items() if cell.variant in SHAPED}
+    drawn, others = of(cells, reference.values), of(cells, SHAPED)
     return {
         "curves.png": draw_curves(drawn, reference),
         "evaluations.png": draw_evaluations(
@@ -90,8 +94,7 @@ def filled(text: str, contents: Mapping[str, str]) -> str:
 def sections(cells: Cells, reference: Reference, folder: Path) -> dict[str, str]:
     """Returns the generated sections of the page by name: Markdown tables."""
     fresh = json.loads((folder.parent / "measurements.json").read_text(encoding="utf-8"))["paper/fresh_episodes"]
-    drawn = {cell: runs for cell, runs in cells.items() if cell.variant in reference.values}
-    rows = final_rows({c: runs for c, runs in cells.items() if c in drawn or c.variant in SHAPED}, reference)
+    rows = final_rows(of(cells, (*reference.values, *SHAPED)), reference)
     for row in rows:
         task, variant = row["task"], row["variant"]
         best = max(reference.values[PAPER][task].values())
@@ -104,7 +107,7 @@ def sections(cells: Cells, reference: Reference, folder: Path) -> dict[str, str]
     absolute = {"ours": "ours is", "absolute": "best checkpoint", "success": "success rate"}
     return {
         **{v: markdown([r for r in rows if r["variant"] == v], cell | reward | absolute) for v in (PAPER, SCRATCH)},
-        "aggregates": "\n\n".join(markdown(table) for table in aggregate_tables(drawn).values()),
+        "aggregates": "\n\n".join(markdown(table) for table in aggregate_tables(of(cells, reference.values)).values()),
         TUNED: markdown(
             [row for row in rows if row["variant"] in SHAPED],
             cell
