@@ -68,6 +68,8 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     assert isinstance(policy_of("go1gate", robot="go2"), SimplePolicy)  # trained on the Go1
     assert isinstance(policy_of("go1gate", set=["gate_width=0.8"]), SimplePolicy)
     assert isinstance(policy_of("go1plane"), SimplePolicy)  # none is shipped
+    joints = policy_of("go1gate", control="position")
+    assert joints.act(jnp.zeros((1, 2, 16)), (), jax.random.PRNGKey(0))[0].shape == (1, 2, 12)
     both = policy_of("go1tug")
     assert isinstance(both, BothTeams) and both.first is both.second and isinstance(both.first, TrainedPolicy)
     alone = policy_of("go1tug", opponent="idle")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import tarfile
 from pathlib import Path
@@ -199,7 +200,21 @@ def test_the_shipped_policies_are_remade_with_the_settings_of_train(part: str) -
             changed | {"start", "imitation", "ppo"} if job.cell.variant == "from-champion" else changed
         )
         if own["start"]:
-            assert zoo.file_of(job.cell.task).name == Path(own["start"]).name
+            assert own["start"] == job.cell.task
+
+
+@pytest.mark.parametrize("task", [task for task in zoo.names() if zoo.card(task).command.startswith("mqe sweep")])
+def test_the_command_on_a_card_trains_one_run(task: str) -> None:
+    words = zoo.card(task).command.split()
+    option = {name: value for name, value in itertools.pairwise(words) if name.startswith("--")}
+    sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", option["--part"])
+    jobs = sweeps.plan(sweep, CONFIGS, of_train, [option["--cells"]], [int(option["--seeds"])])
+    assert [(job.cell.task, len(job.configs)) for job in jobs] == [(task, 1)]
+
+
+def test_a_part_must_be_named() -> None:
+    with pytest.raises(InputError, match=r"part: none is named; .*zoo\.yaml has: selection, .*--part selection"):
+        sweeps.load_sweep(CONFIGS / "zoo.yaml")
 
 
 def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:
@@ -274,9 +289,9 @@ def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, 
 
 def test_the_shipped_policies_can_be_planned_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    for part in ("published", "matches"):
+    for part, cell, seed in (("published", "*", 10), ("matches", "*", 10), ("responses", "go1tug/*", 20)):
         sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
-        assert sweeps.plan(sweep, CONFIGS, of_train, seeds=[10], check=setup.check_start)
+        assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
 
 
 def test_a_cell_that_fails_is_named_and_the_others_are_trained(

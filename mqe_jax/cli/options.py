@@ -66,7 +66,8 @@ class PolicyOptions(TaskOptions):
     policy: PolicyName = None
     """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
     another scripted policy of the task, a task with a shipped policy, a run folder, or a policy file. Default: that of
-    the given run; of a task: the shipped one (see `mqe zoo`), else scripted, else forward."""
+    the given run; of a task: the shipped one (see `mqe zoo`), else scripted, else forward; random, where actions are
+    not commands."""
     opponent: PolicyName = None
     """Policy of team 1 in a match: what --policy accepts. Default: the same as team 0 where that is the shipped one by
     default, else idle."""
@@ -79,7 +80,7 @@ class PolicyOptions(TaskOptions):
         """Returns task and vectorised environment as `make_env`, and the policy of all agents.
 
         A run has its own task, parameters and policy; a task has its shipped policy, if its parameters are the default
-        ones, its scripted policy, or forward if it has neither.
+        ones, its scripted policy, or forward if it has neither; random, where actions are not commands.
         """
         from mqe_jax import zoo
         from mqe_jax.cli import setup
@@ -88,7 +89,9 @@ class PolicyOptions(TaskOptions):
 
         task, params = ALIASES.get(self.target, self.target), self.overrides()
         shipped = task in zoo.names() and not params and self.policy is None
-        name = task if shipped else self.policy or ("scripted" if task in PLANNERS else "forward")
+        walking = "scripted" if task in PLANNERS else "forward"
+        default = walking if params.get("control", "command") == "command" else "random"
+        name = task if shipped else self.policy or default
         if task not in (*TASKS, *zoo.names()) and (os.sep in self.target or Path(self.target).exists()):
             config = setup.run_config(self.target)
             task, params, name = config.task, {**config.env, **params}, self.policy or self.target

@@ -27,7 +27,7 @@ class Sweep:
     """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
 
     file: tyro.conf.Positional[Path]
-    """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/training.md)."""
+    """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/sweeps.md)."""
     json: Json = False
     part: str | None = None
     """Name of one sweep in a file that maps names to sweeps."""

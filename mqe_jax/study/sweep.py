@@ -93,6 +93,8 @@ def load_sweep(path: Path, part: str | None = None) -> Sweep:
         if not isinstance(values.get(part), dict):
             raise InputError(f"{path}: has no part {part!r}{nearest(part, values)}; it has: {', '.join(values)}")
         values = values[part]
+    elif "tasks" not in values and any(isinstance(value, dict) and "tasks" in value for value in values.values()):
+        raise InputError(f"part: none is named; {path} has: {', '.join(values)} (--part {next(iter(values))})")
     try:
         return build(Sweep, values)
     except InputError as error:

@@ -211,8 +211,8 @@ class TrainConfig:
     includes the time left. During training only."""
     league: LeagueSettings = LeagueSettings()
     start: str | None = None
-    """Run folder or policy file whose policy the run starts from: its parameters and observation statistics; none
-    starts from nothing."""
+    """Run folder, policy file or, for its shipped policy, task whose policy the run starts from: its parameters and
+    observation statistics; none starts from nothing."""
     seed: Seed = 0
     """Random seed."""
     num_envs: Environments = 500

@@ -86,7 +86,9 @@ def first_state(
 
 def policy_to_start(task: str, params: Params, start: str) -> TrainedPolicy:
     """Returns the policy that `start` names; InputError unless it fits parameters, given their shapes, and the task."""
-    policy = read_policy(start)
+    from mqe_jax import zoo
+
+    policy = zoo.load(start) if start in zoo.names() else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != task:
         raise InputError(
