@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, autoreset
+from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy
 from mqe_jax.train.types import PyTree
@@ -50,6 +51,8 @@ class Demonstrated(VectorEnv):
     ) -> None:
         """Creates the batch; `demonstrator` acts for all agents, `num_envs` and `copies` are those of `VectorEnv`."""
         super().__init__(env, num_envs, copies)
+        if self.max_episode_steps < MOMENTS:
+            fail("episode_length", env.params.episode_length, f"at least {MOMENTS} steps with a demonstrator")
         self.demonstrator, self.backward = demonstrator, backward
         self._guide = VectorEnv(self.env, EPISODES)
 

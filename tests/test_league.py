@@ -25,11 +25,13 @@ from mqe_jax.errors import InputError
 from mqe_jax.league import pool, tournament
 from mqe_jax.league.league import League
 from mqe_jax.opponents import versus
-from mqe_jax.settings import build
+from mqe_jax.settings import build, override
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.policy import policy_of, read_policy, save_policy
+from mqe_jax.train.seeds import Seeds
+from mqe_jax.train.start import first_state, own_learner
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content
 
@@ -106,6 +108,37 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
             assert int(state.extra.pool.born[member]) >= 0
             of_pool = jax.tree.map(lambda x: x[member], state.extra.pool.arrays)  # noqa: B023
             jax.tree.map(np.testing.assert_array_equal, opponent.arrays, of_pool)
+
+
+def test_new_environments_play_what_the_league_says(history: list[TrainState]) -> None:
+    """As after a resume without environments: they are reset, and the rest is of an earlier update."""
+    env = League(matches(num_envs=8), SOURCES, config_of())
+    reset = env.reset(KEY)
+    state = dataclasses.replace(history[9], rollout=history[9].rollout._replace(env_state=reset))
+    newest, *drawn, idle = env.seated(state).rollout.env_state.opponents
+    same = lambda x, y: jax.tree.map(np.testing.assert_array_equal, x, y)  # noqa: E731
+    for opponent, arrays in (
+        (newest, env._own(state)),
+        *((o, env._member(state.extra, 1 + i)) for i, o in enumerate(drawn)),
+    ):
+        same(opponent.arrays, arrays)
+        same(opponent.before, arrays)
+    same(idle, reset.opponents[3])
+
+
+def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainState], tmp_path: Path) -> None:
+    config, state = config_of(start=str(tmp_path)), history[9]
+    env = League(matches(num_envs=8), SOURCES, config)
+    save_policy(tmp_path, policy_of(state, env_dims(env, config), config, task=env.name, env_steps=0))
+    learner, processes = own_learner(env, config, None)
+    begun, _ = first_state(env, learner, processes, config, None, Seeds(learner.init, 1).shared)
+    mine = env._own(begun)
+    jax.tree.map(np.testing.assert_array_equal, mine.params, env._own(state).params)
+    for arrays in (
+        jax.tree.map(lambda x: x[0], begun.extra.pool.arrays),
+        *(o.arrays for o in begun.rollout.env_state.opponents[:3]),
+    ):
+        jax.tree.map(np.testing.assert_array_equal, arrays, mine)
 
 
 @pytest.mark.parametrize(("share", "nearest"), [(0.45, 4), (1.0, 9)])
@@ -292,6 +325,7 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
     config = base_config(task, None)
     assert {"newest", "older", "scripted"} <= set(config.opponents) and config.num_envs % len(config.opponents) == 0
     assert make(task, impl="c", num_envs=1, **config.training_env).params.frozen_time == 0
+    override(config, {"evaluation": {"every": 50}})  # its episodes are shared by the fixed opponents
     if task == "go1wrestling":
         assert dict(config.train_env) == {"frozen_time": 0.0, "rewards.push": 3.0, "rewards.approach": 1.0}
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents

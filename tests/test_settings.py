@@ -183,6 +183,7 @@ def test_there_and_back() -> None:
         ({"ppo": {"gama": 1.0}}, "ppo.gama: unknown name .*did you mean 'gamma'"),
         ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be greater than 0"),
         ({"ppo.ratio": "joint"}, "ppo.value: 'agent' .* 'joint' when ppo.ratio is 'joint'"),
+        ({"ppo.critic_warmup": 0.1, "network": {"name": "mat"}}, "ppo.critic_warmup: 0.1 .* 0 with the network mat"),
         ({"ppo.dual_clip": 0.5}, "ppo.dual_clip: 0.5 .* greater than 1"),
         ({"network.hidden_sizes": []}, "network.hidden_sizes: .* should have at least 1 item"),
         ({"network.hidden_size": 3}, "network.hidden_size: unknown name .* 'hidden_sizes'"),

@@ -226,6 +226,12 @@ class Bending:
         return jnp.broadcast_to(0.01 * memory[:, None, None], (*obs.shape[:2], 12)), memory + 1.0
 
 
+def test_a_demonstrator_needs_episodes_of_sixteen_steps() -> None:
+    task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.2)
+    with pytest.raises(InputError, match=r"episode_length: 0\.2 .*at least 16 steps with a demonstrator"):
+        Demonstrated(task, N, Bending())
+
+
 @pytest.fixture(scope="module")
 def rollout() -> tuple[Any, dict[str, Any]]:
     """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading axis time."""

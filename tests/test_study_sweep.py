@@ -230,6 +230,16 @@ def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:
     assert [job.steps_left for job in jobs] == [16, 96]
 
 
+def test_seeds_that_stopped_at_other_steps_are_trained_alone(tmp_path: Path) -> None:
+    sweep = override(load(tmp_path), {"seeds": (0, 1, 2, 3), "algorithms": ("mappo",)})
+    for seed, step in ((0, 32), (2, 48), (3, 32)):
+        folder = tmp_path / "study" / "runs" / "go1gate" / "mappo" / f"seed{seed}" / "checkpoints"
+        folder.mkdir(parents=True)
+        (folder / f"step_{step:012}.safetensors").touch()
+    jobs = sweeps.plan(sweep, tmp_path / "study", config_of)
+    assert [[config.seed for config in job.configs] for job in jobs] == [[2], [0, 3], [1]]
+
+
 def test_variants_override_the_settings(tmp_path: Path) -> None:
     jobs = sweeps.plan(load(tmp_path, VARIANTS + "seeds_together: 1\n"), tmp_path, config_of)
     assert len(jobs) == 8

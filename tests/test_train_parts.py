@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.settings import build
 from mqe_jax.train import loss, nn
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import PPO, Curriculum, Imitation, OptimizerSettings, TrainConfig
@@ -23,7 +24,7 @@ from mqe_jax.train.normalize import (
     value_normalize,
     value_update,
 )
-from mqe_jax.train.optim import adam
+from mqe_jax.train.optim import adam, begun_anew
 from mqe_jax.train.schedules import next_assistance, scheduled
 from tests.training import random_params
 
@@ -106,10 +107,10 @@ def test_schedules_by_hand() -> None:
         imitation=Imitation(weight=3.0, until=0.6),
     )
     expected = {
-        0: (1.0, 0.8, 3.0, 0.01, 3.0, 0.0, 1.0),
-        2: (0.6, 0.4, 3.0, 0.008, 2.0, 1.0, 1.0),
-        5: (0.0, 0.0, math.inf, 0.005, 0.5, 1.0, 1.0),
-        9: (0.0, 0.0, math.inf, 0.001, 0.0, 1.0, 0.5),
+        0: (1.0, 0.8, 3.0, 0.01, 3.0, 0.0, 0.0, 1.0),
+        2: (0.6, 0.4, 3.0, 0.008, 2.0, 1.0, 1.0, 1.0),
+        5: (0.0, 0.0, math.inf, 0.005, 0.5, 1.0, 0.0, 1.0),
+        9: (0.0, 0.0, math.inf, 0.001, 0.0, 1.0, 0.0, 0.5),
     }
     for updates, values in expected.items():
         np.testing.assert_allclose(jnp.stack(scheduled(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
@@ -170,6 +171,20 @@ def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:
     small = {"a": jnp.array([0.3, 0.0, -0.4]), "b": {"c": jnp.array(0.0)}}
     state = optimizer.update(small, optimizer.init(params), params, 0.1)[1]
     np.testing.assert_allclose(state.mean["a"], [0.03, 0.0, -0.04], rtol=1e-5)  # a small gradient stays as it is
+
+
+def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() -> None:
+    config = build(TrainConfig, {"num_envs": 2, "rollout_steps": 1, "total_steps": 20, "ppo": {"critic_warmup": 0.3}})
+    begins = [bool(scheduled(config, jnp.int32(i)).actor_begins) for i in range(10)]
+    assert begins == [i == 3 for i in range(10)]
+    optimizer, params = adam(eps=1e-8), {"a": jnp.zeros(())}
+    state = optimizer.init(params)
+    for _ in range(500):
+        params, state, _ = optimizer.update({"a": jnp.zeros(())}, state, params, 0.1)
+    gradient = {"a": jnp.float32(0.5)}
+    assert float(optimizer.update(gradient, begun_anew(state, False), params, 0.1)[0]["a"]) < -0.15
+    again = begun_anew(state, jnp.bool_(True))
+    assert float(optimizer.update(gradient, again, params, 0.1)[0]["a"]) == pytest.approx(-0.1, rel=1e-4)
 
 
 @pytest.mark.parametrize("shape", [(8, 3), (3, 8)])

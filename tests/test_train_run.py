@@ -18,7 +18,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.settings import build, override
+from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
@@ -28,7 +28,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import load_run_config, train
-from mqe_jax.train.start import without_environments
+from mqe_jax.train.start import check_same, without_environments
 from mqe_jax.viz.curves import draw_curve
 from tests import training as probes
 from tests.training import Probe, Traces, assert_same
@@ -130,6 +130,15 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
     with pytest.raises(ValueError, match=f"--config {run_dir / 'config.yaml'}"):
         train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     assert load_run_config(run_dir) == settings()
+
+
+@pytest.mark.parametrize("before", [{"width": 0.7}, {"width": 0.7, "other": 1}])
+def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> None:
+    config = settings(env={"width": 0.7} if "other" in before else {})
+    lost = "env.other: None differs from the run in x, which has 1" if "other" in before else "env.width: None differs"
+    with pytest.raises(InputError, match=lost):
+        check_same(Path("x"), {**to_mapping(config), "env": before}, config)
+    check_same(Path("x"), to_mapping(config), config)
 
 
 @pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml"])
@@ -326,6 +335,8 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
     assert len(same) > 5
     for name in same:
         np.testing.assert_array_equal(first[name], last[name])
+    with pytest.raises(InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "):
+        train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b")
     with pytest.raises(InputError, match=rf"start: {run_dir} has a policy of probe; allowed: .* this run's network"):
         train(PROBE, settings(start=str(run_dir), network__hidden_sizes=(8,)), tmp_path / "b")
 

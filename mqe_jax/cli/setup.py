@@ -17,13 +17,13 @@ from mqe_jax.envs.match import Match
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
 from mqe_jax.files import parse_yaml
-from mqe_jax.league.league import MOVING, League
+from mqe_jax.league.league import League
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
 from mqe_jax.settings import Parameters, check, fail, load_yaml, override
 from mqe_jax.train.checks import check_divisible
-from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.config import MOVING, TrainConfig, load_config
 from mqe_jax.train.learner import env_dims
 from mqe_jax.train.start import initial_key, policy_to_start
 
@@ -118,10 +118,14 @@ def check_start(config: TrainConfig) -> None:
     if config.train_env:
         make_env(config.task or "", "auto", config.env, 1)
     _check_teams(env, config)
-    network = config.network.build(env_dims(single, config))
+    dims = env_dims(single, config)
+    if len(env.teams) > 1:  # the policy has one team
+        size = len(env.teams[0])
+        dims = dims._replace(agents=size, values=min(dims.values, size))
+    network = config.network.build(dims)
     check_divisible(config, network)
     if config.start is not None:
-        policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config.start)
+        policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config)
     for name in {*config.opponents} - {*MOVING}:
         load_opponent(name, env)
     for name in (config.curriculum.demonstrator, config.imitation.teacher):

@@ -21,16 +21,14 @@ from mqe_jax.opponents import OUTCOMES, Versus, exchanged, versus
 from mqe_jax.policies import load_opponent
 from mqe_jax.settings import fail
 from mqe_jax.train import devices
-from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.config import MOVING, TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import PolicyArrays, TrainedPolicy
 
-NEWEST, OLDER, UNIFORM = "newest", "older", "uniform"
+NEWEST, OLDER, UNIFORM = MOVING
 DRAWN = (OLDER, UNIFORM)
 """Opponents that are members of the pool."""
-MOVING = (NEWEST, *DRAWN)
-"""Opponents that exist in training only."""
 
 _FADE = 0.95  # of the counts behind the metrics, per update
 _GAIN = 1.0  # Elo points per game
@@ -92,6 +90,18 @@ class League(Versus):
             key=jax.random.fold_in(state.key, 1),
         )
 
+    def seated(self, state: TrainState) -> TrainState:
+        """Returns the state whose new environments play the policy itself and the members that the league says."""
+        env_state, own, league = state.rollout.env_state, self._own(state), state.extra
+        opponents = []
+        for i, (source, opponent) in enumerate(zip(self.sources, env_state.opponents, strict=True)):
+            if source in MOVING:
+                arrays = own if source == NEWEST else self._member(league, i)
+                opponent = dataclasses.replace(opponent, arrays=arrays, before=arrays)
+            opponents.append(opponent)
+        env_state = dataclasses.replace(env_state, opponents=tuple(opponents))
+        return dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state))
+
     def after(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         """Records the results of an update, takes a snapshot when due, and gives the blocks their opponents."""
         env_state, own = state.rollout.env_state, self._own(state)
@@ -103,14 +113,16 @@ class League(Versus):
             if source == NEWEST:
                 opponent = exchanged(opponent, own, at_once=True)
             elif source in DRAWN:
-                arrays = jax.tree.map(lambda x: x[league.member[i]], league.pool.arrays)  # noqa: B023
-                other = exchanged(opponent, arrays)
-                same = dataclasses.replace(opponent, arrays=arrays)  # also after a resume with new environments
-                opponent = jax.tree.map(lambda a, b: jnp.where(redrawn[i], a, b), other, same)  # noqa: B023
+                other = exchanged(opponent, self._member(league, i))
+                opponent = jax.tree.map(lambda a, b: jnp.where(redrawn[i], a, b), other, opponent)  # noqa: B023
             opponents.append(dataclasses.replace(opponent, outcomes=jnp.zeros_like(opponent.outcomes)))
         env_state = dataclasses.replace(env_state, opponents=tuple(opponents))
         state = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state), extra=league)
         return state, self._metrics(league)
+
+    def _member(self, league: LeagueState, block: int) -> PolicyArrays:
+        """Returns the arrays of the member that a block plays."""
+        return jax.tree.map(lambda x: x[league.member[block]], league.pool.arrays)
 
     def _own(self, state: TrainState) -> PolicyArrays:
         """Returns the arrays of the learner's policy."""

@@ -15,7 +15,7 @@ class BothSides(Wrapper):
     """Matches, in the second half of which team 0 is the task's team 1.
 
     The privileged observation has one more number: 1 where the teams have changed places, else 0. Of the metrics,
-    outcomes are those of the new teams; terms of the reward, zero-sum, change sign.
+    outcomes and reward are those of the new teams; terms of the reward change sign, as if all were zero-sum.
 
     It makes a difference where a match is symmetric under a reflection: robots walk not quite as their mirror images.
     """
@@ -36,7 +36,9 @@ class BothSides(Wrapper):
                 value = jnp.where(changed, inner.metrics[other[name[:6]] + name[6:]], value)
             elif name == "success":
                 value = jnp.where(changed, inner.metrics["team1/win"], value)
-            elif name.startswith("reward/") or name == "average_step_reward":
+            elif name == "average_step_reward":
+                value = self._exchanged(inner.reward)[:, 0]
+            elif name.startswith("reward/"):
                 value = jnp.where(changed, -value, value)
             metrics[name] = value
 

@@ -131,8 +131,8 @@ def plan(
 
     Of the sweep's seeds those in `seeds` are trained, or all if it is empty. `config_of(task, algorithm)` gives the
     settings that those of the sweep override, and `check` raises an InputError for settings with which a run could not
-    start: here, before the first cell is trained. Finished runs are left out. The others are trained in separate jobs
-    with and without checkpoints, so that all seeds of a job start from the same step. InputError for a task, an
+    start: here, before the first cell is trained. Finished runs are left out. Seeds whose newest checkpoints differ are
+    trained in separate jobs, so that all seeds of a job start from the same step. InputError for a task, an
     algorithm, a setting, a pattern or a seed that is not allowed.
     """
     if unknown := set(seeds) - set(sweep.seeds):
@@ -150,10 +150,10 @@ def plan(
             raise InputError(f"{cell.path.as_posix()}: {error}") from None
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
-        started = [seed for seed in left if list_checkpoints(_run(folder, cell, seed))]
-        fresh = [seed for seed in left if seed not in started]
+        newest = {seed: [file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:]] for seed in left}
         size = sweep.seeds_together or len(sweep.seeds)
-        for group in (started, fresh):
+        for step in sorted({tuple(names) for names in newest.values()}, reverse=True):
+            group = [seed for seed in left if tuple(newest[seed]) == step]
             jobs += [_job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)]
     return jobs
 

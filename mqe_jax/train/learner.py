@@ -28,7 +28,7 @@ from mqe_jax.train.normalize import (
     value_normalize,
     value_update,
 )
-from mqe_jax.train.optim import AdamState, Optimizer, adam
+from mqe_jax.train.optim import AdamState, Optimizer, adam, begun_anew
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, minibatches, normalize_obs, rollout, take
 from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
 from mqe_jax.train.types import Batch, LearnerHook, Params, PyTree, TraceStep, Transition, VectorEnv, replace_fields
@@ -127,7 +127,7 @@ def make_learner(
                 updates=jnp.zeros((), jnp.int32),
             )
         )
-        return state if hook is None else dataclasses.replace(state, extra=hook.begin(state))
+        return state if hook is None else hook.seated(dataclasses.replace(state, extra=hook.begin(state)))
 
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
@@ -341,7 +341,7 @@ def _learn(
         carry, metrics = jax.lax.scan(lambda c, i: step(c, take(batch, i)), carry, index)
         return carry, jax.tree.map(jnp.mean, metrics)
 
-    carry = (state.params, state.optimizer, state.learning_rate)
+    carry = (state.params, begun_anew(state.optimizer, now.actor_begins), state.learning_rate)
     carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.ppo.epochs))
     params, optimizer_state, learning_rate = carry
     metrics = jax.tree.map(jnp.mean, metrics)

@@ -26,6 +26,15 @@ class Optimizer(NamedTuple):
     update: Callable[[PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]]
 
 
+def begun_anew(state: AdamState, when: jax.Array | bool) -> AdamState:
+    """Returns the initial state where `when` is true, else the state itself.
+
+    After updates with gradients of 0 the corrections of both moments are gone: the first real steps would be several
+    times as long as the learning rate.
+    """
+    return state if when is False else jax.tree.map(lambda x: jnp.where(when, jnp.zeros_like(x), x), state)
+
+
 def global_norm(tree: PyTree) -> jax.Array:
     """Returns the Euclidean norm () of all leaves as one vector."""
     return jnp.sqrt(sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.float32(0.0)))

@@ -27,6 +27,8 @@ class Scheduled(NamedTuple):
     """`imitation.weight`."""
     actor_coef: jax.Array | float
     """Weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1."""
+    actor_begins: jax.Array | bool
+    """Whether it is the first update with all losses after `ppo.critic_warmup`."""
     learning_rate_factor: jax.Array
     """Factor of `optimizer.schedule` on the learning rate."""
 
@@ -34,7 +36,7 @@ class Scheduled(NamedTuple):
 def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
     """Returns the values of the scheduled settings after a number of updates ()."""
     ppo, optimizer, curriculum = config.ppo, config.optimizer, config.curriculum
-    progress = updates.astype(jnp.float32) / config.num_updates
+    progress, before = ((updates - i).astype(jnp.float32) / config.num_updates for i in (0, 1))
 
     def falling(start: float, until: float) -> jax.Array:
         return start * jnp.maximum(1.0 - progress / until, 0.0)
@@ -43,6 +45,7 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
     entropy_coef = jnp.float32(ppo.entropy_coef)
     if ppo.entropy_coef_final is not None:
         entropy_coef += jnp.minimum(progress, 1.0) * (ppo.entropy_coef_final - ppo.entropy_coef)
+    warm = progress >= ppo.critic_warmup
     factor = jnp.float32(1.0)
     if optimizer.schedule == "linear":
         factor = jnp.clip((1.0 - progress) / optimizer.anneal, 0.0, 1.0)
@@ -52,7 +55,8 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
         advantage_clip=jnp.where(progress < ppo.advantage_clip_until, clip, jnp.inf),
         entropy_coef=entropy_coef,
         imitation=falling(config.imitation.weight, config.imitation.until),
-        actor_coef=(progress >= ppo.critic_warmup).astype(jnp.float32) if ppo.critic_warmup else 1.0,
+        actor_coef=warm.astype(jnp.float32) if ppo.critic_warmup else 1.0,
+        actor_begins=warm & (before < ppo.critic_warmup) if ppo.critic_warmup else False,
         learning_rate_factor=factor,
     )
 

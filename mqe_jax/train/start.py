@@ -18,10 +18,12 @@ from mqe_jax.train.devices import Processes
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.types import Params, PyTree, Recorder, VectorEnv
+from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv
 
 CONFIG_FILE = "config.yaml"
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
+_MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
+"""Settings of a network that the policy to start from may have otherwise."""
 
 
 def initial_key(config: TrainConfig) -> jax.Array:
@@ -51,16 +53,19 @@ def first_state(
     `env` has the environments of all processes, `learner` the share of one; `shared` as in `Seeds`.
     """
     start = processes.compile(learner.init, start=True)
+    hook: LearnerHook | None = getattr(env, "learner_hook", None)
 
     def init(key: jax.Array) -> TrainState:
         return processes.own(start(key))
 
     if checkpoint is None:
-        policy = None if config.start is None else policy_to_start(env.name, processes.whole.params, config.start)
+        policy = None if config.start is None else policy_to_start(env.name, processes.whole.params, config)
         state = init(initial_key(config))
         if policy is not None:
             normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
             state = dataclasses.replace(state, params={**state.params, **policy.params}, obs_normalizer=normalizer)
+            if hook is not None:
+                state = hook.seated(dataclasses.replace(state, extra=hook.begin(state)))
         return state, 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
     if metadata.get("task") != env.name:
@@ -68,7 +73,7 @@ def first_state(
     before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
     if not isinstance(before, dict) or not isinstance(seconds, int | float):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
-    _check_same(checkpoint.parent.parent, before, config)
+    check_same(checkpoint.parent.parent, before, config)
     whole = metadata.get("environments", True)
     template = processes.whole
     saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
@@ -77,23 +82,33 @@ def first_state(
         raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
     if not whole:
         fresh = init(jax.random.fold_in(tree["key"], tree["updates"]))
-        return jax.tree.map(jnp.asarray, dataclasses.replace(fresh, **tree)), float(seconds)
+        state = jax.tree.map(jnp.asarray, dataclasses.replace(fresh, **tree))
+        return (state if hook is None else hook.seated(state)), float(seconds)
     tree = processes.part(tree)
     if any(jax.tree.leaves(shared)):
         tree = with_shared(tree, shared, init(initial_key(config)))
     return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
-def policy_to_start(task: str, params: Params, start: str) -> TrainedPolicy:
-    """Returns the policy that `start` names; InputError unless it fits parameters, given their shapes, and the task."""
+def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPolicy:
+    """Returns the policy that `config.start` names.
+
+    InputError unless it fits the task, the parameters, given their shapes, and the settings by which it acts.
+    """
     from mqe_jax import zoo
 
+    start = str(config.start)
     policy = zoo.load(start) if start in zoo.names() else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != task:
         raise InputError(
             f"start: {start} has a policy of {policy.task}; allowed: one of {task} with this run's network"
         )
+    theirs = dict(_leaves(to_mapping(policy.config)))
+    for name, value in _leaves(to_mapping(config)):
+        acts = name in ("action_scale", "normalization.observations") or name.startswith("network.")
+        if acts and name.split(".")[-1] not in _MAY_DIFFER and theirs.get(name) != value:
+            raise InputError(f"{name}: {value!r} differs from that of the policy in {start}, {theirs.get(name)!r}")
     return policy
 
 
@@ -115,10 +130,12 @@ def learned(state: TrainState) -> dict[str, Any]:
     }
 
 
-def _check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
+def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
     """Raises an InputError naming the first setting in which the run to resume differs."""
-    old = {**dict(_leaves(to_mapping(TrainConfig()))), **dict(_leaves(before))}  # a new setting had its default
-    for name, value in _leaves(to_mapping(config)):
+    given = dict(_leaves(before))
+    old = {**dict(_leaves(to_mapping(TrainConfig()))), **given}  # a new setting had its default
+    left_out = {name: None for name in given if name.startswith(("env.", "train_env."))}
+    for name, value in {**left_out, **dict(_leaves(to_mapping(config)))}.items():
         if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
             raise InputError(
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "

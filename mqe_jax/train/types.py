@@ -85,10 +85,12 @@ class VectorEnv(Protocol):
 class LearnerHook(Protocol):
     """What an environment does between updates with the learner state, a `TrainState`; pure, and compiled with them.
 
-    `begin(state)` returns the first value of `TrainState.extra`; `after(state) -> (state, metrics)` follows an update.
+    `begin(state)` returns the first value of `TrainState.extra`; `seated(state)` makes new environments fit it;
+    `after(state) -> (state, metrics)` follows an update.
     """
 
     def begin(self, state: Any) -> PyTree: ...
+    def seated(self, state: Any) -> Any: ...
     def after(self, state: Any) -> tuple[Any, dict[str, jax.Array]]: ...
 
 
