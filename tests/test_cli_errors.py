@@ -34,7 +34,10 @@ BAD = {
     "opponent": (["eval", "go1tug", "--opponent", "randm"], ["opponent: unknown 'randm'", "random", "a run folder"]),
     "opponent of no match": (["eval", "fake", "--opponent", "idle"], ["opponent: fake is not a competitive task"]),
     "no scripted policy": (["eval", "fake", "--policy", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
-    "joints of scripted": (["eval", "go1gate", "--control", "position"], ["'position'", "--policy random or idle"]),
+    "joints of scripted": (
+        ["eval", "go1gate", "--control", "position", "--policy", "scripted"],
+        ["'position'", "--policy random or idle"],
+    ),
     "commands of scripted": (
         ["eval", "go1gate", "--policy", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
         ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],

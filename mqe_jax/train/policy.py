@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -140,6 +140,10 @@ def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata:
     """Returns the policy of a learner state."""
     policy_params = config.network.build(dims).policy_params(state.params)
     return TrainedPolicy(policy_params, state.obs_normalizer.obs, dims, config, metadata)
+
+
+NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
+"""Reads the policies that have names, the shipped ones, which `mqe_jax.zoo` adds."""
 
 
 def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False) -> Path:

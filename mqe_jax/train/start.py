@@ -16,7 +16,7 @@ from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.learner import Learner, TrainState, make_learner
-from mqe_jax.train.policy import TrainedPolicy, read_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
 from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv
 
@@ -95,10 +95,8 @@ def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPo
 
     InputError unless it fits the task, the parameters, given their shapes, and the settings by which it acts.
     """
-    from mqe_jax import zoo
-
     start = str(config.start)
-    policy = zoo.load(start) if start in zoo.names() else read_policy(start)
+    policy = NAMED[start]() if start in NAMED else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != task:
         raise InputError(

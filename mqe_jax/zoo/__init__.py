@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.limits import NonNegative, PositiveInt
 from mqe_jax.settings import build, record, to_mapping
 from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
 FOLDER = Path(__file__).parent
 
@@ -79,3 +80,6 @@ def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
     shipped = TrainedPolicy(**{**vars(policy), "metadata": metadata})
     return save_policy(folder, shipped, file_of(policy.task).name, half=True)
+
+
+NAMED.update({name: functools.partial(load, name) for name in names()})
