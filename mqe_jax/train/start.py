@@ -93,7 +93,7 @@ def first_state(
 def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPolicy:
     """Returns the policy that `config.start` names.
 
-    InputError unless it fits the task, the parameters, given their shapes, and the settings by which it acts.
+    InputError unless it fits the task, the parameters, given their shapes, and the settings of its mean actions.
     """
     start = str(config.start)
     policy = NAMED[start]() if start in NAMED else read_policy(start)
