@@ -99,7 +99,7 @@ def history() -> list[TrainState]:
 def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainState]) -> None:
     assert [int(jnp.sum(state.extra.pool.born >= 0)) for state in history[:5]] == [1, 2, 3, 4, 4]
     network = config_of().network.build(env_dims(versus(matches(), ["idle"]), config_of()))
-    for state in history[1:]:
+    for state in history:
         newest, older, uniform, idle = state.rollout.env_state.opponents
         jax.tree.map(np.testing.assert_array_equal, newest.arrays.params, network.policy_params(state.params))
         assert not bool(newest.waiting.any()) and idle.arrays == ()

@@ -150,10 +150,10 @@ def plan(
             raise InputError(f"{cell.path.as_posix()}: {error}") from None
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
-        newest = {seed: [file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:]] for seed in left}
+        newest = {seed: "".join(file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:]) for seed in left}
         size = sweep.seeds_together or len(sweep.seeds)
-        for step in sorted({tuple(names) for names in newest.values()}, reverse=True):
-            group = [seed for seed in left if tuple(newest[seed]) == step]
+        for name in sorted({*newest.values()}, reverse=True):  # those without a checkpoint last
+            group = [seed for seed in left if newest[seed] == name]
             jobs += [_job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)]
     return jobs
 
