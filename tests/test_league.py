@@ -25,13 +25,13 @@ from mqe_jax.errors import InputError
 from mqe_jax.league import pool, tournament
 from mqe_jax.league.league import League
 from mqe_jax.opponents import versus
-from mqe_jax.settings import build, override
+from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.policy import policy_of, read_policy, save_policy
 from mqe_jax.train.seeds import Seeds
-from mqe_jax.train.start import first_state, own_learner
+from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content
 
@@ -139,6 +139,18 @@ def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainSt
         *(o.arrays for o in begun.rollout.env_state.opponents[:3]),
     ):
         jax.tree.map(np.testing.assert_array_equal, arrays, mine)
+
+
+def test_a_league_resumed_without_environments_plays_its_members(history: list[TrainState], tmp_path: Path) -> None:
+    config, state = config_of(), history[9]
+    env = League(matches(num_envs=8), SOURCES, config)
+    metadata = {"task": env.name, "config": to_mapping(config), "environments": False}
+    file = save_checkpoint(tmp_path, without_environments(state), 9, metadata, keep=1)
+    learner, processes = own_learner(env, config, None)
+    resumed, _ = first_state(env, learner, processes, config, file, Seeds(learner.init, 1).shared)
+    seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)
+    for now, before in seats:
+        jax.tree.map(np.testing.assert_array_equal, now.arrays, before.arrays)
 
 
 @pytest.mark.parametrize(("share", "nearest"), [(0.45, 4), (1.0, 9)])

@@ -16,6 +16,7 @@ import yaml
 
 from mqe_jax import cli
 from mqe_jax.envs import VectorEnv, make
+from mqe_jax.envs.wrestling import WrestlingRewards
 from mqe_jax.errors import InputError
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, Versus, versus
@@ -201,12 +202,13 @@ def test_a_mirrored_match_shows_both_teams() -> None:
     np.testing.assert_allclose(state.reward[::2], -state.reward[1::2], atol=1e-6)
 
 
-def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half(door: VectorEnv) -> None:
-    """The policy moves as it would as team 1; results and rewards are its own."""
-    env, action = BothSides(door), jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)
+def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half() -> None:
+    """The policy moves as it would as team 1; results and rewards are its own, even where they are not zero-sum."""
+    inner = matches("go1wrestling", rewards=WrestlingRewards(push=3.0))
+    env, action = BothSides(inner), jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)
     exchanged = action.at[2:].set(action[2:, ::-1])
-    plain, state = door.reset(KEY), env.reset(KEY)
-    step, plain_step = jax.jit(env.step), jax.jit(door.step)
+    plain, state = inner.reset(KEY), env.reset(KEY)
+    step, plain_step = jax.jit(env.step), jax.jit(inner.step)
     for _ in range(6):
         plain, state = plain_step(plain, exchanged), step(state, action)
         for name in ("obs", "final_obs", "reward"):
@@ -220,6 +222,7 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
         np.testing.assert_array_equal(state.metrics["team0/win"][2:], plain.metrics["team1/win"][2:])
         np.testing.assert_array_equal(state.metrics["team1/win"][2:], plain.metrics["team0/win"][2:])
         np.testing.assert_array_equal(state.metrics["success"], state.metrics["team0/win"])
+        assert bool(jnp.any(jnp.abs(jnp.sum(state.reward, axis=1)) > 1e-4))
 
 
 def test_a_team_wins_from_both_sides() -> None:

@@ -115,6 +115,8 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
             "deterministic"
         ]
         assert one["deterministic"] == two["deterministic"]
+        (absolute,) = Monitor(env, config).evaluate([policy], [3], N, absolute=True)
+        assert absolute["sampled"] != one["sampled"]
         results.append(one["sampled"])
     assert results[0] != results[1]
 

@@ -93,6 +93,7 @@ def test_only_the_critic_learns_at_first(history: Any) -> None:
         for name, moves in (("critic", True), ("policy", number >= 2)):
             pairs = zip(*(jax.tree.leaves(state.params[name]) for state in (before, after)), strict=True)
             assert any(np.any(a != b) for a, b in pairs) == moves
+    assert [int(state.optimizer.updates) for state in history[0]] == [0, 1, 2, 1, 2]  # Adam begins anew with the actor
 
 
 def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> None:

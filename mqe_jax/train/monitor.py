@@ -68,13 +68,17 @@ class Monitor:
         self._evaluator = Evaluator(env, act, config.network.build(dims).initial_memory(env.num_envs).actor)
 
     def evaluate(
-        self, policies: Sequence[TrainedPolicy], env_steps: Sequence[int], episodes: int
+        self, policies: Sequence[TrainedPolicy], env_steps: Sequence[int], episodes: int, *, absolute: bool = False
     ) -> list[dict[str, Any]]:
-        """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with mean actions."""
+        """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with mean actions.
+
+        Those of the `absolute` metric are other episodes than those by which its policy was chosen.
+        """
         stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *(policy.arrays for policy in policies))
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
         # The same random keys for every policy and training step, to reduce the variance of comparisons.
-        keys = jnp.tile(jax.random.PRNGKey(self._config.seed), (2 * len(policies), 1))
+        key = jax.random.PRNGKey(self._config.seed)
+        keys = jnp.tile(jax.random.fold_in(key, 1) if absolute else key, (2 * len(policies), 1))
         results = self._evaluator((stacked, modes), episodes, keys)
         return [
             {

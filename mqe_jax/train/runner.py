@@ -321,7 +321,8 @@ class _Training:
             return
         self._evaluate()
         policies, steps = zip(*(log.best_policy() for log in self._evaluations), strict=True)
-        results = self._monitor.evaluate(policies, steps, ABSOLUTE_FACTOR * self._config.evaluation.episodes)
+        episodes = ABSOLUTE_FACTOR * self._config.evaluation.episodes
+        results = self._monitor.evaluate(policies, steps, episodes, absolute=True)
         with self._writing:
             for log, result in zip(self._evaluations, results, strict=True):
                 log.end(result, self._env_steps)
