@@ -42,7 +42,7 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
 
     policy = policy_of(state, env_dims(env, config), config, task=matches.name)
     fights = [versus(matches, [opponent]) for opponent in (snapshot, "scripted")]
-    return [evaluate(fight, policy.act, episodes, jax.random.PRNGKey(1)) for fight in fights]
+    return [evaluate(fight, policy, episodes, jax.random.PRNGKey(1)) for fight in fights]
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def _evaluate(x: Any, episodes: Any = 2, key: Any = KEY, **options: Any) -> Any:
 
 
 def _record(x: Any, key: Any = KEY, **options: Any) -> Any:
-    return recording.record(x["fake"], options.pop("act", x["act"]), (), key, **options)
+    return recording.record(x["fake"], options.pop("act", x["act"]), key, **options)
 
 
 def _render(x: Any, **options: Any) -> Any:
@@ -91,7 +91,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("block: ", lambda x, v: _evaluate(x, block=v), (0, NAN, 1.5)),
     ("max_steps: ", lambda x, v: _evaluate(x, max_steps=v), (0, NAN, -1)),
     ("key: ", lambda x, v: _evaluate(x, key=v), (3, None, "k")),
-    ("act: ", lambda x, v: _evaluate(x, act=None), (None,)),
+    ("policy: ", lambda x, v: _evaluate(x, act=v), (None, 3)),
     ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
     ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
     ("source: ", lambda x, v: mqe_jax.load_policy(v), (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)),
@@ -105,7 +105,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("seconds: ", lambda x, v: _record(x, seconds=v), (0, NAN, math.inf, -1, 1e-9, "x")),
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
     ("key: ", lambda x, v: _record(x, key=7), (None,)),
-    ("act: ", lambda x, v: _record(x, act=3), (None,)),
+    ("policy: ", lambda x, v: _record(x, act=3), (None,)),
     ("episodes: ", lambda x, v: recording.best([]), (None,)),
     ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
     ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),

@@ -311,8 +311,7 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     assert any(not np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
     policy = read_policy(whole / "seed1")
-    memory = policy.initial_memory(4)
-    result = evaluate(env, policy.act, 8, jax.random.PRNGKey(0), memory=memory, block=3)
+    result = evaluate(env, policy, 8, jax.random.PRNGKey(0), block=3)
     assert result.episode_length == 3.0 and -4.0 < result.average_step_reward < 0.0
     monkeypatch.setattr(Session, "moment", lambda self: None)  # the probe has no bodies
     session = Session(env, env, policy)

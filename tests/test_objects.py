@@ -262,7 +262,7 @@ def test_the_planner_wins(task: str, share: float) -> None:
 
     batch = VectorEnv(make(task, impl="c", num_envs=16), 16)
     plan = jax.vmap(scripted_policy(batch.env))
-    result = evaluate(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0), memory=())
+    result = evaluate(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0))
     assert result.to_dict()["success_rate"] >= share
 
 

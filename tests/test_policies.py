@@ -53,7 +53,7 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
     """32 episodes of the gate: within four standard errors of the rate on the card."""
     env = VectorEnv(make("go1gate", impl="c", num_envs=32), 32)
     policy = load_policy("go1gate", env.env)
-    result = evaluate(env, policy.act, 32, jax.random.PRNGKey(0), memory=policy.initial_memory(32))
+    result = evaluate(env, policy, 32, jax.random.PRNGKey(0))
     assert result.success_rate > zoo.card("go1gate").results["success"] - 4 * 0.02
 
 

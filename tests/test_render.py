@@ -34,8 +34,8 @@ def env() -> Any:
 
 @pytest.fixture(scope="module")
 def episode(env: Any) -> recording.Episode:
-    act = load_policy("forward", env).act
-    return recording.record(env, act, (), jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
+    policy = load_policy("forward", env)
+    return recording.record(env, policy, jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
 
 
 def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: Any, episode: recording.Episode) -> None:
@@ -360,6 +360,6 @@ def test_the_camera_of_every_task_shows_an_episode_of_its_policy(task: str) -> N
     env = make(task, impl="c")
     own = load_policy(task, env)
     policy = all_agents(env, own, own if len(env.teams) > 1 else None)
-    for episode in record(env, policy.act, policy.initial_memory(4), jax.random.PRNGKey(1), episodes=4):
+    for episode in record(env, policy, jax.random.PRNGKey(1), episodes=4):
         for view in ("follow", "near"):
             check(env, episode.cut(slice(None, None, 4)), view)

@@ -317,7 +317,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     assert policy.metadata["task"] == "probe"
     with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
         policy.act(np.zeros((3, 3, 2)), memory)
-    result = evaluate(PROBE, policy.act, 8, jax.random.PRNGKey(0), memory=policy.initial_memory(4))
+    result = evaluate(PROBE, policy, 8, jax.random.PRNGKey(0))
     assert result.episodes == 8 and result.episode_length == 4.0
 
 
@@ -357,7 +357,5 @@ def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
     assert training.all[0].action.shape == (4, 4, 2, 1) and training.all[0].diverged.shape == (4, 4)
     # The environment gets unbounded samples, which it clips to what it allows.
     assert max(float(np.abs(trace.action).max()) for trace in training.all) > 1.0
-    evaluate(
-        PROBE, read_policy(tmp_path).act, 4, KEY, memory=read_policy(tmp_path).initial_memory(4), recorder=evaluation
-    )
+    evaluate(PROBE, read_policy(tmp_path), 4, KEY, recorder=evaluation)
     assert evaluation.all[0].snapshot.shape == (50, 4)

@@ -167,7 +167,7 @@ def measure(task: str) -> dict[str, Any]:
     env = make(task, impl="c", num_envs=EPISODES)
     opponent = load_policy("scripted", env) if isinstance(env, Match) else None
     policy = all_agents(env, load_policy(task, env), opponent)
-    episodes = record(env, policy.act, policy.initial_memory(EPISODES), jax.random.PRNGKey(1), episodes=EPISODES)
+    episodes = record(env, policy, jax.random.PRNGKey(1), episodes=EPISODES)
     chosen = [episode for episode in episodes if episode.success > 0 or task == "go1sheep-hard"]
     rows = [MEASURES[task](env, episode) for episode in chosen]
     means = {name: round(float(np.mean([row[name] for row in rows])), 3) for name in rows[0]}

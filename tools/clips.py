@@ -31,8 +31,7 @@ def write(task: str) -> None:
     """Writes a task's clip, from a fixed camera."""
     env = make(task, impl="c", num_envs=EPISODES)
     policy = all_agents(env, load_policy(task, env), load_policy("scripted", env) if len(env.teams) > 1 else None)
-    memory = policy.initial_memory(EPISODES)
-    episode = typical(record(env, policy.act, memory, jax.random.PRNGKey(0), episodes=EPISODES))
+    episode = typical(record(env, policy, jax.random.PRNGKey(0), episodes=EPISODES))
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
     shown = episode.cut(slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt))))
     views = cameras(rendering_model(env.mj_model, shown), shown, "near", SIZE[0] / SIZE[1])

@@ -101,12 +101,7 @@ class Eval(PolicyOptions):
         env, vector_env, policy = self.environments(num_envs)
         recorder = None if self.dump_diverged is None else DivergenceRecorder(env, self.dump_diverged)
         result = evaluation.evaluate(
-            vector_env,
-            policy.act,
-            self.episodes,
-            jax.random.PRNGKey(self.seed),
-            memory=policy.initial_memory(num_envs),
-            recorder=recorder,
+            vector_env, policy, self.episodes, jax.random.PRNGKey(self.seed), recorder=recorder
         )
         if recorder is not None:
             recorder.report()

@@ -69,10 +69,8 @@ def demo(arguments: Demo) -> None:
 
 def _measure(env: VectorEnv, policy: TrainedPolicy, episodes: int, config: TrainConfig) -> dict[str, Any]:
     """Evaluates a policy with its mean actions."""
-    memory = policy.initial_memory(env.num_envs)
-    act = dataclasses.replace(policy, deterministic=True).act
-    key = jax.random.PRNGKey(config.seed + 1000)
-    return evaluation.evaluate(env, act, episodes, key, memory=memory).to_dict()
+    mean = dataclasses.replace(policy, deterministic=True)
+    return evaluation.evaluate(env, mean, episodes, jax.random.PRNGKey(config.seed + 1000)).to_dict()
 
 
 def _summary(result: Mapping[str, Any]) -> str:

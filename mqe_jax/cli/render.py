@@ -69,8 +69,7 @@ def draw(
     from mqe_jax.viz import recording
     from mqe_jax.viz import render as rendering
 
-    memory = policy.initial_memory(episodes)
-    recorded = recording.record(env, policy.act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
+    recorded = recording.record(env, policy, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
     best = recording.best(recorded)
     renderer = rendering.render_episode(env, best, path, **options)
     return {

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,20 @@ import numpy as np
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.settings import check, checked
-from mqe_jax.train.types import AnyBatch, Memory, RandomKey, Recorder, TraceStep, VectorEnv, join_traces, teams_of
+from mqe_jax.train.types import (
+    AnyBatch,
+    Memory,
+    PolicyOrAct,
+    RandomKey,
+    Recorder,
+    TraceStep,
+    VectorEnv,
+    join_traces,
+    teams_of,
+)
+
+if TYPE_CHECKING:
+    from mqe_jax.train.policy import Policy
 
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
@@ -68,10 +81,10 @@ class _Progress(NamedTuple):
     """Sums over the last steps of counted episodes (N,) each."""
 
 
-@checked(env=AnyBatch, act=Callable, episodes=Episodes, key=RandomKey)
+@checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
 def evaluate(
     env: VectorEnv,
-    act: Act,
+    policy: Policy | Act,
     episodes: int,
     key: jax.Array,
     *,
@@ -87,10 +100,10 @@ def evaluate(
 
     Args:
         env: the environments.
-        act: the policy.
+        policy: the policy, or a function as its `act`.
         episodes: number of episodes.
         key: random key.
-        memory: initial recurrent state of `act`, leading axis N.
+        memory: initial recurrent state of a function, leading axis N; a policy brings its own.
         block: steps per compiled call.
         max_steps: limit on the steps of an environment.
         recorder: receives all steps, block by block.
@@ -98,6 +111,10 @@ def evaluate(
     Raises:
         InputError: for `episodes` < 1, or if the episodes do not end within `max_steps`.
     """
+
+    act = policy
+    if not callable(act):
+        act, memory = act.act, act.initial_memory(env.num_envs)
 
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)

@@ -38,12 +38,20 @@ def _batch(value: Any) -> Any:
     return value
 
 
+def _policy(value: Any) -> Any:
+    if not callable(value) and not all(hasattr(value, name) for name in ("act", "initial_memory")):
+        raise ValueError("a policy, such as that of mqe_jax.load_policy, or a function act(obs, memory, key)")
+    return value
+
+
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
 """Kind of an argument that is a random key (see `mqe_jax.settings.checked`)."""
 AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]
 """Kind of an argument that is one environment or a batch."""
 AnyBatch = Annotated[Any, pydantic.AfterValidator(_batch)]
 """Kind of an argument that is a batch of environments."""
+PolicyOrAct = Annotated[Any, pydantic.AfterValidator(_policy)]
+"""Kind of an argument that is a policy or its function `act`."""
 
 Teams = tuple[tuple[int, ...], ...]
 """Agents of each team; every agent belongs to exactly one."""

@@ -12,6 +12,7 @@ import jax
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.evaluate import Act
+from mqe_jax.train.policy import Policy
 from mqe_jax.viz.recording import Episode, best, record
 from mqe_jax.viz.render import render_episode
 
@@ -31,15 +32,8 @@ def clip(env: QuadrupedEnv, episode: Episode, size: tuple[int, int] = (480, 270)
 
 
 def play(
-    env: QuadrupedEnv,
-    act: Act,
-    memory: Any = (),
-    *,
-    episodes: int = 1,
-    seconds: float = 20.0,
-    seed: int = 0,
-    **options: Any,
+    env: QuadrupedEnv, policy: Policy | Act, *, episodes: int = 1, seconds: float = 20.0, seed: int = 0, **options: Any
 ) -> Any:
-    """Runs episodes under a batched policy, as `record`, and returns the best one as `clip`, with its options."""
-    recorded = record(env, act, memory, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
+    """Runs episodes under a policy of all agents, as `record`, and returns the best one as `clip`, with its options."""
+    recorded = record(env, policy, jax.random.PRNGKey(seed), episodes=episodes, seconds=seconds)
     return clip(env, best(recorded), **options)

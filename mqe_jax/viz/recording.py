@@ -1,6 +1,5 @@
 """Recording of episodes as numpy arrays."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,8 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.settings import checked, fail
 from mqe_jax.train.evaluate import Act
-from mqe_jax.train.types import RandomKey
+from mqe_jax.train.policy import Policy
+from mqe_jax.train.types import PolicyOrAct, RandomKey
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,15 @@ class Episode:
         return Episode(*poses, dt=self.dt * (frames.step or 1), **rest)
 
 
-@checked(act=Callable, key=RandomKey, episodes=Candidates, seconds=ClipLength)
+@checked(policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
 def record(
-    env: QuadrupedEnv, act: Act, memory: Any, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
+    env: QuadrupedEnv, policy: Policy | Act, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
 ) -> list[Episode]:
     """Records one episode in each of several environments, without automatic reset.
 
     Args:
         env: the task.
-        act: the policy, batched over the episodes.
-        memory: initial recurrent state of the policy, batched likewise.
+        policy: the policy of all agents, or a function as its `act`, batched over the episodes.
         key: random key.
         episodes: number of environments.
         seconds: time limit of an episode; otherwise its last frame is that of the termination or truncation.
@@ -62,6 +61,7 @@ def record(
     if 4 * numbers > CLIP_BYTES:
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     length = 50
+    act, memory = (policy, ()) if callable(policy) else (policy.act, policy.initial_memory(episodes))
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
