@@ -24,6 +24,7 @@ from mqe_jax.settings import override
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
+from mqe_jax.train.monitor import Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
@@ -243,7 +244,10 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
         best = max(record["evaluations"], key=lambda e: e["sampled"]["average_step_reward"])
         assert record["absolute"]["env_steps"] == best["env_steps"]
         (policy,) = (folder / "best").glob("*.safetensors")
-        assert read_policy(policy).metadata["env_steps"] == best["env_steps"]
+        chosen = read_policy(policy)
+        assert chosen.metadata["env_steps"] == best["env_steps"]
+        (again,) = Monitor(PROBE, configs[0]).evaluate([chosen], [best["env_steps"]], 40, absolute=True)
+        assert record["absolute"]["sampled"] == again["sampled"]
         assert best["deterministic"]["average_step_reward"] != best["sampled"]["average_step_reward"]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Episodes, Horizon, PositiveInt
-from mqe_jax.settings import check, checked
+from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.types import (
     AnyBatch,
     Memory,
@@ -81,6 +81,16 @@ class _Progress(NamedTuple):
     """Sums over the last steps of counted episodes (N,) each."""
 
 
+def acting(policy: Policy | Act, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
+    """Returns the function of a policy, or a function itself, and its initial recurrent state."""
+    either: Any = policy
+    if not hasattr(either, "act"):
+        return either, memory
+    if jax.tree.leaves(memory):
+        fail("memory", "an array", "() for a policy, which brings its own")
+    return either.act, either.initial_memory(num_envs)
+
+
 @checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
 def evaluate(
     env: VectorEnv,
@@ -100,7 +110,7 @@ def evaluate(
 
     Args:
         env: the environments.
-        policy: the policy, or a function as its `act`.
+        policy: the policy of team 0, or a function as its `act`.
         episodes: number of episodes.
         key: random key.
         memory: initial recurrent state of a function, leading axis N; a policy brings its own.
@@ -109,12 +119,9 @@ def evaluate(
         recorder: receives all steps, block by block.
 
     Raises:
-        InputError: for `episodes` < 1, or if the episodes do not end within `max_steps`.
+        InputError: for `episodes` < 1, a policy with a `memory` too, or episodes that do not end within `max_steps`.
     """
-
-    act = policy
-    if not callable(act):
-        act, memory = act.act, act.initial_memory(env.num_envs)
+    act, memory = acting(policy, env.num_envs, memory)
 
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)

@@ -78,7 +78,7 @@ class Monitor:
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
         # The same random keys for every policy and training step, to reduce the variance of comparisons.
         key = jax.random.PRNGKey(self._config.seed)
-        keys = jnp.tile(jax.random.fold_in(key, 1) if absolute else key, (2 * len(policies), 1))
+        keys = jnp.tile(jax.random.fold_in(key, 2) if absolute else key, (2 * len(policies), 1))
         results = self._evaluator((stacked, modes), episodes, keys)
         return [
             {

@@ -39,7 +39,8 @@ def _batch(value: Any) -> Any:
 
 
 def _policy(value: Any) -> Any:
-    if not callable(value) and not all(hasattr(value, name) for name in ("act", "initial_memory")):
+    whole = all(hasattr(value, name) for name in ("act", "initial_memory"))
+    if isinstance(value, type) or not (whole or callable(value)):
         raise ValueError("a policy, such as that of mqe_jax.load_policy, or a function act(obs, memory, key)")
     return value
 

@@ -10,7 +10,7 @@ import numpy as np
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.settings import checked, fail
-from mqe_jax.train.evaluate import Act
+from mqe_jax.train.evaluate import Act, acting
 from mqe_jax.train.policy import Policy
 from mqe_jax.train.types import PolicyOrAct, RandomKey
 
@@ -52,7 +52,7 @@ def record(
 
     Args:
         env: the task.
-        policy: the policy of all agents, or a function as its `act`, batched over the episodes.
+        policy: the policy of all agents, or a function as its `act` without recurrent state; batched over episodes.
         key: random key.
         episodes: number of environments.
         seconds: time limit of an episode; otherwise its last frame is that of the termination or truncation.
@@ -61,7 +61,7 @@ def record(
     if 4 * numbers > CLIP_BYTES:
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     length = 50
-    act, memory = (policy, ()) if callable(policy) else (policy.act, policy.initial_memory(episodes))
+    act, memory = acting(policy, episodes)
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
