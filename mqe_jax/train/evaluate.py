@@ -110,7 +110,7 @@ def evaluate(
 
     Args:
         env: the environments.
-        policy: the policy of team 0, or a function as its `act`.
+        policy: the policy of the environments' agents, or a function as its `act`.
         episodes: number of episodes.
         key: random key.
         memory: initial recurrent state of a function, leading axis N; a policy brings its own.
