@@ -17,7 +17,7 @@ from mqe_jax.envs.autoreset import KEPT, autoreset
 from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import PyTree
+from mqe_jax.train.types import PyTree, where_rows
 
 EPISODES = 128
 """Environments in which the demonstrator acts."""
@@ -98,9 +98,8 @@ class Demonstrated(VectorEnv):
             action, memory = policy.act(state.obs, memory, key)
             state = guide.step(state, action)
             done = state.terminated | state.truncated
-            keep = lambda start, now: jnp.where(done.reshape(-1, *(1,) * (now.ndim - 1)), start, now)  # noqa: E731
             decided = jnp.maximum(state.metrics["success"], state.metrics.get("team1/win", 0.0))
-            return (state, jax.tree.map(keep, first, memory)), (decided, done)
+            return (state, where_rows(done, first, memory)), (decided, done)
 
         def moment(carry: tuple[State, Any], keys: jax.Array) -> tuple[tuple[State, Any], PyTree]:
             carry, seen = jax.lax.scan(advance, carry, keys)

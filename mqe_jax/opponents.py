@@ -19,7 +19,7 @@ from mqe_jax.policies import load_opponent
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
-from mqe_jax.train.types import AnyBatch, Memory, PyTree
+from mqe_jax.train.types import AnyBatch, Memory, PyTree, where_rows
 
 OUTCOMES = ("win", "draw", "loss")
 """Outcomes of an episode for team 0, in the order of `Opponent.outcomes`."""
@@ -170,7 +170,7 @@ class Versus(OneTeam):
         """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
         done, ended = done[self._block(index)], ended[self._block(index)]
         first = self.opponents[index].initial_memory(self._size)
-        memory = jax.tree.map(lambda start, now: _where(done, start, now), first, opponent.memory)
+        memory = where_rows(done, first, opponent.memory)
         outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
         return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
 
@@ -299,11 +299,6 @@ def _act(policy: Policy, opponent: Opponent, obs: jax.Array, key: jax.Array) -> 
 
     def either() -> tuple[jax.Array, Any]:
         before = policy.act_with(opponent.before, obs, opponent.memory, key)
-        return jax.tree.map(lambda a, b: _where(opponent.waiting, a, b), before, now())
+        return where_rows(opponent.waiting, before, now())
 
     return jax.lax.cond(jnp.any(opponent.waiting), either, now)
-
-
-def _where(condition: jax.Array, yes: jax.Array, no: jax.Array) -> jax.Array:
-    """Selects along the leading axis: condition (B,) bool, yes and no (B, ...)."""
-    return jnp.where(condition.reshape(condition.shape + (1,) * (no.ndim - 1)), yes, no)

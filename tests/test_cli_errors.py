@@ -10,7 +10,7 @@ import pytest
 from fake_env import SMALL
 
 from mqe_jax import cli
-from mqe_jax.cli import bench, commands, setup
+from mqe_jax.cli import commands, setup
 from mqe_jax.cli.train import runner
 from mqe_jax.errors import NonFiniteError
 from mqe_jax.train.nn import mlp_init
@@ -24,7 +24,6 @@ BAD = {
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
     "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
     "sizes alone": (["bench", "go1gate", "--sizes", "8"], ["sizes", "--profile"]),
-    "profile's table": (["bench", "go1gate", "--profile", "--csv", "x.csv"], ["x.csv", "--json"]),
     "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
     "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
     "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),
@@ -71,7 +70,6 @@ BAD = {
     "task as a parameter of a run": (["train", "fake", "--set", "task=go1tug"], ["env.task: is not a task parameter"]),
     "self as a parameter": (["eval", "go1gate", "--set", "self=3"], ["self: unknown name (value 3)"]),
     "YAML: open list": (["bench", "go1gate", "--set", "gate_width=["], ["set: the value of 'gate_width=['"]),
-    "table in a pipe": (["bench", "fake", "--csv", "fifo"], ["csv: fifo: cannot be read (not a regular file)"]),
     "policy in a pipe": (["eval", "fake", "--policy", "./fifo"], ["not a regular file"]),
     "settings in a pipe": (["train", "fake", "--config", "./fifo.yaml"], ["fifo.yaml"]),
     "recording in a pipe": (["replay", "./fifo"], ["not a regular file"]),
@@ -122,17 +120,6 @@ def test_wrong_flags_are_named_by_tyro(
     shown = " ".join(err.replace("│", " ").split())
     assert out == "" and len(err) < 4000 and all(word in shown for word in said), shown
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_table_that_cannot_be_appended_to_is_refused_before_measuring(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(bench, "bench", lambda *arguments, **settings: pytest.fail("measured"))
-    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    for path, words in (("/proc/none/x.csv", "cannot be written"), ("other.csv", "has other columns"), (".", "read")):
-        assert cli.main(["bench", "fake", "--csv", path]) == 2
-        err = capfd.readouterr().err
-        assert err.startswith("mqe: csv: ") and words in err
 
 
 def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from statistics import median
 from typing import Any
 
@@ -15,22 +12,6 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
-from mqe_jax.errors import InputError
-from mqe_jax.files import append, check_folder, read_rows
-
-COLUMNS: tuple[str, ...] = (
-    "task",
-    "impl",
-    "num_envs",
-    "env_steps_per_s",
-    "bare_env_steps_per_s",
-    "ratio",
-    "compile_s",
-    "overflow",
-    "device",
-    "jax",
-)
-"""Names of the results, in order."""
 
 
 def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, float, Any]:
@@ -110,24 +91,3 @@ def device_name() -> str:
         return device.device_kind
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"{cores} CPU cores"
-
-
-def check_csv(path: Path) -> None:
-    """Creates the folder of a table of measurements, and raises an InputError where the table has other columns."""
-    check_folder(path.parent, "csv")
-    try:
-        head = next(read_rows(path), []) if path.exists() else []
-    except InputError as error:
-        raise InputError(f"csv: {error}") from None
-    if head not in ([], list(COLUMNS)):
-        raise InputError(f"csv: {path} has other columns; it must have {', '.join(COLUMNS)}")
-
-
-def append_csv(path: Path, row: Mapping[str, Any]) -> None:
-    """Appends a row to a table of measurements."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    if not path.exists() or not path.stat().st_size:
-        writer.writeheader()
-    writer.writerow(row)
-    append(path, text.getvalue().encode())

@@ -175,8 +175,6 @@ class Bench(TaskOptions):
     repeats: Horizon = 5
     """Number of timed calls; the median is reported."""
     seed: Seed = 0
-    csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Append the results as a row to this file."""
     profile: bool = False
     """Also measure what an environment step and a training update consist of: physics, walk policy (control),
     observation and reward (task), reset, learner and idle time; kernels, contacts, compilation and memory."""
@@ -193,19 +191,13 @@ class Bench(TaskOptions):
 
         if not self.profile and (self.sizes or self.output):
             raise InputError("sizes and output need --profile")
-        if self.profile and self.csv is not None:
-            raise InputError(f"csv: {self.csv} is not allowed with --profile; use --json")
         if self.profile:
             from mqe_jax.cli.profile import run
 
             return run(self)
-        if self.csv is not None:
-            bench.check_csv(self.csv)  # before the measurement, which would be lost
         env, vector_env = setup.make_env(self.task, self.impl, self.overrides(), self.num_envs)
         key = jax.random.PRNGKey(self.seed)
         result = bench.bench(env, vector_env, key, steps=self.steps, repeats=self.repeats)
-        if self.csv is not None:
-            bench.append_csv(self.csv, result)
         if not self.json:
             print_table(result)
         return result

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mqe_jax.envs.wrappers import Wrapper
 from mqe_jax.train import devices
+from mqe_jax.train.types import where_rows
 
 
 class BothSides(Wrapper):
@@ -61,4 +62,4 @@ class BothSides(Wrapper):
     def _exchanged(self, x: jax.Array) -> jax.Array:
         """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A, ...)."""
         other = jnp.roll(x, self.num_agents // 2, axis=1)
-        return jnp.where(self._changed().reshape(-1, *(1,) * (x.ndim - 1)), other, x)
+        return where_rows(self._changed(), other, x)

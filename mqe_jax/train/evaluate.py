@@ -26,6 +26,7 @@ from mqe_jax.train.types import (
     VectorEnv,
     join_traces,
     teams_of,
+    where_rows,
 )
 
 if TYPE_CHECKING:
@@ -214,15 +215,12 @@ def _run_block(
         counted = p.finished < quota
         trace = () if trace_step is None else trace_step(p.env_state, action, state)
 
-        def restart(now: jax.Array, at_start: jax.Array) -> jax.Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), at_start, now)
-
         step_sums = {n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()}
         end_sums = {n: s + jnp.where(counted & done, state.metrics[n], 0.0) for n, s in p.end_sums.items()}
         return (
             _Progress(
                 env_state=state,
-                memory=jax.tree.map(restart, memory, initial_memory),
+                memory=where_rows(done, initial_memory, memory),
                 finished=p.finished + (counted & done),
                 steps=p.steps + counted,
                 returns=p.returns + jnp.where(counted, jnp.mean(state.reward[:, own], axis=-1), 0.0),

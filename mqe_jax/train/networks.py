@@ -26,7 +26,7 @@ from mqe_jax.errors import nearest
 from mqe_jax.limits import NonNegativeInt, PositiveInt
 from mqe_jax.settings import build, fail, record
 from mqe_jax.train import nn
-from mqe_jax.train.types import Memory, NetworkMemory, Params
+from mqe_jax.train.types import Memory, NetworkMemory, Params, where_rows
 
 
 class EnvDims(NamedTuple):
@@ -148,8 +148,4 @@ def network_settings(value: Any) -> Any:
 
 def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
     """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
-
-    def zero(leaf: jax.Array) -> jax.Array:
-        return jnp.where(is_first.reshape(is_first.shape + (1,) * (leaf.ndim - is_first.ndim)), 0.0, leaf)
-
-    return jax.tree.map(zero, memory)
+    return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)

@@ -13,18 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.opponents import OUTCOMES
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import VectorEnv
+from mqe_jax.train.types import VectorEnv, where_rows
 from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")
 """Teleoperation commands: m/s, m/s, rad/s."""
 HOLD_TIME = 0.35
 """Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
-
-
-OUTCOMES = ("win", "draw", "loss")
-"""Outcomes of an episode of a match for team 0."""
 
 
 @dataclass(frozen=True)
@@ -192,11 +189,7 @@ class Session:
             commands = applied(action)[..., env.controller.skill.index(DRIVEN)]
         state = self._vector_env.step(state, action)
         done = state.terminated | state.truncated
-
-        def restart(now: jax.Array, first: jax.Array) -> jax.Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (now.ndim - 1)), first, now)
-
-        memory = jax.tree.map(restart, memory, self._first_memory)
+        memory = where_rows(done, self._first_memory, memory)
         names = [name for name in state.metrics if name.startswith("reward/")]
         rewards = jnp.stack([state.metrics[name] for name in (*names, "average_step_reward")], axis=-1)
         names = [name if name in state.metrics else f"team0/{name}" for name in self.outcomes]

@@ -103,7 +103,6 @@ READERS: dict[str, list[str]] = {
     "a.jit": ["walk", "convert", "a.jit", "a.jit", "-o", "w.safetensors"],
     "a.npz": ["replay", "a.npz"],
     "run/config.yaml": ["eval", "run", "--episodes", "2"],
-    "table.csv": ["bench", "fake", "--csv", "table.csv", "--num-envs", "2", "--steps", "1", "--repeats", "1"],
 }
 """The command that reads each file."""
 
@@ -119,7 +118,6 @@ def file_cases() -> st.SearchStrategy[Any]:
         "walk.safetensors": inputs.damaged(policy) | inputs.tensors_file(policy),
         "a.jit": inputs.script_archive(inputs.small_archive()),
         "a.npz": st.binary(max_size=99) | inputs.damaged(inputs.small_archive()),
-        "table.csv": st.binary(max_size=99) | _encoded(st.text(max_size=50)),
     }
 
     @st.composite
