@@ -212,6 +212,20 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
     assert [policy for policy, _ in played[::2]] == [str(run_folder), "go1gate", "forward"]
 
 
+def test_set_keeps_the_other_parameters_of_a_run(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    config = override(setup.run_config(str(run_folder)), {"env": {"rewards": {"collision": -5.0}}})
+    monkeypatch.setattr(setup, "run_config", lambda target: config)
+
+    def make_env(task: str, impl: str, overrides: Any, num_envs: int) -> None:
+        made.append(overrides)
+        raise InputError("stop")
+
+    monkeypatch.setattr(setup, "make_env", make_env)
+    assert cli.main(["eval", str(run_folder), "--set", "rewards={success: 9}", "--set", "rewards={approach: 1}"]) == 2
+    assert made == [{"rewards": {"collision": -5.0, "success": 9, "approach": 1}}]
+
+
 def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
     env: Any = FakeEnv()
     obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs

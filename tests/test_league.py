@@ -339,7 +339,7 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
     assert make(task, impl="c", num_envs=1, **config.training_env).params.frozen_time == 0
     override(config, {"evaluation": {"every": 50}})  # its episodes are shared by the fixed opponents
     if task == "go1wrestling":
-        assert dict(config.train_env) == {"frozen_time": 0.0, "rewards.push": 3.0, "rewards.approach": 1.0}
+        assert dict(config.train_env) == {"frozen_time": 0.0, "rewards": {"push": 3.0, "approach": 1.0}}
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
 
 
