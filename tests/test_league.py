@@ -369,6 +369,13 @@ def test_a_round_robin_names_what_is_wrong() -> None:
         tournament.round_robin(matches(), nothing, KEY)
 
 
+@pytest.mark.parametrize("params", [{"control": "position"}, {"commands": ["vx", "yaw_rate"]}])
+def test_where_the_scripted_policy_does_not_fit_the_anchor_is_an_idle_team(params: dict[str, Any]) -> None:
+    assert setup.anchors(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == ["idle", "random"]
+    changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
+    assert setup.environments("c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1)[1] is not None
+
+
 def test_a_tournament_meets_every_pair_on_both_sides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,7 +12,7 @@ import jax
 
 from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
-from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
@@ -145,7 +145,8 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
 
 def anchors(env: QuadrupedEnv) -> list[str]:
     """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
-    return [*(["scripted"] if env.name in PLANNERS and env.control == "command" else []), "idle", "random"]
+    walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
+    return [*(["scripted"] if env.name in PLANNERS and walking else []), "idle", "random"]
 
 
 def platform() -> str:
