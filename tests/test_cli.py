@@ -256,6 +256,20 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
     assert walk == override(WALK, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0, "num_envs": 16})
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--run-dir go1tug go1gate",
+        "--curriculum.no-backward go1gate --run_dir go1tug",
+        "--start go1tug --resume go1gate",
+    ],
+)
+def test_a_task_that_a_flag_names_is_not_the_one_to_train(words: str) -> None:
+    parsed, alone = parse_train(words.split()), parse_train(["go1gate"]).settings
+    assert parsed.target == "go1gate"
+    assert override(parsed.settings, {"start": None, "curriculum.backward": alone.curriculum.backward}) == alone
+
+
 def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken"
     broken.mkdir()
