@@ -67,6 +67,13 @@ def test_every_training_setting_has_a_flag_with_its_default(capfd: pytest.Captur
     assert "--network.hidden-sizes" in out and "--seed" in out
 
 
+def test_help_names_all_that_is_accepted(capfd: pytest.CaptureFixture[str]) -> None:
+    for command, said in (("eval", "TASK|RUN|FILE"), ("eval", "policy file"), ("train", "demo, league, tuned/TASK")):
+        with pytest.raises(SystemExit):
+            cli.main([command, "--help"])
+        assert said in " ".join(capfd.readouterr().out.replace("│", " ").split())
+
+
 def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
     names = {path.name for path in run_folder.iterdir()}
     assert {"config.yaml", "metrics.csv", "curve.png", "policy.safetensors", "checkpoints"} <= names

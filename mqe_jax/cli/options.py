@@ -61,8 +61,8 @@ class TaskOptions:
 class PolicyOptions(TaskOptions):
     """Options of a task and its policies."""
 
-    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
-    """Id of a task, or run folder."""
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN|FILE")]
+    """Id of a task, run folder, or policy file."""
     policy: PolicyName = None
     """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
     another scripted policy of the task, a task with a shipped policy, a run folder, or a policy file. Default: that of
