@@ -34,9 +34,7 @@ class Pillar(TerrainBlock):
     """Length of the pillar's sides, m."""
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
-        assert not isinstance(self.length, tuple)  # the track has interpolated ranges (easy, hard)
-        length = self.length
-        center = (start + length / 2, 0.0, track.wall_height / 2)
+        center = (start + self.length / 2, 0.0, track.wall_height / 2)
         return Layout(walls=(Wall(f"pillar{number}", center, (self.side, self.side, track.wall_height)),))
 
 

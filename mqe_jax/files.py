@@ -11,7 +11,9 @@ import re
 import shutil
 import stat
 import tempfile
+import time
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +27,9 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-_TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\.\w+)?")
+_HOST = f"{zlib.crc32(os.uname().nodename.encode()):08x}"
+_TEMPORARY = re.compile(r"\..+?(?:\.([0-9a-f]{8}))?\.(\d+)\.tmp(?:\.\w+)?")  # host, process
+_ABANDONED = 3600.0  # s after its last change another host's temporary file counts as left
 _TAGS = {f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")}
 _locks: dict[Path, int] = {}  # folders that this process has locked, with the handle of each
 
@@ -39,7 +43,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     The temporary file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    temporary = temporary_name(path)
     check_locks(path)
     interrupts.temporaries.add(temporary)
     try:
@@ -94,13 +98,22 @@ def check_locks(path: Path) -> None:
             raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
 
 
+def temporary_name(path: Path) -> Path:
+    """Returns the name under which this process writes a file or folder, as `remove_temporaries` knows it."""
+    return path.with_name(f".{path.stem}.{_HOST}.{os.getpid()}.tmp{path.suffix}")
+
+
 def remove_temporaries(folder: Path) -> None:
-    """Removes the temporary files and folders that processes which have ended left in a folder."""
+    """Removes the temporary files and folders that processes which have ended left in a folder.
+
+    Whether one of another host has ended is not known here: what it left goes an hour after its last change.
+    """
     for path in folder.glob(".*.tmp*"):
         match = _TEMPORARY.fullmatch(path.name)
-        if match and path not in interrupts.temporaries and not _alive(int(match[1])):
+        if match and path not in interrupts.temporaries and not _alive(int(match[2])):
             with contextlib.suppress(OSError):
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                if match[1] == _HOST or time.time() - path.stat().st_mtime > _ABANDONED:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _alive(process: int) -> bool:

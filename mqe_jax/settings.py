@@ -175,12 +175,27 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
     """Returns a record with fields replaced, given as in `build`.
 
     A nested record with a `name` field (a choice among several records) is replaced as a whole where the changes
-    name another one; mappings that are not records are merged.
+    name another one; mappings that are not records are `joined`.
 
     Raises:
         InputError: as `build`.
     """
     return type(settings)(**_merged(settings, _nested(type(settings), changes)))
+
+
+def joined(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
+    """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
+
+    InputError where one is nested more than `depth` deep.
+    """
+    both: dict[str, Any] = {}
+    for key, value in (*first.items(), *second.items()):
+        name, dot, rest = str(key).partition(".")
+        value = {rest: value} if dot else value
+        if isinstance(value, Mapping) and not depth:
+            fail(name, value, f"nested at most {limits.DEPTH} deep")
+        both[name] = joined(_fields(both.get(name)), value, depth - 1) if isinstance(value, Mapping) else value
+    return both
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
@@ -278,23 +293,17 @@ def _boolean(value: Any) -> bool:
 
 
 def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values with dotted names resolved into mappings, and records among them as mappings where merged."""
+    """Returns values with dotted names resolved into mappings."""
     if not isinstance(values, Mapping):
         fail(kind.__name__, values, "a mapping of names to values")
-    nested: dict[str, Any] = {}
-    for key, value in values.items():
-        name, dot, rest = str(key).partition(".")
-        if dot:
-            value = {rest: value}
-        if isinstance(nested.get(name), Mapping) and isinstance(value, Mapping):
-            value = {**nested[name], **value}
-        nested[name] = value
-    hints = hints_of(kind)
-    for name, value in nested.items():
-        inner = _record_in(hints.get(name))
-        if inner is not None and isinstance(value, Mapping):
-            nested[name] = _nested(inner, value)
-    return nested
+    return joined({}, values)
+
+
+def _fields(value: Any) -> Mapping[str, Any]:
+    """Returns a mapping, or a record as one; empty for another value."""
+    if is_record(value):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return value if isinstance(value, Mapping) else {}
 
 
 def _record_in(hint: Any) -> Any:
@@ -306,14 +315,14 @@ def _record_in(hint: Any) -> Any:
 
 def _merged(settings: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a record's fields as keyword arguments, with the changes merged in."""
-    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    values = dict(_fields(settings))
     for name, change in changes.items():
         now = values.get(name)
         if isinstance(change, Mapping) and is_record(now):
             renamed = "name" in change and change["name"] != getattr(now, "name", None)
-            change = dict(change) if renamed else _merged(now, _nested(type(now), change))
+            change = dict(change) if renamed else _merged(now, change)
         elif isinstance(change, Mapping) and isinstance(now, Mapping):
-            change = {**now, **change}
+            change = joined(now, change)
         values[name] = change
     return values
 

@@ -67,6 +67,13 @@ def test_every_training_setting_has_a_flag_with_its_default(capfd: pytest.Captur
     assert "--network.hidden-sizes" in out and "--seed" in out
 
 
+def test_help_names_all_that_is_accepted(capfd: pytest.CaptureFixture[str]) -> None:
+    for command, said in (("eval", "TASK|RUN|FILE"), ("eval", "policy file"), ("train", "demo, league, tuned/TASK")):
+        with pytest.raises(SystemExit):
+            cli.main([command, "--help"])
+        assert said in " ".join(capfd.readouterr().out.replace("│", " ").split())
+
+
 def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
     names = {path.name for path in run_folder.iterdir()}
     assert {"config.yaml", "metrics.csv", "curve.png", "policy.safetensors", "checkpoints"} <= names
@@ -205,6 +212,20 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
     assert [policy for policy, _ in played[::2]] == [str(run_folder), "go1gate", "forward"]
 
 
+def test_set_keeps_the_other_parameters_of_a_run(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    config = override(setup.run_config(str(run_folder)), {"env": {"rewards": {"collision": -5.0}}})
+    monkeypatch.setattr(setup, "run_config", lambda target: config)
+
+    def make_env(task: str, impl: str, overrides: Any, num_envs: int) -> None:
+        made.append(overrides)
+        raise InputError("stop")
+
+    monkeypatch.setattr(setup, "make_env", make_env)
+    assert cli.main(["eval", str(run_folder), "--set", "rewards={success: 9}", "--set", "rewards={approach: 1}"]) == 2
+    assert made == [{"rewards": {"collision": -5.0, "success": 9, "approach": 1}}]
+
+
 def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
     env: Any = FakeEnv()
     obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs
@@ -233,6 +254,20 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
         ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--num-envs", "16"]
     ).settings
     assert walk == override(WALK, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0, "num_envs": 16})
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--run-dir go1tug go1gate",
+        "--curriculum.no-backward go1gate --run_dir go1tug",
+        "--start go1tug --resume go1gate",
+    ],
+)
+def test_a_task_that_a_flag_names_is_not_the_one_to_train(words: str) -> None:
+    parsed, alone = parse_train(words.split()), parse_train(["go1gate"]).settings
+    assert parsed.target == "go1gate"
+    assert override(parsed.settings, {"start": None, "curriculum.backward": alone.curriculum.backward}) == alone
 
 
 def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -99,6 +99,7 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd:
         (["eval", "fake", "--episodes", "0"], ["episodes: 0", "greater than 0"]),
         (["eval", "fake", "--seed", "-1"], ["seed: -1 is not allowed", "greater than or equal to 0"]),
         (["render", "fake", "-o", "a.png", "--width", "5000"], ["width: 5000", "less than or equal to 4096"]),
+        (["render", "fake", "-o", "a.png", "--width", "26"], ["width: 26", "greater than or equal to 27"]),
         (["train", "fake", "--num-seeds", "0"], ["num_seeds: 0", "greater than 0"]),
         (["view", "go1gate", "--num-envs", "17"], ["num_envs: 17", "less than or equal to 16"]),
         (["view", "go1gate", "--port", "99999"], ["port: 99999", "less than 65536"]),

@@ -341,6 +341,16 @@ def test_a_divergence_is_recorded_and_replayed(tmp_path: Any) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["diverged.npz"]
 
 
+def test_a_recording_holds_the_last_episode_whatever_its_first_step(
+    gate: QuadrupedEnv, fresh: State, tmp_path: Any
+) -> None:
+    actions = jnp.arange(6.0)[:, None, None] * jnp.ones((2, 12))
+    states = dataclasses.replace(trajectory(gate, fresh, actions), step=jnp.array([7, 8, 9, 3, 4, 5]))
+    replay.save_recording(tmp_path / "gate.npz", gate, states, actions)
+    recording = replay.load_recording(tmp_path / "gate.npz")
+    assert recording.states["step"].tolist() == recording.actions[:, 0, 0].tolist() == [3, 4, 5]
+
+
 def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: Any) -> None:
     with pytest.raises(InputError, match=r"none.npz: cannot be read"):
         replay.load_recording(tmp_path / "none.npz")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mqe_jax import cli
+from mqe_jax import cli, files
 from mqe_jax.cli import setup
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
@@ -132,7 +132,7 @@ pack._copy = copy
 pack.pack([folder / "study"], folder / "out", 1, 1.0)
 """
     seed, out = tmp_path / "study/runs/go1gate/mappo/seed0", tmp_path / "out"
-    (out / f".pack.{2**22 + 1}.tmp" / "sweeps").mkdir(parents=True)  # above the largest process number
+    (out / f".pack.{files._HOST}.{2**22 + 1}.tmp" / "sweeps").mkdir(parents=True)  # above the largest process number
     seed.mkdir(parents=True)
     (seed / "config.yaml").touch()
     process = run(body, tmp_path, tmp_path / "ready")

@@ -339,7 +339,7 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
     assert make(task, impl="c", num_envs=1, **config.training_env).params.frozen_time == 0
     override(config, {"evaluation": {"every": 50}})  # its episodes are shared by the fixed opponents
     if task == "go1wrestling":
-        assert dict(config.train_env) == {"frozen_time": 0.0, "rewards.push": 3.0, "rewards.approach": 1.0}
+        assert dict(config.train_env) == {"frozen_time": 0.0, "rewards": {"push": 3.0, "approach": 1.0}}
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
 
 
@@ -367,6 +367,13 @@ def test_a_round_robin_names_what_is_wrong() -> None:
         tournament.round_robin(nothing, {}, KEY)
     with pytest.raises(InputError, match="policies: None is not allowed"):
         tournament.round_robin(matches(), nothing, KEY)
+
+
+@pytest.mark.parametrize("params", [{"control": "position"}, {"commands": ["vx", "yaw_rate"]}])
+def test_where_the_scripted_policy_does_not_fit_the_anchor_is_an_idle_team(params: dict[str, Any]) -> None:
+    assert setup.anchors(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == ["idle", "random"]
+    changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
+    assert setup.environments("c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1)[1] is not None
 
 
 def test_a_tournament_meets_every_pair_on_both_sides(

@@ -186,6 +186,22 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
         TaskFunctions(SimpleNamespace(control="position"))  # type: ignore[arg-type]
 
 
+def test_no_policy_of_a_page_replaces_another(tmp_path: Path) -> None:
+    from mqe_jax import zoo
+
+    sources = ["go1gate"]
+    for name in ("a/seed0", "b/seed0", "v1.2", "v1.3", "shipped", "c/scripted", "x/b/seed0", "run.safetensors"):
+        file = tmp_path / name / "policy.safetensors" if not name.endswith(".safetensors") else tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(zoo.file_of("go1gate"), file)
+        sources.append(str(tmp_path / name))
+    last_two = ["seed0", "b/seed0", "v1.2", "v1.3", f"{tmp_path.name}/shipped", "c/scripted"]
+    with pytest.raises(InputError, match=r"^run: .*x/b/seed0' is not allowed; .* seed0 and b/seed0, which are taken"):
+        entries(sources)
+    (entry,) = entries([*sources[:7], sources[8], sources[1]])
+    assert list(entry.policies) == ["shipped", *last_two, "run", "scripted"]
+
+
 def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
     monkeypatch.setattr(libraries, "CACHE", tmp_path)
     (tmp_path / "mujoco-mujoco-3.14.0.tgz").write_bytes(b"something else")

@@ -194,6 +194,23 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
     assert env.mj_model.vis.global_.offwidth == before  # the model's own settings are left alone
 
 
+@pytest.mark.parametrize(
+    ("chosen", "tried"), [("", ["egl", "osmesa"]), ("glfw", ["egl", "osmesa"]), ("osmesa", ["osmesa"]), ("disable", [])]
+)
+def test_only_libraries_that_draw_without_a_window_are_tried(
+    chosen: str, tried: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[str] = []
+
+    def child(command: Any, *, env: dict[str, str], **options: Any) -> Any:
+        found.append(env["MUJOCO_GL"])
+        raise OSError
+
+    monkeypatch.setattr(render, "child", child)
+    monkeypatch.setenv("MUJOCO_GL", chosen)
+    assert render._working_backend.__wrapped__() is None and found == tried
+
+
 def test_a_broken_drawing_leaves_nothing_behind(tmp_path: Path) -> None:
     def frames() -> Any:
         yield np.zeros((8, 8, 3), np.uint8)

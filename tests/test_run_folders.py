@@ -6,6 +6,7 @@ import json
 import os
 import resource
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -109,14 +110,17 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
 
 
 def test_files_of_dead_processes_go_when_a_run_starts(tmp_path: Path) -> None:
-    """Those of processes that run, such as a clip that is being written, stay."""
+    """Those of processes that run, such as a clip that is being written, stay, and another host's for an hour."""
     dead = 2**22 + 1  # above the largest process number
     (tmp_path / "checkpoints").mkdir()
-    gone = [f".policy.{n}.tmp.safetensors" for n in (dead, os.getpid())]
-    gone += [f"checkpoints/.step_000000000016.{dead}.tmp.safetensors"]
-    kept = [f".clip.{os.getppid()}.tmp.mp4", ".hidden", "notes.tmp"]
+    gone = [f".policy.{files._HOST}.{n}.tmp.safetensors" for n in (dead, os.getpid())]
+    gone += [f"checkpoints/.step_000000000016.{files._HOST}.{dead}.tmp.safetensors", f".old.{dead}.tmp"]
+    kept = [f".clip.{files._HOST}.{os.getppid()}.tmp.mp4", ".hidden", "notes.tmp"]
+    kept += [f".policy.{host}{n}.tmp.safetensors" for n in (dead, os.getpid()) for host in ("", "00000000.")]
     for name in (*gone, *kept):
         (tmp_path / name).write_text("half")
+    then = time.time() - 3700
+    os.utime(tmp_path / gone[-1], (then, then))
     train(PROBE, SETTINGS, tmp_path)
     assert [name for name in (*gone, *kept) if (tmp_path / name).exists()] == kept
 
@@ -277,7 +281,7 @@ def test_parts_of_programs_that_a_killed_process_left_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    (tmp_path / ".jit_step-1-cache.999999999.tmp").write_bytes(b"half")
+    (tmp_path / f".jit_step-1-cache.{files._HOST}.999999999.tmp").write_bytes(b"half")
     (tmp_path / "jit_step-2-cache").write_bytes(b"whole")
     programs.write_whole()
     assert [path.name for path in tmp_path.iterdir()] == ["jit_step-2-cache"]

@@ -20,6 +20,7 @@ from mqe_jax.settings import (
     Range,
     build,
     fail,
+    joined,
     load_yaml,
     override,
     record,
@@ -69,7 +70,9 @@ class Derived(Outer):
         ({"span": [0, 1]}, {"span": (0.0, 1.0)}),
         ({"span": "none", "label": "none"}, {"span": None, "label": None}),
         ({"inner": {"clip": np.float32(0.5)}, "inner.gamma": 0.5}, {"inner": Inner(clip=0.5, gamma=0.5)}),
-        ({"free": {"a.b": 3}, "free.c.d": 4}, {"free": {"a.b": 3, "c.d": 4}}),
+        ({"free": {"a.b": 3}, "free.c.d": 4}, {"free": {"a": {"b": 3}, "c": {"d": 4}}}),
+        ({"free": {"a": {"b": 3}}, "free.a": {"c": 4}}, {"free": {"a": {"b": 3, "c": 4}}}),
+        ({"inner": Inner(clip=0.5), "inner.gamma": 0.5}, {"inner": Inner(clip=0.5, gamma=0.5)}),
     ],
 )
 def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
@@ -129,6 +132,30 @@ def test_overriding_merges_nested_records_and_free_mappings() -> None:
     assert first.free == {"a": 1}
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ({"a": {"b": 1}}, {"a": {"c": 2}}, {"a": {"b": 1, "c": 2}}),
+        ({"a": {"b": 1, "c": {"d": 1}}}, {"a.c.e": 2}, {"a": {"b": 1, "c": {"d": 1, "e": 2}}}),
+        ({"a.b": 1}, {"a": {"b": 2}}, {"a": {"b": 2}}),
+        ({"a": {"c": 1}, "a.b": 1}, {"a": {"b": 2}}, {"a": {"c": 1, "b": 2}}),
+        ({"a": 1}, {"a": {"b": 2}}, {"a": {"b": 2}}),
+        ({"a": {"b": 1}}, {"a": None}, {"a": None}),
+        ({"a": Inner(clip=0.5)}, {"a.gamma": 0.5}, {"a": {**vars(Inner(clip=0.5)), "gamma": 0.5}}),
+    ],
+)
+def test_the_second_of_two_mappings_replaces_only_what_it_names(first: Any, second: Any, expected: Any) -> None:
+    before = repr((first, second))
+    assert joined(first, second) == expected
+    assert override(Outer(free=first), {"free": second}).free == expected
+    assert repr((first, second)) == before
+
+
+def test_names_of_a_thousand_dots_are_refused() -> None:
+    with pytest.raises(InputError, match=r"^a: .* is not allowed; it must be nested at most 32 deep"):
+        build(Outer, {"free": {"a" + ".a" * 1000: 1}})
+
+
 def test_to_a_mapping_and_back(tmp_path: Path) -> None:
     made = Derived(sizes=(1, 2), inner=Inner(dual=3.0), free={"range": (0, np.float64(1.0))})
     mapping = to_mapping(made)
@@ -175,6 +202,13 @@ def test_there_and_back() -> None:
     text = yaml.safe_dump(to_mapping(config))
     assert build(TrainConfig, yaml.safe_load(text)) == config
     assert yaml.safe_load(text)["network"]["name"] == "actor_critic"
+
+
+def test_parameters_in_training_change_those_that_they_name() -> None:
+    config = build(TrainConfig, {"env": {"rewards": {"collision": -5}}, "train_env": {"rewards": {"approach": 10}}})
+    assert config.training_env == {"rewards": {"collision": -5, "approach": 10}}
+    for changes in ({"env": {"rewards": {"success": 9}}}, {"env.rewards.success": 9}, {"env": {"rewards.success": 9}}):
+        assert override(config, changes).env == {"rewards": {"collision": -5, "success": 9}}
 
 
 @pytest.mark.parametrize(

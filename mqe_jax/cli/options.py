@@ -61,8 +61,8 @@ class TaskOptions:
 class PolicyOptions(TaskOptions):
     """Options of a task and its policies."""
 
-    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
-    """Id of a task, or run folder."""
+    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN|FILE")]
+    """Id of a task, run folder, or policy file."""
     policy: PolicyName = None
     """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
     another scripted policy of the task, a task with a shipped policy, a run folder, or a policy file. Default: that of
@@ -94,7 +94,7 @@ class PolicyOptions(TaskOptions):
         name = task if shipped else self.policy or default
         if task not in (*TASKS, *zoo.names()) and (os.sep in self.target or Path(self.target).exists()):
             config = setup.run_config(self.target)
-            task, params, name = config.task, {**config.env, **params}, self.policy or self.target
+            task, params, name = config.task, settings.joined(config.env, params), self.policy or self.target
         env, vector_env = setup.make_env(task, self.impl, params, num_envs)
         own = load_policy(name, env, deterministic=self.deterministic)
         opponent = own if shipped and len(env.teams) > 1 else None

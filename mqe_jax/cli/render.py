@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mqe_jax.cli.options import Json, PolicyOptions, echo
-from mqe_jax.limits import Candidates, ClipLength, FrameRate, Pixels, Speed, Time
+from mqe_jax.limits import Candidates, ClipLength, FrameRate, ImageWidth, Speed, Time
 from mqe_jax.settings import record
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Render(PolicyOptions):
     """Number of episodes, of which the best is rendered (by success, then reward)."""
     seconds: ClipLength = 20.0
     """Maximum length of the clip, s."""
-    width: Annotated[Pixels | None, tyro.conf.arg(metavar="INT")] = None
+    width: Annotated[ImageWidth | None, tyro.conf.arg(metavar="INT")] = None
     """Image width, pixels (height follows at 16:9). Default: 960 for .mp4, 480 for .webp
     and .gif, 1280 for .png."""
     fps: Annotated[FrameRate | None, tyro.conf.arg(metavar="FLOAT")] = None

@@ -12,7 +12,7 @@ import jax
 
 from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
-from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest, shown
@@ -21,7 +21,7 @@ from mqe_jax.league.league import League
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_opponent, load_policy
-from mqe_jax.settings import Parameters, check, fail, load_yaml, override
+from mqe_jax.settings import Parameters, check, fail, joined, load_yaml, override
 from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
 from mqe_jax.train.learner import env_dims
@@ -32,12 +32,13 @@ CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
 
 def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     """Parses KEY=VALUE pairs, values as YAML; raises an InputError naming the malformed pair."""
-    values = {}
+    values: dict[str, Any] = {}
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals or not name.strip():
             raise InputError(f"set: {shown(pair)} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
-        values[name.strip().replace("-", "_")] = parse_yaml(text, f"set: the value of {shown(pair)}")
+        value = parse_yaml(text, f"set: the value of {shown(pair)}")
+        values = joined(values, {name.strip().replace("-", "_"): value})
     return values
 
 
@@ -144,7 +145,8 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
 
 def anchors(env: QuadrupedEnv) -> list[str]:
     """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
-    return [*(["scripted"] if env.name in PLANNERS and env.control == "command" else []), "idle", "random"]
+    walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
+    return [*(["scripted"] if env.name in PLANNERS and walking else []), "idle", "random"]
 
 
 def platform() -> str:

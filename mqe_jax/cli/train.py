@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import typing
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -21,10 +22,11 @@ from mqe_jax.envs.wrappers import WrappedState
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Seeds
 from mqe_jax.opponents import TeamState
-from mqe_jax.settings import override, record
+from mqe_jax.settings import is_record, override, record
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import check_alone, check_run, latest
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.networks import NETWORKS
 from mqe_jax.train.types import Trace
 from mqe_jax.viz import curves
 from mqe_jax.walk.task import WalkTask
@@ -39,8 +41,9 @@ class Source:
     """Where the settings come from that flags then change."""
 
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings, or the name of a shipped one: demo, tuned/TASK, paper/ALGORITHM. Default: the paper's
-    settings of --algorithm if given, else the task's tuned settings, else league (a match) or the paper's MAPPO."""
+    """YAML file of settings, or the name of a shipped one: demo, league, tuned/TASK, paper/ALGORITHM. Default: the
+    paper's settings of --algorithm if given, else the task's tuned settings, else league (a match) or the paper's
+    MAPPO."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
 
@@ -141,14 +144,34 @@ def parse_train(arguments: Sequence[str]) -> Train:
     """
     source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
     network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
-    task = next((word for word in others if word in (*TASKS, *ALIASES)), "")
-    settings = base_config(task, source.config, source.algorithm)
+    settings = base_config(_task(others), source.config, source.algorithm)
     if network.name is not None and network.name != settings.network.name:
         settings = override(settings, {"network": {"name": network.name}})
     if any(word.split("=")[0] == "--opponent" for word in others):  # tyro would append to those of the file
         settings = override(settings, {"opponents": ()})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=_MARKERS)
+
+
+def _task(words: Sequence[str]) -> str:
+    """Returns the first task's id that is not the value of a flag; empty without one."""
+    switches = {"help", *_switches(Train), *(name for network in NETWORKS.values() for name in _switches(network))}
+
+    def takes_value(word: str) -> bool:
+        name = word.split(".")[-1].replace("-", "_").lstrip("_").removeprefix("no_")
+        return word.startswith("--") and "=" not in word and name not in switches
+
+    pairs = zip(["", *words], words, strict=False)
+    return next((word for before, word in pairs if word in (*TASKS, *ALIASES) and not takes_value(before)), "")
+
+
+def _switches(kind: Any) -> Iterator[str]:
+    """Yields the names of a record's flags without a value, at any depth."""
+    for name, hint in typing.get_type_hints(kind).items():
+        if is_record(hint):
+            yield from _switches(hint)
+        elif hint is bool:
+            yield name
 
 
 def parse_walk_train(arguments: Sequence[str]) -> WalkTrain:

@@ -57,8 +57,8 @@ def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, a
         states: of one environment before each action (T, ...).
         actions: (T, A, D).
     """
-    starts = np.flatnonzero(np.asarray(states.step) == 0)
-    first = int(starts[-1]) if len(starts) else 0
+    steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
+    first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
     about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
     arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
     arrays |= {"about": np.array(json.dumps(about)), "actions": np.asarray(actions)[first:]}

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, 
 from mqe_jax.export.translate import Function
 from mqe_jax.files import write_atomically
 from mqe_jax.policies import check_policy, load_policy
+from mqe_jax.settings import fail
 from mqe_jax.train.policy import Policy, TrainedPolicy
 
 PAGE = Path(__file__).parent / "page"
@@ -108,7 +109,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     """Returns the tasks of a site; runs of one task with the same parameters share an entry."""
     playable = [task for task in TASKS if task in PLANNERS or task in zoo.names()]
     found: list[tuple[str, dict[str, Any], Entry]] = []
-    for source in sources or playable:
+    for source in dict.fromkeys(sources or playable):
         task, params, policies = _source(source, playable)
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
@@ -119,7 +120,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
             found.append((task, params, entry))
         for name, policy in policies.items():
             check_policy(policy, entry.env, source)
-            entry.policies[name] = policy
+            entry.policies[name if name == "shipped" else _short(Path(name), entry.policies)] = policy
     for task, _, entry in found:
         if task in PLANNERS and entry.env.params.commands == type(entry.env.params).commands:
             entry.policies.setdefault("scripted", load_policy("scripted", entry.env))
@@ -127,7 +128,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
 
 
 def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
-    """Returns the task, its parameters and the trained policy by name that a source stands for."""
+    """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a source stands for."""
     task = ALIASES.get(source, source)
     if os.sep not in source and (task in playable or not Path(source).exists()):
         if task not in playable:
@@ -137,7 +138,16 @@ def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], 
     policy = load_policy(source)
     if policy.task not in TASKS:
         raise InputError(f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}")
-    return policy.task, dict(policy.config.env), {Path(source).resolve().stem: policy}
+    return policy.task, dict(policy.config.env), {str(Path(source).resolve()): policy}
+
+
+def _short(path: Path, taken: Iterable[str]) -> str:
+    """Returns the name of a run on the page: the last part of its path, or the last two where that is taken."""
+    last = path.name if path.is_dir() else path.stem
+    names = (last, f"{path.parent.name}/{last}")
+    if free := [name for name in names if name not in {*taken, "shipped", "scripted", "idle"}]:
+        return free[0]
+    fail("run", str(path), f"a path whose last parts differ from {' and '.join(names)}, which are taken")
 
 
 def _title(entry: Entry) -> str:

@@ -7,7 +7,6 @@ the environments, which are reset where it resumes. `tar xzf FILE -C FOLDER` unp
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import tarfile
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,7 @@ from pathlib import Path
 
 from mqe_jax import interrupts, limits
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_file, check_folder, read_text, remove_temporaries
+from mqe_jax.files import check_file, check_folder, read_text, remove_temporaries, temporary_name
 from mqe_jax.settings import fail
 from mqe_jax.study.sweep import SWEEP_FILE
 from mqe_jax.train.checkpoint import copy_without, latest
@@ -72,7 +71,7 @@ def pack(folders: Sequence[Path], output: Path, parts: int, megabytes: float) ->
 @contextlib.contextmanager
 def _temporary(output: Path) -> Iterator[Path]:
     """Yields a new folder in `output`, removed at the end, when a signal ends the process, or else by the next call."""
-    folder = output / f".pack.{os.getpid()}.tmp"  # as `remove_temporaries` knows it
+    folder = temporary_name(output / "pack")
 
     def remove() -> None:
         for _ in range(3):  # while the main thread may still write to a run's copy

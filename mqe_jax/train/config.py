@@ -24,7 +24,7 @@ from mqe_jax.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.settings import Parameters, fail, load_yaml, override, record
+from mqe_jax.settings import Parameters, fail, joined, load_yaml, override, record
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
@@ -260,7 +260,7 @@ class TrainConfig:
     @property
     def training_env(self) -> dict[str, Any]:
         """Overrides of the task's parameters during training."""
-        return {**self.env, **self.train_env}
+        return joined(self.env, self.train_env)
 
     @property
     def steps_per_update(self) -> int:

@@ -53,11 +53,11 @@ def _working_backend() -> str | None:
     """Tries the GL libraries.
 
     Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
-    `MUJOCO_GL`, where set, is the only candidate.
+    `MUJOCO_GL`, where set, is the only candidate, but for `glfw`, which draws into windows.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
-    for name in [chosen] if chosen else ["egl", "osmesa"]:
-        if name not in ("egl", "osmesa", "glfw"):
+    for name in ["egl", "osmesa"] if chosen in ("", "glfw") else [chosen]:
+        if name not in ("egl", "osmesa"):
             return None
         environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": name}
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -79,7 +79,7 @@ def _gl_context(backend: str) -> Any:
 def load_gl() -> None:
     """Finds and loads the GL library, as a thread may do while an episode is computed."""
     backend = gl_backend()
-    if backend in ("egl", "osmesa"):
+    if backend is not None:
         with _probing:
             context = _gl_context(backend)(64, 64)
             context.make_current()
