@@ -10,6 +10,7 @@ import gc
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -346,7 +347,7 @@ def test_warp_takes_dense_jacobians_up_to_50_degrees_of_freedom(
 def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change() -> None:
     seen = []
 
-    def add(owner: Owner, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def add(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         seen.append((x.shape, y.dtype.name, x.flags.writeable))
         return x + y
 
@@ -357,7 +358,7 @@ def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change()
 
 
 def test_what_a_host_function_raises_ends_the_program() -> None:
-    def fail(owner: Owner, *arrays: np.ndarray) -> np.ndarray:
+    def fail(*arrays: np.ndarray) -> np.ndarray:
         raise KeyboardInterrupt
 
     owner = Owner()
@@ -365,14 +366,42 @@ def test_what_a_host_function_raises_ends_the_program() -> None:
         called(fail, 2, owner)(jnp.zeros((2, 3)), jnp.zeros((2, 3))).block_until_ready()
 
 
-def test_a_program_without_its_environment_says_so() -> None:
-    owner = Owner()
-    program = called(lambda owner, x, y: x + y, 3, owner).lower(jnp.zeros((1, 3)), jnp.zeros((1, 3))).compile()
-    np.testing.assert_array_equal(program(jnp.ones((1, 3)), jnp.ones((1, 3))), jnp.full((1, 3), 2.0))
+def test_a_program_outlives_its_environment() -> None:
+    """JAX still runs it when the caller has its result; the environment's buffers are freed."""
+    seen: list[Any] = []
+
+    def walk() -> Any:
+        env: Any = make("go1plane", impl="c", control="position")
+        seen[:] = weakref.ref(env.physics), env.physics._stepper
+
+        def run(key: jax.Array) -> jax.Array:
+            state = jax.vmap(env.reset)(jax.random.split(key, 3))
+            step, action = jax.vmap(env.step), jnp.zeros((3, 2, 12))
+            return jax.lax.scan(lambda state, _: (step(state, action), ()), state, None, 100)[0].data.qpos
+
+        return run
+
+    kept = walk()
+    expected = jax.jit(kept)(jax.random.PRNGKey(0)).block_until_ready()
+    assert sum(map(len, seen[1]._idle.values())) == 1
+    del kept
+    qpos = jax.jit(walk())(jax.random.PRNGKey(0))
+    gc.collect()
+    assert seen[0]() is None
+    np.testing.assert_array_equal(qpos, expected)
+    assert not any(seen[1]._idle.values())
+
+
+def test_a_program_of_an_environment_long_gone_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mqe_jax.engines.host_call._KEPT", 1)
+    owner, zeros = Owner(), jnp.zeros((1, 3))
+    program = called(lambda x, y: x + y, 3, owner).lower(zeros, zeros).compile()
     del owner
     gc.collect()
+    np.testing.assert_array_equal(program(zeros + 1.0, zeros), zeros + 1.0)
+    called(lambda x, y: x - y, 4, Owner())(zeros, zeros)
     with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="no longer exists"):
-        program(jnp.ones((1, 3)), jnp.ones((1, 3))).block_until_ready()
+        program(zeros, zeros).block_until_ready()
 
 
 SECOND_START = """
@@ -423,7 +452,7 @@ from mqe_jax.engines.host_call import host_call
 from mqe_jax.engines.mjx import WarpEngine
 class Owner: pass
 owner = Owner()
-def slow(owner, x):
+def slow(x):
     time.sleep(0.02)
     return x + 1
 shape = jax.ShapeDtypeStruct((300, 300), np.float32)

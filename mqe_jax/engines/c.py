@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import threading
+import weakref
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ from mqe_jax.robots.motors import CLAMP, Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
+_Rows = tuple[Motors, np.ndarray, np.ndarray]
 SHARE = 0.5  # share of idle environments above which steps without limits are worth trying
 
 
@@ -32,16 +35,15 @@ class CEngine(Engine):
 
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
-        self._model = model.__copy__()
+        own = model.__copy__()
         # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        content = np.zeros(mujoco.mj_sizeModel(self._model), np.uint8)
-        mujoco.mj_saveModel(self._model, None, content)
+        own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        content = np.zeros(mujoco.mj_sizeModel(own), np.uint8)
+        mujoco.mj_saveModel(own, None, content)
         self._content = content.tobytes()
-        self._idle: dict[tuple[int, tuple[str, ...], bool], list[Batch]] = {}
-        self._rows: dict[int, tuple[Motors, np.ndarray, np.ndarray]] = {}
-        self._lock = threading.Lock()
         self._sizes = (model.nq, model.nv, model.nv, model.nsensordata)
+        self._stepper = _Stepper(own, self.motors)
+        weakref.finalize(self, self._stepper.retire).atexit = False
 
     @classmethod
     def preferred(cls) -> bool:
@@ -67,9 +69,7 @@ class CEngine(Engine):
         forces = (data.xfrc_applied,) if forced else ()
         mocap = (data.mocap_pos, data.mocap_quat) if self.model.nmocap else ()
 
-        def call(engine: CEngine, *arrays: np.ndarray) -> np.ndarray:
-            return engine._call(names, forced, num_substeps, *arrays)
-
+        call = functools.partial(self._stepper.call, names, forced, num_substeps)
         start = (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)
         arguments = (*start, *mocap, *forces, *(fields[name] for name in names))
         row = host_call(self._number(names, forced, num_substeps), self, call, out, arguments)
@@ -79,7 +79,7 @@ class CEngine(Engine):
             qvel=qvel,
             qacc_warmstart=warmstart,
             sensordata=sensordata,
-            time=data.time + num_substeps * self._model.opt.timestep,
+            time=data.time + num_substeps * self.model.opt.timestep,
         )
         return data, jnp.zeros((), bool)
 
@@ -90,25 +90,50 @@ class CEngine(Engine):
         content.update(repr((*options, [np.asarray(value).tolist() for value in motors])).encode())
         return int.from_bytes(content.digest()[:8], "little", signed=True)
 
-    def _call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray) -> np.ndarray:
+
+class _Stepper:
+    """Steps environments of one model in batches, which it keeps for the next call until its engine is gone."""
+
+    def __init__(self, model: mujoco.MjModel, motors: Motors | None) -> None:
+        self._model, self._motors = model, motors
+        self._idle: dict[tuple[int, tuple[str, ...], bool], list[Batch]] = {}
+        self._rows: dict[int, _Rows] = {}
+        self._lock = threading.Lock()
+        self._retired = False
+
+    def retire(self) -> None:
+        """Frees its batches, and those of later calls when they end. It takes no lock: a finaliser may interrupt."""
+        self._retired = True
+        self._idle, self._rows = {}, {}
+
+    def call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray) -> np.ndarray:
+        """Returns positions, velocities, accelerations and sensors after some physics steps (N, sum of the sizes)."""
         qpos, *rest = arrays
         lead = qpos.shape[:-1]
         count = int(np.prod(lead)) if lead else 1
         flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
         key = count, names, forced
         with self._lock:
-            if self.motors is not None and count not in self._rows:
-                self._rows[count] = self._repeated(self.motors, count)
+            rows = None if self._motors is None else self._rows.get(count) or self._repeated(self._motors, count)
+            if rows is not None:
+                self._rows[count] = rows
             idle = self._idle.setdefault(key, [])
             batch = idle.pop() if idle else Batch(self._model, nsim=count)
         try:
-            row = self._stepped(batch, names, forced, substeps, flat)
+            row = self._stepped(batch, rows, names, forced, substeps, flat)
         finally:
-            idle.append(batch)
+            if not self._retired:
+                idle.append(batch)
         return row.reshape(*lead, -1)
 
     def _stepped(
-        self, batch: Batch, names: tuple[str, ...], forced: bool, substeps: int, flat: Iterator[np.ndarray]
+        self,
+        batch: Batch,
+        rows: _Rows | None,
+        names: tuple[str, ...],
+        forced: bool,
+        substeps: int,
+        flat: Iterator[np.ndarray],
     ) -> np.ndarray:
         """Returns the results of a batch (N, sum of the sizes), from the arguments of the call (N, ...)."""
         start = {name: next(flat) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
@@ -123,56 +148,57 @@ class CEngine(Engine):
         for name in names:
             batch.expand(name)[:] = next(flat)
         sensordata = batch.bind("sensordata")
-        if self.motors is None:
+        if self._motors is None or rows is None:
             batch.step(nstep=substeps)
         else:
-            self._drive(batch, self.motors, substeps, names, start)
+            _drive(batch, self._motors, rows, substeps, names, start)
         parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
-    def _drive(
-        self, batch: Batch, motors: Motors, substeps: int, names: tuple[str, ...], start: dict[str, np.ndarray]
-    ) -> None:
-        """Steps a batch from `start`, with the motors' limits in every physics step.
-
-        The limits seldom act on robots that walk. So the environments whose motors are idle (`Motors.idle`), unless
-        they are few, make their physics steps in one call without limits. The states between these steps are then
-        checked likewise. The environments that fail a check step from `start` with the limits evaluated in every
-        physics step. The result is that of doing so in all environments, to the last bit.
-        """
-        angles, speeds = motors.joint_qpos, motors.joint_qvel
-        every, gain, bias = self._rows[batch.nsim]
-        if "actuator_gainprm" in names:
-            gain = batch.expand("actuator_gainprm")[..., 0].astype(np.float32)
-        if "actuator_biasprm" in names:
-            bias = _columns(batch.expand("actuator_biasprm")[..., :3])
-        asked, position, velocity = start["ctrl"], start["qpos"][:, angles], start["qvel"][:, speeds]
-        idle = every.idle(asked, position, velocity, gain, bias)
-        if np.count_nonzero(idle) > SHARE * len(idle):
-            ids = np.flatnonzero(idle)
-            path = batch.rollout(substeps, record=("qpos", "qvel"), ids=ids)
-            for step in range(substeps - 1):
-                position[ids], velocity[ids] = path["qpos"][:, step][:, angles], path["qvel"][:, step][:, speeds]
-                idle &= every.idle(asked, position, velocity, gain, bias)
-            # Unlike steps, a rollout ends where the engine warns.
-            idle &= batch.bind("time") > (substeps - 0.5) * motors.timestep
-        else:
-            idle[:] = False
-        ids = np.flatnonzero(~idle)
-        if ids.size:
-            for name, values in start.items():
-                batch.bind(name)[ids] = values[ids]
-            batch.bind("time")[ids] = 0.0
-            if len(ids) < batch.nsim:
-                every, gain, bias = motors.repeated(len(ids)), gain[ids], bias[ids]
-            _step_limited(batch, every, substeps, ids, gain, bias)
-        _clamp(batch, motors, slice(None))
-
-    def _repeated(self, motors: Motors, count: int) -> tuple[Motors, np.ndarray, np.ndarray]:
+    def _repeated(self, motors: Motors, count: int) -> _Rows:
         """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each environment."""
         gain, bias = self._model.actuator_gainprm[:, 0], self._model.actuator_biasprm[:, :3]
         gain, bias = np.tile(gain.astype(np.float32), (count, 1)), _columns(np.tile(bias, (count, 1, 1)))
         return motors.repeated(count), gain, bias
+
+
+def _drive(
+    batch: Batch, motors: Motors, rows: _Rows, substeps: int, names: tuple[str, ...], start: dict[str, np.ndarray]
+) -> None:
+    """Steps a batch from `start`, with the motors' limits in every physics step.
+
+    The limits seldom act on robots that walk. So the environments whose motors are idle (`Motors.idle`), unless
+    they are few, make their physics steps in one call without limits. The states between these steps are then
+    checked likewise. The environments that fail a check step from `start` with the limits evaluated in every
+    physics step. The result is that of doing so in all environments, to the last bit.
+    """
+    angles, speeds = motors.joint_qpos, motors.joint_qvel
+    every, gain, bias = rows
+    if "actuator_gainprm" in names:
+        gain = batch.expand("actuator_gainprm")[..., 0].astype(np.float32)
+    if "actuator_biasprm" in names:
+        bias = _columns(batch.expand("actuator_biasprm")[..., :3])
+    asked, position, velocity = start["ctrl"], start["qpos"][:, angles], start["qvel"][:, speeds]
+    idle = every.idle(asked, position, velocity, gain, bias)
+    if np.count_nonzero(idle) > SHARE * len(idle):
+        ids = np.flatnonzero(idle)
+        path = batch.rollout(substeps, record=("qpos", "qvel"), ids=ids)
+        for step in range(substeps - 1):
+            position[ids], velocity[ids] = path["qpos"][:, step][:, angles], path["qvel"][:, step][:, speeds]
+            idle &= every.idle(asked, position, velocity, gain, bias)
+        # Unlike steps, a rollout ends where the engine warns.
+        idle &= batch.bind("time") > (substeps - 0.5) * motors.timestep
+    else:
+        idle[:] = False
+    ids = np.flatnonzero(~idle)
+    if ids.size:
+        for name, values in start.items():
+            batch.bind(name)[ids] = values[ids]
+        batch.bind("time")[ids] = 0.0
+        if len(ids) < batch.nsim:
+            every, gain, bias = motors.repeated(len(ids)), gain[ids], bias[ids]
+        _step_limited(batch, every, substeps, ids, gain, bias)
+    _clamp(batch, motors, slice(None))
 
 
 def _step_limited(

@@ -70,8 +70,11 @@ class _MetadataExtension(Structure):
     _fields_ = [("base", _Extension), ("metadata", POINTER(_Metadata))]
 
 
+_KEPT = 64
 _owners: dict[int, weakref.WeakKeyDictionary[Any, HostFunction]] = {}
-"""Functions of each number by their owners; they do the same, so any that lives will do."""
+"""Functions of each number by their owners; they do the same, so any whose owner lives will do."""
+_latest: dict[int, HostFunction] = {}
+"""The last function of each of the last `_KEPT` numbers, for programs that are called, or run, without an owner."""
 
 
 def host_call(
@@ -81,12 +84,16 @@ def host_call(
 
     Args:
         number: of the function, the same in every process (64 bits); functions of one number do the same.
-        owner: an object that must live as long as the program is called.
-        function: called with an owner of this number, and the arguments as arrays; it must not reference the owner.
+        owner: an object; functions whose owners live are preferred.
+        function: called with the arguments as arrays; it must not reference the owner.
         result: shape and dtype of its result without batch axes.
         arguments: arrays.
     """
     _owners.setdefault(number, weakref.WeakKeyDictionary())[owner] = function
+    _latest.pop(number, None)
+    _latest[number] = function
+    while len(_latest) > _KEPT:
+        del _latest[next(iter(_latest))]
     call = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")
     out = call(*arguments, number=np.int64(number))
     assert isinstance(out, jax.Array)
@@ -105,11 +112,11 @@ def _array(buffer: Any, *, writable: bool = False) -> np.ndarray:
 
 def _execute(frame: Any) -> None:
     number = frame.attributes.items[0].contents.value[0]
-    owner, function = next(iter(_owners.get(number, {}).items()), (None, None))
+    function = next(iter(_owners.get(number, {}).values()), _latest.get(number))
     if function is None:
         raise RuntimeError("the environment of this compiled program no longer exists")
     arguments = [_array(frame.arguments.items[i].contents) for i in range(frame.arguments.size)]
-    np.copyto(_array(frame.results.items[0].contents, writable=True), function(owner, *arguments))
+    np.copyto(_array(frame.results.items[0].contents, writable=True), function(*arguments))
 
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
