@@ -311,6 +311,14 @@ def test_tasks_are_listed_without_mjx_and_nothing_prints_a_warning() -> None:
     assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"]
 
 
+def test_tasks_have_the_sizes_of_their_environments(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks", "--json"]) == 0
+    rows = {row["task"]: row for row in json.loads(capfd.readouterr().out)["tasks"]}
+    env = make("go1gate", impl="c")
+    sizes = env.observation_size, env.privileged_observation_size
+    assert (rows["go1gate"]["observation"], rows["go1gate"]["privileged"]) == sizes
+
+
 def test_a_command_starts_without_what_it_does_not_need() -> None:
     """Nobody chose a GL library before the command, or after it."""
     code = """

@@ -361,6 +361,17 @@ def test_ratings_recover_the_strengths_behind_many_games() -> None:
     np.testing.assert_allclose(tournament.scores(games)[0], [0, 6000, 6000])
 
 
+def test_few_games_that_all_end_alike_leave_a_wide_interval() -> None:
+    def interval(games: int) -> tuple[float, float]:
+        won = np.array([[[0, 0, 0], [games, 0, 0]], [[0, 0, games], [0, 0, 0]]])
+        ratings = tournament.rate(won, anchor=1)
+        assert ratings.low[0] < ratings.value[0] <= ratings.high[0]
+        return ratings.value[0], ratings.low[0]
+
+    (few, low_of_few), (_, low_of_many) = interval(4), interval(256)
+    assert low_of_few < 0.7 * few and few < low_of_many
+
+
 def test_a_round_robin_names_what_is_wrong() -> None:
     nothing: Any = None
     with pytest.raises(InputError, match="matches: None is not allowed; it must be an environment"):
@@ -398,3 +409,6 @@ def test_a_tournament_meets_every_pair_on_both_sides(
     assert len(rows) == 10 and rows[3].startswith(f"forward,idle,{won[0, 2]},")
     assert cli.main(["tournament", "go1gate", "idle", "--impl", "c"]) == 2
     assert "one team" in capfd.readouterr().err
+    monkeypatch.setattr(tournament, "round_robin", lambda *arguments: pytest.fail("played"))
+    assert cli.main(["tournament", *arguments, "-o", str(tmp_path / "tournament.csv")]) == 2
+    assert "output: " in capfd.readouterr().err

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.errors import InputError
+from mqe_jax.policies import SimplePolicy
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate
@@ -360,6 +361,8 @@ def test_evaluation_counts_the_first_episodes_of_every_environment() -> None:
     assert result.to_dict()["diverged"] == 0 and result.overflow == 5 * 30
     with pytest.raises(ValueError, match="episodes: 0"):
         evaluate(env, act, 0, jax.random.PRNGKey(0), memory=jnp.zeros((4,)))
+    with pytest.raises(InputError, match=f"policy: 'one of go1tug' is not allowed; it must be one of {env.name}"):
+        evaluate(env, SimplePolicy("go1tug", 2, lambda obs, key: obs[..., :1]), 4, jax.random.PRNGKey(0))
 
 
 def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:

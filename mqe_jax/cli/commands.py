@@ -30,7 +30,7 @@ class Tasks:
 
         rows, shipped = [], zoo.names()
         for name, task in TASKS.items():
-            env = task(control="position", num_envs=1)  # the same sizes, without loading the walk policy
+            env = task(num_envs=1)
             rows.append(
                 {
                     "task": name,

@@ -15,6 +15,7 @@ import tyro
 from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions, echo
 from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
+from mqe_jax.files import check_folder
 from mqe_jax.limits import Candidates, Positive, PositiveInt
 from mqe_jax.settings import fail, record
 
@@ -167,6 +168,7 @@ class Tournament(TaskOptions):
         env, _ = make_env(self.task, self.impl, self.overrides(), 1)
         if len(env.teams) < 2:
             fail("task", self.task, "a match: it has one team")
+        check_folder(self.output, "output")
         names = list(dict.fromkeys([*self.policies, *anchors(env)]))
         _, matches = make_env(self.task, self.impl, self.overrides(), len(names) * self.episodes)
         policies = {name: load_policy(name, matches.env, deterministic=self.deterministic) for name in names}
@@ -177,6 +179,7 @@ class Tournament(TaskOptions):
         share = tournament.scores(results) / (2 * self.episodes)
         order = sorted(range(len(names)), key=lambda i: -ratings.value[i])
         if not self.json:
+            print(f"{'policy':<32} rating (95% interval); points of 100 games against each, in the same order")
             for i in order:
                 row = " ".join(f"{100 * share[i, j]:4.0f}" if i != j else "    " for j in order)
                 low, value, high = (x[i] for x in (ratings.low, ratings.value, ratings.high))

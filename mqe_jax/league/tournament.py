@@ -83,11 +83,12 @@ def scores(results: NDArray[np.int64]) -> Array:
 def rate(results: NDArray[np.int64], anchor: int, samples: int = 200, seed: int = 0) -> Ratings:
     """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0; intervals by bootstrap.
 
-    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite.
+    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite, and games that
+    all end alike leave an interval.
     """
-    games = results.sum(axis=-1, keepdims=True)
-    random = np.random.default_rng(seed)
-    drawn = random.multinomial(games[..., 0], results / np.maximum(games, 1), (samples, *games.shape[:2]))
+    games, random = results.sum(axis=-1), np.random.default_rng(seed)
+    shares = (results + np.array([0.0, 0.5, 0.0])) / (games[..., None] + 0.5)
+    drawn = random.multinomial(games, shares, (samples, *games.shape))
     resampled = np.stack([_strengths(scores(again), anchor) for again in drawn])
     low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
     return Ratings(_strengths(scores(results), anchor), low, high)

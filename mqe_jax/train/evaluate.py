@@ -82,11 +82,13 @@ class _Progress(NamedTuple):
     """Sums over the last steps of counted episodes (N,) each."""
 
 
-def acting(policy: Policy | Act, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
-    """Returns the function of a policy, or a function itself, and its initial recurrent state."""
+def acting(policy: Policy | Act, task: str, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
+    """Returns the function of a policy of a task, or a function itself, and its initial recurrent state."""
     either: Any = policy
     if not hasattr(either, "act"):
         return either, memory
+    if (trained := getattr(either, "task", "")) and trained != task:
+        fail("policy", f"one of {trained}", f"one of {task}; its `act` may be given alone")
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
     return either.act, either.initial_memory(num_envs)
@@ -120,9 +122,10 @@ def evaluate(
         recorder: receives all steps, block by block.
 
     Raises:
-        InputError: for `episodes` < 1, a policy with a `memory` too, or episodes that do not end within `max_steps`.
+        InputError: for `episodes` < 1, a policy of another task or with a `memory` too, or episodes that do not end
+            within `max_steps`.
     """
-    act, memory = acting(policy, env.num_envs, memory)
+    act, memory = acting(policy, env.name, env.num_envs, memory)
 
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)

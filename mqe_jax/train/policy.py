@@ -72,6 +72,10 @@ class TrainedPolicy:
     deterministic: bool = False
     """Whether it acts with its mean actions; otherwise they are sampled."""
 
+    def __repr__(self) -> str:
+        mode = "mean" if self.deterministic else "sampled"
+        return f"<TrainedPolicy of {self.task or 'no named task'}: {self.config.network.name}, {mode} actions>"
+
     @property
     def task(self) -> str:
         """Id of the task; empty where the file does not name it."""
