@@ -87,13 +87,14 @@ def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest
     assert len(lines) == 1
     result = json.loads(lines[0])
     assert result["task"] == "fake" and result["episodes"] == 6
+    assert (result["policy"], result["actions"], result["seed"]) == (str(run_folder), "sampled", 0)
     assert {"success_rate", "average_step_reward", "terms"} <= set(result)
 
 
 def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["eval", "fake", "--json", "--policy", "forward", "--episodes", "2"]) == 0
     result = json.loads(capfd.readouterr().out)
-    assert result["success_rate"] == 1.0
+    assert result["success_rate"] == 1.0 and result["policy"] == "forward" and not {"actions", "opponent"} & set(result)
     assert result["average_step_reward"] == pytest.approx(0.05)
 
 

@@ -271,10 +271,20 @@ def test_parameters_that_the_skill_does_not_know_are_named(params: dict[str, Any
 def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "go1gate").mkdir()
     monkeypatch.chdir(tmp_path)
-    env, _, policy = Eval(target="go1gate", impl="c").environments(1)
+    env, _, policy, _ = Eval(target="go1gate", impl="c").environments(1)
     assert env.name == "go1gate" and isinstance(policy, TrainedPolicy)
     with pytest.raises(InputError, match="go1gate"):
         Eval(target="./go1gate", impl="c").environments(1)
+
+
+def test_who_acts_is_named() -> None:
+    def about(**options: Any) -> dict[str, Any]:
+        return Eval(impl="c", **options).environments(1)[3]
+
+    shipped = {"policy": "go1bridge", "actions": "sampled", "opponent": "go1bridge", "seed": 3}
+    assert about(target="go1bridge", seed=3) == shipped
+    assert about(target="go1bridge", deterministic=True)["actions"] == "mean"
+    assert about(target="go1tug", policy="scripted") == {"policy": "scripted", "opponent": "idle", "seed": 0}
 
 
 def test_a_name_is_registered_once() -> None:

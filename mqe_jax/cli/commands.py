@@ -98,7 +98,7 @@ class Eval(PolicyOptions):
         from mqe_jax.train import evaluate as evaluation
 
         num_envs = min(self.num_envs, self.episodes)
-        env, vector_env, policy = self.environments(num_envs)
+        env, vector_env, policy, about = self.environments(num_envs)
         recorder = None if self.dump_diverged is None else DivergenceRecorder(env, self.dump_diverged)
         result = evaluation.evaluate(
             vector_env, policy, self.episodes, jax.random.PRNGKey(self.seed), recorder=recorder
@@ -110,9 +110,10 @@ class Eval(PolicyOptions):
                 f"mqe: warning: the engine may have dropped contacts in {result.overflow} environment steps; "
                 "raise --set contacts_per_robot and --set constraints_per_robot"
             )
+        told = {"task": result.task, **about, **result.to_dict()}
         if not self.json:
-            print_table(result.to_dict())
-        return result.to_dict()
+            print_table(told)
+        return told
 
 
 @record

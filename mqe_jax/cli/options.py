@@ -76,8 +76,8 @@ class PolicyOptions(TaskOptions):
     declares."""
     seed: Seed = 0
 
-    def environments(self, num_envs: int) -> tuple[Any, Any, Policy]:
-        """Returns task and vectorised environment as `make_env`, and the policy of all agents.
+    def environments(self, num_envs: int) -> tuple[Any, Any, Policy, dict[str, Any]]:
+        """Returns task and vectorised environment as `make_env`, the policy of all agents, and who acts, by name.
 
         A run has its own task, parameters and policy; a task has its shipped policy, if its parameters are the default
         ones, its scripted policy, or forward if it has neither; random, where actions are not commands.
@@ -86,6 +86,7 @@ class PolicyOptions(TaskOptions):
         from mqe_jax.cli import setup
         from mqe_jax.envs import ALIASES, PLANNERS, TASKS
         from mqe_jax.policies import all_agents, load_opponent, load_policy
+        from mqe_jax.train.policy import TrainedPolicy
 
         task, params = ALIASES.get(self.target, self.target), self.overrides()
         shipped = task in zoo.names() and not params and self.policy is None
@@ -97,10 +98,15 @@ class PolicyOptions(TaskOptions):
             task, params, name = config.task, settings.joined(config.env, params), self.policy or self.target
         env, vector_env = setup.make_env(task, self.impl, params, num_envs)
         own = load_policy(name, env, deterministic=self.deterministic)
-        opponent = own if shipped and len(env.teams) > 1 else None
+        match = len(env.teams) > 1
+        opponent, against = (own, name) if shipped and match else (None, "idle")
         if self.opponent is not None:
-            opponent = load_opponent(self.opponent, env, deterministic=self.deterministic)
-        return env, vector_env, all_agents(env, own, opponent)
+            opponent, against = load_opponent(self.opponent, env, deterministic=self.deterministic), self.opponent
+        about: dict[str, Any] = {"policy": name}
+        if isinstance(own, TrainedPolicy):
+            about["actions"] = "mean" if own.deterministic else "sampled"
+        about |= {"opponent": against, "seed": self.seed} if match else {"seed": self.seed}
+        return env, vector_env, all_agents(env, own, opponent), about
 
 
 def echo(text: str) -> None:

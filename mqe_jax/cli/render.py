@@ -48,12 +48,12 @@ class Render(PolicyOptions):
 
         check_output(self.output)
         threading.Thread(target=load_gl, daemon=True).start()  # while the episode is computed
-        env, _, policy = self.environments(self.best_of)
+        env, _, policy, about = self.environments(self.best_of)
         options = {name: getattr(self, name) for name in ("seed", "seconds", "fps", "view", "speed", "at")}
         size = None if self.width is None else (self.width, round(self.width * 9 / 32) * 2)
         result = draw(env, policy, self.output, episodes=self.best_of, size=size, **options)
         echo(f"mqe: wrote {self.output} ({result['renderer']})")
-        return {"task": env.name, **result}
+        return {"task": env.name, **about, **result}
 
 
 def draw(

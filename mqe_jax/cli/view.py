@@ -35,7 +35,7 @@ class View(PolicyOptions):
         if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
             raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
         _check_address(self.host, self.port)
-        env, vector_env, policy = self.environments(self.num_envs)
+        env, vector_env, policy, _ = self.environments(self.num_envs)
 
         from mqe_jax.envs import ALIASES
         from mqe_jax.view.menu import DEFAULT, Choice, Menu, find_runs
@@ -47,7 +47,7 @@ class View(PolicyOptions):
             names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
             target = choice.policy if choice.policy in runs else choice.task
             options = dataclasses.replace(self, target=target, policy=names[0], opponent=names[1], set=[])
-            return Session(*options.environments(self.num_envs), self.seed)
+            return Session(*options.environments(self.num_envs)[:3], self.seed)
 
         runs = find_runs([Path("runs"), Path(self.target).parent])
         own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
