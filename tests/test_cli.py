@@ -183,7 +183,7 @@ def test_the_best_of_several_episodes_is_rendered(
     (line,) = capfd.readouterr().out.splitlines()
     assert [len(episode) for episode in rendered] == [5]
     assert json.loads(line) == {
-        **{"task": "fake", "renderer": "egl", "rendered": 2},
+        **{"task": "fake", "policy": "forward", "seed": 0, "renderer": "egl", "rendered": 2},
         "episodes": [
             {"success": 0.5, "average_step_reward": 2.0, "seconds": 0.5},
             {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3},

@@ -366,8 +366,9 @@ def test_what_a_host_function_raises_ends_the_program() -> None:
         called(fail, 2, owner)(jnp.zeros((2, 3)), jnp.zeros((2, 3))).block_until_ready()
 
 
-def test_a_program_outlives_its_environment() -> None:
+def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     """JAX still runs it when the caller has its result; the environment's buffers are freed."""
+    monkeypatch.setattr("mqe_jax.engines.host_call._owners", {})  # no other environment of this physics
     seen: list[Any] = []
 
     def walk() -> Any:

@@ -126,7 +126,7 @@ def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None
     arrays = [
         np.asarray(x) for x in (data.qpos, data.qvel, data.qacc_warmstart, np.tile(env.robot.torque_limit, (2, 1)))
     ]
-    call = lambda: env.physics._call((), False, env.physics.num_substeps, *arrays)  # noqa: E731
+    call = lambda: env.physics._stepper.call((), False, env.physics.num_substeps, *arrays)  # noqa: E731
     expected = call()
 
     def interrupted(*_: Any, **__: Any) -> None:

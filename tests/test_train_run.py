@@ -132,12 +132,6 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
     assert load_run_config(run_dir) == settings()
 
 
-def test_settings_of_another_task_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"task: 'go1tug' is not allowed; it must be {PROBE.name}"):
-        train(PROBE, settings(task="go1tug"), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("before", [{"width": 0.7}, {"width": 0.7, "other": 1}])
 def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> None:
     config = settings(env={"width": 0.7} if "other" in before else {})

@@ -82,8 +82,6 @@ def train_seeds(
     for config, run_dir in zip(configs, run_dirs, strict=True):
         check("config", config, TrainConfig)
         check("run_dir", run_dir, PathText)
-        if config.task not in (None, env.name):
-            fail("task", config.task, f"{env.name}, that of the environments, or none")
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
