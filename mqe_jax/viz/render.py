@@ -80,7 +80,7 @@ def load_gl() -> None:
     """Finds and loads the GL library, as a thread may do while an episode is computed."""
     backend = gl_backend()
     if backend is not None:
-        with _probing:
+        with _probing, contextlib.suppress(Exception):  # drawing tells what is wrong, if the command gets so far
             context = _gl_context(backend)(64, 64)
             context.make_current()
             context.free()
