@@ -361,15 +361,19 @@ def test_ratings_recover_the_strengths_behind_many_games() -> None:
     np.testing.assert_allclose(tournament.scores(games)[0], [0, 6000, 6000])
 
 
-def test_few_games_that_all_end_alike_leave_a_wide_interval() -> None:
-    def interval(games: int) -> tuple[float, float]:
-        won = np.array([[[0, 0, 0], [games, 0, 0]], [[0, 0, games], [0, 0, 0]]])
-        ratings = tournament.rate(won, anchor=1)
-        assert ratings.low[0] < ratings.value[0] <= ratings.high[0]
-        return ratings.value[0], ratings.low[0]
+@pytest.mark.parametrize("policies", [2, 8])
+def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> None:
+    """The first policy wins all its games; the others are even."""
 
-    (few, low_of_few), (_, low_of_many) = interval(4), interval(256)
-    assert low_of_few < 0.7 * few and few < low_of_many
+    def interval(games: int) -> tuple[float, float]:
+        results = np.full((policies, policies, 3), [0, games, 0])
+        results[0, 1:], results[1:, 0] = [games, 0, 0], [0, 0, games]
+        value, low, high = (bound[0] for bound in tournament.rate(results, anchor=1))
+        assert low < value < high
+        return low, high
+
+    few, many = interval(4), interval(256)
+    assert few[1] - few[0] > 200 and few[0] < many[0] and few[1] < many[1]
 
 
 def test_a_round_robin_names_what_is_wrong() -> None:

@@ -115,7 +115,7 @@ class _Stepper:
         key = count, names, forced
         with self._lock:
             rows = None if self._motors is None else self._rows.get(count) or self._repeated(self._motors, count)
-            if rows is not None:
+            if rows is not None and not self._retired:
                 self._rows[count] = rows
             idle = self._idle.setdefault(key, [])
             batch = idle.pop() if idle else Batch(self._model, nsim=count)

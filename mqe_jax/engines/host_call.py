@@ -93,7 +93,7 @@ def host_call(
     _latest.pop(number, None)
     _latest[number] = function
     while len(_latest) > _KEPT:
-        del _latest[next(iter(_latest))]
+        _latest.pop(next(iter(_latest)), None)
     call = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")
     out = call(*arguments, number=np.int64(number))
     assert isinstance(out, jax.Array)

@@ -74,30 +74,29 @@ def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Arr
     return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
 
 
-def scores(results: NDArray[np.int64]) -> Array:
+def scores(results: NDArray[Any]) -> Array:
     """Returns the points of each policy against each, as both teams together, in games; a draw counts half (P, P)."""
     points = results[..., 0] + 0.5 * results[..., 1]
     return points + (results.sum(axis=-1) - points).T
 
 
 def rate(results: NDArray[np.int64], anchor: int, samples: int = 200, seed: int = 0) -> Ratings:
-    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0; intervals by bootstrap.
+    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0, and their intervals.
 
-    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite, and games that
-    all end alike leave an interval.
+    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
+    of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
     """
-    games, random = results.sum(axis=-1), np.random.default_rng(seed)
-    shares = (results + np.array([0.0, 0.5, 0.0])) / (games[..., None] + 0.5)
-    drawn = random.multinomial(games, shares, (samples, *games.shape))
-    resampled = np.stack([_strengths(scores(again), anchor) for again in drawn])
+    games = results + np.array([0.0, 0.5, 0.0])
+    weights = np.random.default_rng(seed).standard_gamma(games, (samples, *games.shape))
+    weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
+    resampled = np.stack([_strengths(scores(again), anchor) for again in weights])
     low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
-    return Ratings(_strengths(scores(results), anchor), low, high)
+    return Ratings(_strengths(scores(games), anchor), low, high)
 
 
 def _strengths(points: Array, anchor: int) -> Array:
     """Returns the maximum-likelihood ratings (P,) of points (P, P), by minorisation and maximisation."""
-    points = points + 0.5 * (1 - np.eye(len(points)))
-    np.fill_diagonal(points, 0.0)
+    points = points * (1 - np.eye(len(points)))
     games, strength = points + points.T, np.ones(len(points))
     for _ in range(_ITERATIONS):
         strength = points.sum(axis=1) / (games / (strength[:, None] + strength)).sum(axis=1)
