@@ -9,7 +9,6 @@ import runpy
 import shlex
 import sys
 import time
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +66,6 @@ def commands(page: str) -> list[list[str]]:
     lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
     found = [shlex.split(line, comments=True) for line in lines]
     return [words for words in found if words]
-
-
-def test_every_extra_is_listed_with_its_packages() -> None:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    lines = re.findall(r"^\| `.*", (ROOT / "docs/installation.md").read_text(encoding="utf-8"), re.MULTILINE)
-    rows = {name: line for line in lines for name in re.findall(r"`(\w+)`", line.split(" | ")[0])}
-    for extra, packages in extras.items():
-        names = {re.split(r"[<>=\[]", package)[0].lower() for package in packages} - {"mqe-jax"}
-        assert names <= {*re.findall(r"[\w-]+", rows[extra].lower())}, extra
 
 
 @pytest.mark.parametrize("page", [name for name in NAMES if commands(name)])

@@ -96,15 +96,14 @@ class _Stepper:
 
     def __init__(self, model: mujoco.MjModel, motors: Motors | None) -> None:
         self._model, self._motors = model, motors
-        self._idle: dict[tuple[int, tuple[str, ...], bool], list[Batch]] = {}
-        self._rows: dict[int, _Rows] = {}
+        self._idle: dict[tuple[int, tuple[str, ...], bool], list[tuple[Batch, _Rows | None]]] = {}
         self._lock = threading.Lock()
         self._retired = False
 
     def retire(self) -> None:
         """Frees its batches, and those of later calls when they end. It takes no lock: a finaliser may interrupt."""
         self._retired = True
-        self._idle, self._rows = {}, {}
+        self._idle = {}
 
     def call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray) -> np.ndarray:
         """Returns positions, velocities, accelerations and sensors after some physics steps (N, sum of the sizes)."""
@@ -114,16 +113,13 @@ class _Stepper:
         flat = iter([array.reshape(count, *array.shape[len(lead) :]) for array in (qpos, *rest)])
         key = count, names, forced
         with self._lock:
-            rows = None if self._motors is None else self._rows.get(count) or self._repeated(self._motors, count)
-            if rows is not None and not self._retired:
-                self._rows[count] = rows
             idle = self._idle.setdefault(key, [])
-            batch = idle.pop() if idle else Batch(self._model, nsim=count)
+            batch, rows = idle.pop() if idle else (Batch(self._model, nsim=count), self._repeated(count))
         try:
             row = self._stepped(batch, rows, names, forced, substeps, flat)
         finally:
             if not self._retired:
-                idle.append(batch)
+                idle.append((batch, rows))
         return row.reshape(*lead, -1)
 
     def _stepped(
@@ -155,11 +151,13 @@ class _Stepper:
         parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
-    def _repeated(self, motors: Motors, count: int) -> _Rows:
+    def _repeated(self, count: int) -> _Rows | None:
         """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each environment."""
+        if self._motors is None:
+            return None
         gain, bias = self._model.actuator_gainprm[:, 0], self._model.actuator_biasprm[:, :3]
         gain, bias = np.tile(gain.astype(np.float32), (count, 1)), _columns(np.tile(bias, (count, 1, 1)))
-        return motors.repeated(count), gain, bias
+        return self._motors.repeated(count), gain, bias
 
 
 def _drive(

@@ -45,11 +45,6 @@ def _policy(value: Any) -> Any:
     return value
 
 
-def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
-    """Selects rows of two pytrees: condition (N,) bool, leaves (N, ...)."""
-    return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no)
-
-
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
 """Kind of an argument that is a random key (see `mqe_jax.settings.checked`)."""
 AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]
@@ -139,6 +134,11 @@ def join_traces(traces: Trace) -> Trace:
     return jax.tree.map(
         lambda x: jnp.swapaxes(x, 0, 1).reshape(x.shape[1], x.shape[0] * x.shape[2], *x.shape[3:]), traces
     )
+
+
+def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
+    """Selects rows of two pytrees: condition (N,) bool, leaves (N, ...)."""
+    return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no)
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
