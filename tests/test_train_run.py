@@ -20,7 +20,7 @@ from safetensors.numpy import load_file
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.train import checkpoint as checkpoints
-from mqe_jax.train import runner
+from mqe_jax.train import runner, start
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate
@@ -339,6 +339,12 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
         train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b")
     with pytest.raises(InputError, match=rf"start: {run_dir} has a policy of probe; allowed: .* this run's network"):
         train(PROBE, settings(start=str(run_dir), network__hidden_sizes=(8,)), tmp_path / "b")
+
+
+def test_a_start_by_name_says_what_to_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start, "NAMED", {})
+    with pytest.raises(InputError, match=r"start: 'go1gate' is not allowed; .* after `import mqe_jax.zoo`"):
+        train(PROBE, settings(start="go1gate"), tmp_path)
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
-from mqe_jax.settings import to_mapping
+from mqe_jax.settings import fail, to_mapping
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
@@ -96,6 +96,9 @@ def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPo
     InputError unless it fits the task, the parameters, given their shapes, and the settings of its mean actions.
     """
     start = str(config.start)
+    if start not in NAMED and not Path(start).exists():
+        shipped = f"one of {', '.join(NAMED)}" if NAMED else "a shipped policy's task, after `import mqe_jax.zoo`"
+        fail("start", start, f"a run folder, a policy file, or {shipped}")
     policy = NAMED[start]() if start in NAMED else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != task:
