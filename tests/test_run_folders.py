@@ -115,7 +115,7 @@ def test_files_of_dead_processes_go_when_a_run_starts(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").mkdir()
     gone = [f".policy.{files._HOST}.{n}.tmp.safetensors" for n in (dead, os.getpid())]
     gone += [f"checkpoints/.step_000000000016.{files._HOST}.{dead}.tmp.safetensors", f".old.{dead}.tmp"]
-    kept = [f".clip.{files._HOST}.{os.getppid()}.tmp.mp4", ".hidden", "notes.tmp"]
+    kept = [f".clip.{files._HOST}.{os.getppid()}.tmp.mp4", ".hidden", ".notes.tmp"]
     kept += [f".policy.{host}{n}.tmp.safetensors" for n in (dead, os.getpid()) for host in ("", "00000000.")]
     for name in (*gone, *kept):
         (tmp_path / name).write_text("half")

@@ -141,13 +141,14 @@ def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> N
     check_same(Path("x"), to_mapping(config), config)
 
 
-@pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml"])
+@pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml", "notes.txt"])
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: bool, tmp_path: Path) -> None:
     (tmp_path / left).write_text("a user's work")
+    (tmp_path / "checkpoints").mkdir()  # of a training that was killed at its start
     with pytest.raises(InputError, match=f"{left}.*name another folder"):
         train(PROBE, settings(), tmp_path, resume=resume)
-    assert [path.name for path in tmp_path.iterdir()] == [left]
+    assert {path.name for path in tmp_path.iterdir()} == {left, "checkpoints"}
     assert (tmp_path / left).read_text() == "a user's work"
 
 

@@ -182,7 +182,8 @@ def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
         files: names of a run's files, besides its checkpoints.
 
     Raises:
-        InputError: if it holds a run that is not to be resumed, or one without a checkpoint.
+        InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files and
+            empty folders.
     """
     checkpoint = latest(run_dir)
     found = [name for name in files if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
@@ -190,9 +191,10 @@ def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
         raise InputError(
             f"run_dir: {run_dir} already holds a run ({', '.join(found)}); resume it (--resume) or name another folder"
         )
-    if found and checkpoint is None:
+    held = [path.name for path in sorted(run_dir.glob("[!.]*")) if not path.is_dir() or any(path.glob("[!.]*"))]
+    if held and checkpoint is None:
         raise InputError(
-            f"run_dir: {run_dir} holds {', '.join(found)} but no checkpoint to resume from; name another folder"
+            f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint to resume from; name another folder"
         )
 
 
