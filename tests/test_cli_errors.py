@@ -47,6 +47,9 @@ BAD = {
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
     "config file": (["train", "fake", "--config", "none.yaml"], ["none.yaml"]),
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),
+    "frame rate of an image": (["render", "fake", "-o", "a.png", "--fps", "9"], ["fps: 9.0", "left out for a .png"]),
+    "speed of an image": (["render", "fake", "-o", "a.png", "--speed", "2"], ["speed: 2.0", "left out for a .png"]),
+    "time of a clip": (["render", "fake", "-o", "a.gif", "--at", "2"], ["at: 2.0", "left out for a .gif"]),
     "folder": (["render", "fake", "-o", "/proc/none/clip.png"], ["/proc/none/clip.png", "cannot be written"]),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
     "dump folder": (

@@ -46,7 +46,7 @@ class Render(PolicyOptions):
         from mqe_jax.viz.clips import check_output
         from mqe_jax.viz.render import load_gl
 
-        check_output(self.output)
+        check_output(self.output, fps=self.fps, speed=self.speed, at=self.at)
         threading.Thread(target=load_gl, daemon=True).start()  # while the episode is computed
         env, _, policy, about = self.environments(self.best_of)
         options = {name: getattr(self, name) for name in ("seed", "seconds", "fps", "view", "speed", "at")}

@@ -16,19 +16,27 @@ from PIL import Image
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, replacing
 from mqe_jax.interrupts import child
-from mqe_jax.settings import PathText, checked
+from mqe_jax.settings import PathText, checked, fail
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
 
-def check_output(path: Path) -> Path:
-    """Returns the path if it can be written, in a folder that it creates; the InputError names what is allowed."""
-    if path.suffix.lower() not in SUFFIXES:
+def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at: float | None = None) -> Path:
+    """Returns the path if it can be written, in a folder that it creates, with options of `render_episode`.
+
+    The InputError names what is allowed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
+    unused = {"fps": fps, "speed": None if speed == 1.0 else speed} if suffix == ".png" else {"at": at}
+    for name, value in unused.items():
+        if value is not None:
+            fail(name, value, f"left out for a {suffix} file")
     if path.is_dir():
         raise InputError(f"output {str(path)!r} is a folder, it must be a file")
     check_folder(path.parent, f"output {str(path)!r}")
-    if path.suffix.lower() == ".mp4":
+    if suffix == ".mp4":
         try:
             import_module("imageio_ffmpeg")
         except ImportError:

@@ -182,7 +182,7 @@ def render_episode(
     middle). A legend tells the teams' colours.
     Without GL, the packages required for 3-D rendering are printed to standard error.
     """
-    path = check_output(Path(path))
+    path = check_output(Path(path), fps=fps, speed=speed, at=at)
     if not len(episode) or episode.qpos.shape[1:] != (env.mj_model.nq,):
         raise InputError(f"episode: {episode.qpos.shape} coordinates; {env.name} needs (frames, {env.mj_model.nq})")
     suffix = path.suffix.lower()
