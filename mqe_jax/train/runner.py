@@ -26,7 +26,7 @@ from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLo
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
 from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
-from mqe_jax.train.start import CONFIG_FILE, first_state, learned, own_learner, without_environments
+from mqe_jax.train.start import CONFIG_FILE, check_parameters, first_state, learned, own_learner, without_environments
 from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -44,7 +44,7 @@ def train(
     """Trains until `config.total_steps` and returns the last state.
 
     Args:
-        env: the environments.
+        env: the environments; of a task, with the parameters in the settings, where these name any or the task.
         config: settings.
         run_dir: folder for config.yaml, metrics.csv, logs of other loggers, checkpoints/ and policy.safetensors.
         resume: resume a run in the folder from its newest checkpoint; an empty folder starts a new run.
@@ -86,6 +86,9 @@ def train_seeds(
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
         fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
+    check_parameters(env, configs[0], configs[0].training_env)
+    if eval_env is not None:
+        check_parameters(eval_env, configs[0], configs[0].env)
     check_loggers(configs[0].loggers)
     folders = [Path(run_dir) for run_dir in run_dirs]
     learner, processes = own_learner(env, configs[0], recorder)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
-from mqe_jax.settings import fail, to_mapping
+from mqe_jax.settings import fail, is_record, override, to_mapping
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
@@ -143,6 +143,19 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
                 f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE} "
                 f"(--config {path / CONFIG_FILE})"
             )
+
+
+def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[str, Any]) -> None:
+    """Raises an InputError naming the first parameter of a task that differs in the settings, where they name any."""
+    task: Any = getattr(env, "env", None)
+    if not is_record(getattr(task, "params", None)) or not (config.task or config.training_env):
+        return
+    overrides = dict(parameters)
+    control = overrides.pop("control", "command")
+    found = dict(_leaves({"control": task.control, **to_mapping(task.params)}))
+    for name, value in _leaves({"control": control, **to_mapping(override(type(task.params)(), overrides))}):
+        if found.get(name) != value:
+            raise InputError(f"env.{name}: {value!r} differs from the environments, which have {found.get(name)!r}")
 
 
 def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
