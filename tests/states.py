@@ -109,7 +109,7 @@ def _programs(env: QuadrupedEnv) -> tuple[Any, Any, Any]:
 
     def terms(before: State, after: State) -> tuple[dict[str, jax.Array], jax.Array]:
         terms = env.rewards(moment(before), moment(after), jnp.array(False))
-        return terms, weigh(terms, env.params.rewards, env.num_agents)[0]
+        return terms, weigh(terms, env.params.rewards, env.teams)[0]
 
     return jax.jit(observe), jax.jit(moment), jax.jit(terms)
 

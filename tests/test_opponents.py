@@ -219,6 +219,8 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
         np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 0, 1, 1])
         np.testing.assert_array_equal(state.privileged_obs[:, :-1], plain.privileged_obs)
         np.testing.assert_allclose(state.metrics["average_step_reward"], state.reward[:, 0], atol=1e-7)
+        terms = [value for name, value in state.metrics.items() if name.startswith("reward/")]
+        np.testing.assert_allclose(sum(terms), state.reward[:, 0], atol=1e-6)
         np.testing.assert_array_equal(state.metrics["team0/win"][2:], plain.metrics["team1/win"][2:])
         np.testing.assert_array_equal(state.metrics["team1/win"][2:], plain.metrics["team0/win"][2:])
         np.testing.assert_array_equal(state.metrics["success"], state.metrics["team0/win"])

@@ -208,7 +208,7 @@ class QuadrupedEnv(Task[S, P]):
             key=next_key,
         )
         now = Moment(state, robot_state)
-        _, logged = weigh(self.rewards(now, now, no), self.weights, self.num_agents)
+        _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams)
         names = (*logged, *self.outcome(state, robot_state, no), "collision", "diverged", "overflow")
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
@@ -258,7 +258,7 @@ class QuadrupedEnv(Task[S, P]):
         terms = self.rewards(before, Moment(state, robot_state), collision)
         if (floor := self.params.shaping_floor) < 1.0:
             terms = faded(terms, vars(self.Params())["rewards"], floor + (1.0 - floor) * state.assistance)
-        reward, logged = weigh(terms, self.weights, self.num_agents)
+        reward, logged = weigh(terms, self.weights, self.teams)
         failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
         terminated = failed | self.ending(state, robot_state)
         metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 
-def weigh(terms: Mapping[str, jax.Array], weights: Any, num_agents: int) -> tuple[jax.Array, dict[str, jax.Array]]:
+def weigh(
+    terms: Mapping[str, jax.Array], weights: Any, teams: Sequence[Sequence[int]]
+) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Returns the weighted sum of the terms per agent, and the weighted terms for logging.
 
-    A term is () if it is shared by all agents, or (A,); of the latter the first agent's value is logged.
+    A term is () if it is shared by all agents, or (A,); of the latter the value of each team's first agent is logged.
 
     Args:
         terms: unweighted terms by name.
         weights: a record whose fields have the same names.
-        num_agents: A.
+        teams: agents of each team.
 
     Returns:
-        reward (A,), and `reward/<name>` () of every term with their sum `average_step_reward`.
+        reward (A,), and `reward/<name>` () of every term with their sum `average_step_reward`, those of team 1 with the
+            prefix `team1/`.
 
     Raises:
         ValueError: if the names differ.
@@ -30,9 +33,14 @@ def weigh(terms: Mapping[str, jax.Array], weights: Any, num_agents: int) -> tupl
     if set(terms) != set(names):
         raise ValueError(f"reward: terms {sorted(terms)} do not match the weights {sorted(names)}")
     weighted = {name: getattr(weights, name) * jnp.asarray(terms[name], jnp.float32) for name in names}
-    total = sum((jnp.broadcast_to(value, (num_agents,)) for value in weighted.values()), jnp.zeros(num_agents))
-    logged = {f"reward/{name}": value if value.ndim == 0 else value[0] for name, value in weighted.items()}
-    logged["average_step_reward"] = total[0]
+    agents = sum(map(len, teams))
+    total = sum((jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents))
+    values = {**{f"reward/{name}": value for name, value in weighted.items()}, "average_step_reward": total}
+    logged = {
+        f"team{team}/{name}" if team else name: value[first] if value.ndim else value
+        for team, (first, *_) in enumerate(teams)
+        for name, value in values.items()
+    }
     return total, logged
 
 

@@ -15,8 +15,8 @@ from mqe_jax.train.types import where_rows
 class BothSides(Wrapper):
     """Matches, in the second half of which team 0 is the task's team 1.
 
-    The privileged observation has one more number: 1 where the teams have changed places, else 0. Of the metrics,
-    outcomes and reward are those of the new teams; terms of the reward change sign, as if all were zero-sum.
+    The privileged observation has one more number: 1 where the teams have changed places, else 0. Outcomes, rewards and
+    their terms among the metrics are those of the new teams.
 
     It makes a difference where a match is symmetric under a reflection: robots walk not quite as their mirror images.
     """
@@ -30,18 +30,12 @@ class BothSides(Wrapper):
 
     def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
         changed = self._changed()
-        other = {"team0/": "team1/", "team1/": "team0/"}
-        metrics = {}
-        for name, value in inner.metrics.items():
-            if name[:6] in other:
-                value = jnp.where(changed, inner.metrics[other[name[:6]] + name[6:]], value)
-            elif name == "success":
-                value = jnp.where(changed, inner.metrics["team1/win"], value)
-            elif name == "average_step_reward":
-                value = self._exchanged(inner.reward)[:, 0]
-            elif name.startswith("reward/"):
-                value = jnp.where(changed, -value, value)
-            metrics[name] = value
+        metrics = dict(inner.metrics)
+        for theirs in [name for name in metrics if name.startswith("team1/")]:
+            own = next(name for name in (f"team0/{theirs[6:]}", theirs[6:]) if name in metrics)
+            for name, other in ((own, theirs), (theirs, own)):
+                metrics[name] = jnp.where(changed, inner.metrics[other], inner.metrics[name])
+        metrics["success"] = metrics["team0/win"]
 
         def told(privileged: jax.Array) -> jax.Array:
             return jnp.concatenate([privileged, changed[:, None].astype(privileged.dtype)], axis=1)
