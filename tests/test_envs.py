@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make, register_task, replay
+from mqe_jax.envs import TASKS, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task, replay
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
+from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.errors import InputError
 from tests import engines
 from tests.states import initial, made, stepper
@@ -339,6 +340,29 @@ def test_a_divergence_is_recorded_and_replayed(tmp_path: Any) -> None:
     assert np.asarray(again.metrics["diverged"]).tolist() == [0.0] * (end - 1) + [1.0]
     np.testing.assert_array_equal(again.data.qpos[:-1], after.data.qpos[1:end])
     assert [path.name for path in tmp_path.iterdir()] == ["diverged.npz"]
+
+
+MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
+    "width": ({"observe": lambda *_: {**BLOCKS, "base": jnp.zeros((2, 5))}}, r"observe: base: \(2, 5\).* \(2, 6\)"),
+    "agents": ({"observe": lambda *_: {**BLOCKS, "base": jnp.zeros(6)}}, r"observe: base: \(6,\).* \(2, 6\)"),
+    "no blocks": ({"observe": lambda *_: jnp.zeros((2, 14))}, r"observe: \(2, 14\) float32; expected by name"),
+    "reward's shape": ({"rewards": lambda *_: {"forward": jnp.zeros((2, 1))}}, r"forward: \(2, 1\).* \(\) or \(2,\)"),
+    "reward's name": ({"rewards": lambda *_: {"froward": 0.0}}, r"rewards: \['froward'\]; expected .* \['forward'\]"),
+    "no weights": ({"Params": TaskParams}, "Params = TaskParams: no field rewards"),
+    "outcome": ({"outcome": lambda *_: {"success": jnp.zeros(2)}}, r"outcome: success: \(2,\) float32; expected \(\)"),
+    "no outcome": ({"outcome": lambda *_: None}, "outcome: None; expected numbers by name"),
+    "ending": ({"ending": lambda *_: jnp.zeros(())}, r"ending: \(\) float32; expected \(\) bool"),
+    "own fields": ({"step_task": lambda *_: jnp.zeros(3)}, r"step_task: \(3,\) float32; expected as before, None"),
+}
+BLOCKS = {"one_hot": jnp.eye(2), "base": jnp.zeros((2, 6)), "teammates": jnp.zeros((2, 6))}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_in_a_task_names_the_method(mistake: str) -> None:
+    methods, said = MISTAKES[mistake]
+    with pytest.raises(ValueError, match=said):
+        env: Any = type("Bad", (Go1Plane,), methods)(impl="c", control="position", num_envs=1)
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros((2, 12))), jax.random.PRNGKey(0))
 
 
 def test_a_recording_holds_the_last_episode_whatever_its_first_step(

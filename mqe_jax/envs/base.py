@@ -24,6 +24,7 @@ from mqe_jax.envs.observation import ObservationLayout, box
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
+from mqe_jax.envs.returned import alike, numbers, shaped, weights_of
 from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.envs.task import Task
@@ -47,7 +48,7 @@ class QuadrupedEnv(Task[S, P]):
         self, params: P | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
     ) -> None:
         self.params = self.Params() if params is None else params
-        self.weights = vars(self.params)["rewards"]
+        self.weights = weights_of(self.params)
         expected = self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
@@ -209,7 +210,8 @@ class QuadrupedEnv(Task[S, P]):
         )
         now = Moment(state, robot_state)
         _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams)
-        names = (*logged, *self.outcome(state, robot_state, no), "collision", "diverged", "overflow")
+        outcome = numbers("outcome", self.outcome(state, robot_state, no))
+        names = (*logged, *outcome, "collision", "diverged", "overflow")
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
 
@@ -254,23 +256,21 @@ class QuadrupedEnv(Task[S, P]):
         state, robot_state = after
         diverged = bad_action | self._diverged(state.data)
         collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
-        state = dataclasses.replace(state, task=self.step_task(before, after))
+        state = dataclasses.replace(state, task=alike("step_task", self.step_task(before, after), state.task))
         terms = self.rewards(before, Moment(state, robot_state), collision)
         if (floor := self.params.shaping_floor) < 1.0:
-            terms = faded(terms, vars(self.Params())["rewards"], floor + (1.0 - floor) * state.assistance)
+            terms = faded(terms, weights_of(self.Params()), floor + (1.0 - floor) * state.assistance)
         reward, logged = weigh(terms, self.weights, self.teams)
         failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
-        terminated = failed | self.ending(state, robot_state)
-        metrics = {**logged, **self.outcome(state, robot_state, failed), "collision": collision}
+        terminated = failed | shaped("ending", self.ending(state, robot_state), (), dtype=bool)
+        outcome = numbers("outcome", self.outcome(state, robot_state, failed))
+        metrics = {**logged, **outcome, "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
         metrics = {name: clean(value, self.metrics_if_diverged.get(name, 0.0)) for name, value in metrics.items()}
-        return dataclasses.replace(
-            state,
-            reward=clean(reward),
-            terminated=terminated,
-            metrics={**metrics, "diverged": diverged.astype(jnp.float32)},
-            truncated=~terminated & (state.step >= self.max_steps),
-        )
+        metrics["diverged"] = diverged.astype(jnp.float32)
+        truncated = ~terminated & (state.step >= self.max_steps)
+        reward = clean(reward)
+        return dataclasses.replace(state, reward=reward, terminated=terminated, truncated=truncated, metrics=metrics)
 
     def read(self, data: mjx.Data) -> RobotState:
         """Returns the state of all robots."""
@@ -338,7 +338,7 @@ class QuadrupedEnv(Task[S, P]):
 
     def _observed(self, state: State[S], robot_state: RobotState, key: jax.Array) -> State[S]:
         layout = self.observation_layout
-        obs = layout.pack(self.observe(state, robot_state))
+        obs = layout.pack(self.observe(state, robot_state), self.num_agents)
         noise = self.params.randomization.observation_noise
         if noise:
             obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)

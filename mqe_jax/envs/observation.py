@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.envs.returned import named, shaped
+
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
 
@@ -66,22 +68,15 @@ class ObservationLayout:
             start += block.width
         raise KeyError(f"observation block: unknown name {name!r}; allowed: {', '.join(self.names)}")
 
-    def pack(self, values: Mapping[str, jax.Array]) -> jax.Array:
-        """Concatenates named blocks (..., width) into observations (..., size).
+    def pack(self, values: Mapping[str, jax.Array], agents: int | None = None) -> jax.Array:
+        """Concatenates named blocks (A, width) into observations (A, size).
 
         Raises:
-            ValueError: if names or widths do not match the layout.
+            ValueError: if names, widths or A, where it is given, do not match.
         """
-        if set(values) != set(self.names):
-            raise ValueError(f"observation: blocks {sorted(values)} do not match the layout {sorted(self.names)}")
-        parts = []
-        for block in self.blocks:
-            part = values[block.name]
-            if part.shape[-1] != block.width:
-                raise ValueError(
-                    f"observation block {block.name}: width {part.shape[-1]}; the layout has {block.width}"
-                )
-            parts.append(part)
+        named("observe", values, self.names)
+        rows = (agents or len(values[self.names[0]]),)
+        parts = [shaped(f"observe: {block.name}", values[block.name], (*rows, block.width)) for block in self.blocks]
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
     def split(self, observation: jax.Array) -> dict[str, jax.Array]:

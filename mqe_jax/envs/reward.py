@@ -9,6 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.envs.returned import named, shaped
+
 
 def weigh(
     terms: Mapping[str, jax.Array], weights: Any, teams: Sequence[Sequence[int]]
@@ -27,13 +29,13 @@ def weigh(
             prefix `team1/`.
 
     Raises:
-        ValueError: if the names differ.
+        ValueError: if names or shapes differ.
     """
-    names = [field.name for field in dataclasses.fields(weights)]
-    if set(terms) != set(names):
-        raise ValueError(f"reward: terms {sorted(terms)} do not match the weights {sorted(names)}")
-    weighted = {name: getattr(weights, name) * jnp.asarray(terms[name], jnp.float32) for name in names}
-    agents = sum(map(len, teams))
+    names, agents = [field.name for field in dataclasses.fields(weights)], sum(map(len, teams))
+    named("rewards", terms, names)
+    shapes = ((), (agents,))
+    given = {name: shaped(f"rewards: {name}", terms[name], *shapes).astype(jnp.float32) for name in names}
+    weighted = {name: getattr(weights, name) * term for name, term in given.items()}
     total = sum((jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents))
     values = {**{f"reward/{name}": value for name, value in weighted.items()}, "average_step_reward": total}
     logged = {

@@ -1,0 +1,57 @@
+"""Checks of what the methods of a task return; a ValueError names the method, what it returned and what is expected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NoReturn
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.errors import shown
+
+
+def weights_of(params: Any) -> Any:
+    """Returns the weights of the reward terms, the field `rewards` of a task's parameters."""
+    if not hasattr(params, "rewards"):
+        _fail(f"Params = {type(params).__name__}", "no field rewards", "one, the weights of the reward terms")
+    return params.rewards
+
+
+def named(method: str, values: Any, names: Iterable[str]) -> None:
+    """Checks that values are a mapping of these names."""
+    if not isinstance(values, Mapping) or set(values) != set(names):
+        _fail(method, sorted(values) if isinstance(values, Mapping) else _kind(values), f"by name: {sorted(names)}")
+
+
+def shaped(method: str, value: Any, *shapes: tuple[int, ...], dtype: Any = None) -> jax.Array:
+    """Returns an array of one of these shapes, and of a dtype if one is given."""
+    if value is None or jnp.shape(value) not in shapes or dtype not in (None, getattr(value, "dtype", type(value))):
+        _fail(method, _kind(value), " or ".join(map(str, shapes)) + ("" if dtype is None else f" {dtype.__name__}"))
+    return jnp.asarray(value)
+
+
+def numbers(method: str, values: Any) -> dict[str, jax.Array]:
+    """Returns numbers () by name."""
+    if not isinstance(values, Mapping):
+        _fail(method, _kind(values), "numbers by name")
+    return {name: shaped(f"{method}: {name}", value, ()) for name, value in values.items()}
+
+
+def alike(method: str, values: Any, before: Any) -> Any:
+    """Returns a pytree with the structure, shapes and dtypes of another."""
+    now, then = jax.tree.map(_kind, values), jax.tree.map(_kind, before)
+    if jax.tree.flatten(now) != jax.tree.flatten(then):
+        _fail(method, now, f"as before, {then}")
+    return values
+
+
+def _kind(value: Any) -> str:
+    """Returns the shape and dtype of an array, or what else a value is."""
+    if isinstance(value, bool | int | float) or hasattr(value, "dtype"):
+        return f"{jnp.shape(value)} {jnp.result_type(value)}"
+    return shown(value)
+
+
+def _fail(method: str, found: object, expected: str) -> NoReturn:
+    raise ValueError(f"{method}: {found}; expected {expected}")
