@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import re
 import shutil
 import signal
 import socket
@@ -490,11 +491,13 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_jax_raises_where_another_process_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     text = "UNKNOWN: Gloo AllGather failed: [external/gloo/gloo/transport/tcp/pair.cc:538] Connection reset by peer"
     monkeypatch.setattr(jax, "process_count", lambda: 2)
-    for error in (jax.errors.JaxRuntimeError(text), ValueError(text)):
+    lost = "INTERNAL: NCCL operation async_err failed: remote process exited or there was a network error"
+    for error in (jax.errors.JaxRuntimeError(text), ValueError(text), jax.errors.JaxRuntimeError(lost)):
         with pytest.raises(ConnectionError, match=devices.PEER_ENDED), devices.connected():
             raise error
-    for other in (ValueError("shapes"), InputError("run_dir: Gloo")):
-        with pytest.raises(type(other), match=str(other)), devices.connected():
+    memory = "NCCL operation ncclCommInitRank() failed: unhandled cuda error. Last NCCL warning: 'out of memory'."
+    for other in (ValueError("shapes"), InputError("run_dir: Gloo"), jax.errors.JaxRuntimeError(memory)):
+        with pytest.raises(type(other), match=re.escape(str(other))), devices.connected():
             raise other
 
 

@@ -26,8 +26,12 @@ from mqe_jax.train.types import PyTree
 
 AXIS = "processes"
 
-PEER = re.compile(r"[Gg]loo|NCCL|[Cc]onnection (reset|closed)|coordination|distributed service")
-"""Occurs in what JAX says where another process has ended."""
+PEER = re.compile(
+    r"^(?!.*NCCL.*(unhandled cuda error|invalid (argument|usage)))"  # of this process
+    r".*([Gg]loo|NCCL|[Cc]onnection (reset|closed)|coordination|distributed service)",
+    re.DOTALL,
+)
+"""Matches what JAX says where another process has ended."""
 PEER_ENDED = "another process of the training, or its host, has ended"
 
 _WHOLE = PartitionSpec()
