@@ -1,6 +1,7 @@
 """Self-play: trains Sumo Wrestling against a frozen snapshot of the policy itself and a scripted opponent.
 
-`python examples/self_play.py` prints win and loss rates against both; a minute on a CPU.
+`python examples/self_play.py` prints the results against both; a minute or two on a CPU. 41,000 steps teach little, the
+shipped policy was trained for 150 million: `mqe train go1wrestling` has the settings.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
     network = {"recurrent": False, "hidden_sizes": [64, 64], "openrl_layers": True}
     settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
     config = build(TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True})
-    matches = VectorEnv(make("go1wrestling", episode_length=5.0, num_envs=num_envs), num_envs)
+    matches = VectorEnv(make("go1wrestling", rewards={"push": 3.0, "approach": 1.0}, num_envs=num_envs), num_envs)
 
     one_team = versus(matches, ["idle"])  # for the sizes of a policy; its first snapshot is untrained
     learner = make_learner(one_team, config)
@@ -47,4 +48,4 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
 
 if __name__ == "__main__":
     for name, result in zip(("snapshot", "scripted"), main(), strict=True):
-        print(f"against {name}: {result.match['win_rate']:.0%} won, {result.match['loss_rate']:.0%} lost")
+        print(f"against {name}: " + ", ".join(f"{rate} {value:.0%}" for rate, value in result.match.items()))

@@ -15,7 +15,7 @@ from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Number
-from mqe_jax.policies import load_opponent
+from mqe_jax.policies import load_as
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
@@ -217,7 +217,7 @@ def versus(env: VectorEnv | Wrapper, opponents: Sequence[Policy | str | Path], *
     for policy in opponents:
         if not isinstance(policy, str | Path) and not hasattr(policy, "initial_memory"):
             fail("opponents", policy, "a policy, or what load_policy accepts")
-    policies = [load_opponent(x, env.env) if isinstance(x, str | Path) else x for x in opponents]
+    policies = [load_as("opponent", x, env.env) if isinstance(x, str | Path) else x for x in opponents]
     return Versus(env, policies, draw_reward)
 
 

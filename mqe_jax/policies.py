@@ -120,12 +120,12 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     return policy
 
 
-def load_opponent(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
-    """Returns `load_policy` for an opponent, which errors name so."""
+def load_as(field: str, source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
+    """Returns `load_policy` for a setting or argument, which errors name."""
     try:
         return load_policy(source, env, deterministic=deterministic)
     except InputError as error:
-        raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
+        raise InputError(str(error).replace("policy:", f"{field}:", 1)) from None
 
 
 def check_policy(policy: TrainedPolicy, env: QuadrupedEnv, name: str = "policy") -> None:
@@ -178,8 +178,7 @@ def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array], jax.Array]:
     plan = scripted_policy(env, name)
     if env.control != "command":
         raise InputError(
-            f"policy: {name!r} outputs walk commands; control must be 'command', not {env.control!r}; "
-            "with it give --policy random or idle"
+            f"policy: {name!r} outputs walk commands; control is {env.control!r}, use another, such as random"
         )
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")

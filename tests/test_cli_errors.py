@@ -29,6 +29,11 @@ BAD = {
     "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
     "policy": (["eval", "fake", "--policy", "randm"], ["policy: unknown 'randm'", "random", "a run folder"]),
+    "file without its suffix": (["eval", "./fifo"], ["'./fifo' is not a folder", "*.safetensors"]),
+    "control of a teacher": (
+        ["train", "go1sheep-easy", "--control", "position"],
+        ["imitation.teacher: 'scripted'", "'position'"],
+    ),
     "policy's file": (["eval", "fake", "--policy", "runs/none"], ["runs/none", "no such file"]),
     "opponent": (["eval", "go1tug", "--opponent", "randm"], ["opponent: unknown 'randm'", "random", "a run folder"]),
     "opponent of no match": (["eval", "fake", "--opponent", "idle"], ["opponent: fake is not a competitive task"]),

@@ -5,9 +5,11 @@ One scene has every kind of object; the soak compares all tasks. `python -m test
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import gc
 import os
+import pickle
 import subprocess
 import sys
 import weakref
@@ -364,6 +366,14 @@ def test_what_a_host_function_raises_ends_the_program() -> None:
     owner = Owner()
     with pytest.raises(jax.errors.JaxRuntimeError, match="KeyboardInterrupt"):
         called(fail, 2, owner)(jnp.zeros((2, 3)), jnp.zeros((2, 3))).block_until_ready()
+
+
+def test_a_used_environment_can_be_copied() -> None:
+    env = make("go1gate", impl="c", num_envs=1)
+    step = lambda env: jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), jnp.ones((2, 3)))  # noqa: E731
+    obs = step(env).obs
+    for copied in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        np.testing.assert_array_equal(step(copied).obs, obs)
 
 
 def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,6 +87,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("env: ", lambda x, v: VectorEnv(v, 2), ("go1gate", None)),
     ("key: ", lambda x, v: x["matches"].reset(v), (3, "x", None, np.zeros(2))),
     ("key: ", lambda x, v: x["task"].reset(v), (3, "x", None, np.zeros(3, np.uint32))),
+    ("policy: ", lambda x, v: _evaluate(x, act=lambda obs, memory, key: v), (None, np.zeros((2, 2, 3)), (1, 2, 3))),
     ("episodes: ", lambda x, v: _evaluate(x, v), (0, -1, 1.5, NAN, "many", True, 10**12, b"1")),
     ("block: ", lambda x, v: _evaluate(x, block=v), (0, NAN, 1.5)),
     ("max_steps: ", lambda x, v: _evaluate(x, max_steps=v), (0, NAN, -1)),

@@ -217,6 +217,12 @@ def test_seeds_together_are_recorded_and_learn_as_alone(tmp_path: Path, alone: t
             np.testing.assert_allclose(float(one[name]), float(other[name]), rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+def test_a_seed_without_a_checkpoint_is_named(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
+    with pytest.raises(InputError, match=f"{alone[0].name} 80, new none"):
+        train_seeds(PROBE, [seeded(1), seeded(2)], [alone[0], tmp_path / "new"], resume=True)
+    assert not (tmp_path / "new").exists()
+
+
 def test_seeds_must_have_the_same_settings(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="only in the seed"):
         train_seeds(PROBE, [seeded(0), seeded(1, ppo__clip=0.3)], [tmp_path / "a", tmp_path / "b"])

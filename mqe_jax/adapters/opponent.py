@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
-from mqe_jax.policies import SimplePolicy, load_opponent
+from mqe_jax.policies import SimplePolicy, load_as
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.types import Memory
 
@@ -53,7 +53,7 @@ class TeamEnv:
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
         self.match = match
-        self.opponent = load_opponent(opponent, match) if isinstance(opponent, str | Path) else opponent
+        self.opponent = load_as("opponent", opponent, match) if isinstance(opponent, str | Path) else opponent
         self.num_agents = len(match.teams[0])
         if (self.opponent.task, self.opponent.agents) != (match.name, self.num_agents):
             raise InputError(

@@ -85,7 +85,7 @@ class PolicyOptions(TaskOptions):
         from mqe_jax import zoo
         from mqe_jax.cli import setup
         from mqe_jax.envs import ALIASES, PLANNERS, TASKS
-        from mqe_jax.policies import all_agents, load_opponent, load_policy
+        from mqe_jax.policies import all_agents, load_as, load_policy
         from mqe_jax.train.policy import TrainedPolicy
 
         task, params = ALIASES.get(self.target, self.target), self.overrides()
@@ -101,7 +101,7 @@ class PolicyOptions(TaskOptions):
         match = len(env.teams) > 1
         opponent, against = (own, name) if shipped and match else (None, "idle")
         if self.opponent is not None:
-            opponent, against = load_opponent(self.opponent, env, deterministic=self.deterministic), self.opponent
+            opponent, against = load_as("opponent", self.opponent, env, deterministic=self.deterministic), self.opponent
         about: dict[str, Any] = {"policy": name}
         if isinstance(own, TrainedPolicy):
             about["actions"] = "mean" if own.deterministic else "sampled"

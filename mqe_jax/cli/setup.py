@@ -20,7 +20,7 @@ from mqe_jax.files import parse_yaml
 from mqe_jax.league.league import League
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
-from mqe_jax.policies import all_agents, load_opponent, load_policy
+from mqe_jax.policies import all_agents, load_as, load_policy
 from mqe_jax.settings import Parameters, check, fail, joined, load_yaml, override
 from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
@@ -49,9 +49,12 @@ def run_config(target: str) -> Any:
     if target.endswith(".safetensors"):
         return load_policy(target).config
     if not Path(target).is_dir():
-        raise InputError(f"run: no folder {target!r}; allowed: a run folder, a policy file, or a task's id")
+        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
+        raise InputError(f"run: {target!r} is {'not a' if Path(target).exists() else 'no'} folder; allowed: {allowed}")
     if not (Path(target) / runner.CONFIG_FILE).is_file():
-        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder")
+        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{runner.CONFIG_FILE}"))
+        hint = f"; did you mean {runs[0]}?" if runs else ""
+        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder{hint}")
     config = runner.load_run_config(target)
     if config.task is None:
         raise InputError(f"{target}: {runner.CONFIG_FILE} has no 'task' entry")
@@ -85,7 +88,7 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
         if demonstrator is None:
             started = env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
         else:
-            policy = load_policy(demonstrator, both)
+            policy = load_as("curriculum.demonstrator", demonstrator, both)
             everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
             started = Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
         return Deadline(started) if config.time_limit_ends else started
@@ -103,7 +106,7 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     else:
         learning = Mirror(batch(config.num_envs // 2))
     if config.imitation.teacher is not None:
-        learning.teacher = load_policy(config.imitation.teacher, both)
+        learning.teacher = load_as("imitation.teacher", config.imitation.teacher, both)
     if len(both.teams) > 1 and eval_env is not None:
         fixed = [opponent for opponent in opponents if opponent not in MOVING]
         eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed or anchors(eval_env.env)[:1])
@@ -128,10 +131,13 @@ def check_start(config: TrainConfig) -> None:
     if config.start is not None:
         policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config)
     for name in {*config.opponents} - {*MOVING}:
-        load_opponent(name, env)
-    for name in (config.curriculum.demonstrator, config.imitation.teacher):
+        load_as("opponent", name, env)
+    for field, name in (
+        ("curriculum.demonstrator", config.curriculum.demonstrator),
+        ("imitation.teacher", config.imitation.teacher),
+    ):
         if name is not None:
-            load_policy(name, env)
+            load_as(field, name, env)
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:

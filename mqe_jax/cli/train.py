@@ -103,7 +103,9 @@ class Train(TaskOptions):
         if jax.process_index() > 0:  # one process writes the files
             return
         curves.draw_curve(folders, run_dir / "curve.png", self.target)
-        echo(f"mqe: {run_dir} has the policy, metrics.csv, curve.png; evaluate it with: mqe eval {folders[0]}")
+        for folder in folders:
+            echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
+        echo(f"mqe: {run_dir / 'curve.png'} has the curve")
 
 
 @record

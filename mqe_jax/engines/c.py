@@ -100,6 +100,9 @@ class _Stepper:
         self._lock = threading.Lock()
         self._retired = False
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Stepper, (self._model, self._motors)  # a copy has its own batches
+
     def retire(self) -> None:
         """Frees its batches, and those of later calls when they end. It takes no lock: a finaliser may interrupt."""
         self._retired = True

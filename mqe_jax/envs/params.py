@@ -33,7 +33,7 @@ class TaskParams:
     robot: str = "go1"
     """Name of the robot, such as go1 or go2 (`mqe_jax.robots`)."""
     episode_length: TimeLimit = 10.0
-    """Time limit, s."""
+    """Time limit, s, rounded to environment steps (0.02 s)."""
     spawn_height: Length = 0.42
     """Spawn height of the trunks, m."""
     spawn_noise: Distance = 0.1

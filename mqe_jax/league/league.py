@@ -18,7 +18,7 @@ from mqe_jax.envs.wrappers import Wrapper
 from mqe_jax.league import pool
 from mqe_jax.league.pool import Pool
 from mqe_jax.opponents import OUTCOMES, Versus, exchanged, versus
-from mqe_jax.policies import load_opponent
+from mqe_jax.policies import load_as
 from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.config import MOVING, TrainConfig
@@ -66,7 +66,7 @@ class League(Versus):
             fail("league.members", config.league.members, f"more than the blocks that play members, {drawn}")
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
         first = TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": matches.name})
-        policies = [first if source in MOVING else load_opponent(source, matches.env) for source in opponents]
+        policies = [first if source in MOVING else load_as("opponent", source, matches.env) for source in opponents]
         super().__init__(matches, policies, config.draw_reward)
         self._members = config.league.members if drawn else 1
         self._moving = np.array([source in DRAWN for source in opponents])

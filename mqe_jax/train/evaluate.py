@@ -5,6 +5,7 @@ Short episodes are therefore not over-represented.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -86,12 +87,19 @@ def acting(policy: Policy | Act, task: str, num_envs: int, memory: Memory = ()) 
     """Returns the function of a policy of a task, or a function itself, and its initial recurrent state."""
     either: Any = policy
     if not hasattr(either, "act"):
-        return either, memory
+        return functools.partial(_given, either), memory
     if (trained := getattr(either, "task", "")) and trained != task:
         fail("policy", f"one of {trained}", f"one of {task}; its `act` may be given alone")
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
     return either.act, either.initial_memory(num_envs)
+
+
+def _given(function: Act, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    returned = function(obs, memory, key)
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        fail("policy", f"a function that returns {type(returned).__name__}", "one that returns (action, memory)")
+    return returned
 
 
 @checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)

@@ -97,6 +97,7 @@ def train_seeds(
         if processes.leads:
             for folder in folders:
                 check_alone(folder)
+            _common_checkpoints(folders)
             for folder in folders:
                 check_folder(folder)
                 locks.enter_context(locked(folder))
@@ -123,8 +124,11 @@ def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
         return [steps[max(common)] for steps in by_step]
     if all(not steps or 0 in steps for steps in by_step):
         return [None] * len(folders)
+    newest = ", ".join(
+        f"{folder.name} {max(steps, default='none')}" for folder, steps in zip(folders, by_step, strict=True)
+    )
     raise InputError(
-        f"run_dir: {folders[0].parent}: its seeds have no checkpoint of the same step; resume them separately"
+        f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds ({newest}); resume them separately"
     )
 
 

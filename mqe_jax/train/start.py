@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail, is_record, override, to_mapping
-from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata
+from mqe_jax.train.checkpoint import checkpoint_step, load_tree, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.learner import Learner, TrainState, make_learner
@@ -74,6 +74,8 @@ def first_state(
     if not isinstance(before, dict) or not isinstance(seconds, int | float):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
     check_same(checkpoint.parent.parent, before, config)
+    if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
+        fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
     whole = metadata.get("environments", True)
     template = processes.whole
     saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
