@@ -203,7 +203,7 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
     score, games, rating, played, recent = np.zeros(members), np.zeros(members), 0.0, np.zeros(5), np.zeros((5, 3))
     for number in range(30):
         member = random.integers(0, 3, 5)
-        outcomes = random.integers(0, 40 if number % 7 == 0 else 4, (5, 3)) * (random.random((5, 1)) < 0.7)
+        outcomes = random.integers(0, 400 if number % 7 == 0 else 4, (5, 3)) * (random.random((5, 1)) < 0.7)
         state = state._replace(member=jnp.asarray(member, jnp.int32))
         state = env._recorded(state, [SimpleNamespace(outcomes=jnp.asarray(row)) for row in outcomes])
         gained, met = 0.0, set()

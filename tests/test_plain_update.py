@@ -31,7 +31,7 @@ COMMON: dict[str, Any] = {
     "rollout_steps": T,
     "total_steps": 10 * T * N,
     "ppo": {"epochs": 2, "minibatches": 2, "gamma": 0.9, "gae_lambda": 0.8, "clip": 0.1, "value_coef": 0.7},
-    "optimizer": {"learning_rate": 0.02, "max_grad_norm": 0.5, "eps": 1e-3},
+    "optimizer": {"learning_rate": 0.004, "max_grad_norm": 0.5, "eps": 1e-3},
     "network": {"hidden_sizes": (5,), "activation": "tanh", "recurrent": False, "log_std_init": -0.5},
 }
 

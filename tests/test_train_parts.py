@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.settings import build
-from mqe_jax.train import loss, nn
+from mqe_jax.train import nn
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import PPO, Curriculum, Imitation, OptimizerSettings, TrainConfig
 from mqe_jax.train.loss import gae
@@ -46,51 +46,10 @@ def test_gae_by_hand_with_termination_truncation_and_going_on() -> None:
     np.testing.assert_allclose(target, advantage + 2.0)
 
 
-def test_gae_broadcasts_flags_over_agents() -> None:
-    shape = (4, 3, 2)
-    done = jnp.zeros((4, 3), bool).at[1].set(True)
-    advantage, _ = gae(jnp.ones(shape), jnp.zeros(shape), jnp.ones(shape), done, done, gamma=0.9, gae_lambda=1.0)
-    assert advantage.shape == shape
-    np.testing.assert_allclose(advantage[1], 1.0)
-
-
 def test_gae_of_integer_rewards_keeps_fractions_of_the_bootstrap() -> None:
     ones = jnp.ones((1, 1), jnp.int32)
     advantage, _ = gae(ones, jnp.zeros((1, 1)), 2.0 * ones, 0.3 * ones, ones.astype(bool), gamma=1.0, gae_lambda=1.0)
     np.testing.assert_allclose(advantage, [[1.0 + 0.7 * 2.0]], rtol=1e-6)
-
-
-def test_clipped_surrogate_by_hand() -> None:
-    log_ratio = jnp.log(jnp.array([1.5, 1.5, 0.5, 0.5, 5.0]))
-    advantage = jnp.array([1.0, -1.0, 1.0, -1.0, -1.0])
-    expected = [-1.2, 1.5, -0.5, 0.8, 5.0]
-    np.testing.assert_allclose(loss.clipped_surrogate(log_ratio, advantage, 0.2), expected, rtol=1e-5)
-    dual = loss.clipped_surrogate(log_ratio, advantage, 0.2, dual_clip=3.0)
-    np.testing.assert_allclose(dual, [-1.2, 1.5, -0.5, 0.8, 3.0], rtol=1e-5)
-
-
-def test_value_loss_is_clipped_and_huber() -> None:
-    value, old, target = jnp.array([1.0, 1.0]), jnp.array([0.0, 1.0]), jnp.array([1.0, 21.0])
-    # kept to 0.2: error 0.8; free: error 20, beyond the Huber delta of 10
-    expected = [0.5 * 0.8**2, 10 * (20 - 5)]
-    np.testing.assert_allclose(loss.value_loss(value, old, target, 0.2, 10.0), expected, rtol=1e-6)
-    np.testing.assert_allclose(loss.value_loss(value, old, target, None, None), [0.0, 200.0], rtol=1e-6)
-
-
-def test_gaussian_density_and_entropy() -> None:
-    action, mean, log_std = jnp.array([0.5]), jnp.array([0.1]), jnp.array([-0.3])
-    std = math.exp(-0.3)
-    expected = -0.5 * (0.4 / std) ** 2 - math.log(std * math.sqrt(2 * math.pi))
-    np.testing.assert_allclose(loss.log_prob(action, mean, log_std), [expected], rtol=1e-5)
-    np.testing.assert_allclose(loss.entropy(log_std), 0.5 * math.log(2 * math.pi * math.e * std**2), rtol=1e-5)
-
-
-def test_ratio_functions_by_hand() -> None:
-    new = jnp.array([[0.1, 0.2], [0.3, 0.4]])  # 2 agents, 2 dimensions
-    old = jnp.zeros((2, 2))
-    np.testing.assert_allclose(loss.ratio_per_agent(new, old), [[0.3], [0.7]], rtol=1e-6)
-    np.testing.assert_allclose(loss.ratio_per_dimension(new, old), new)
-    np.testing.assert_allclose(loss.ratio_joint(new, old), [[1.0]], rtol=1e-6)
 
 
 def test_schedules_by_hand() -> None:
@@ -160,17 +119,12 @@ def test_value_statistics_at_their_limits() -> None:
     np.testing.assert_allclose(value_normalize(statistics, jnp.float32(5.5)), 100.0, rtol=2e-2)
 
 
-def test_adam_first_step_has_the_size_of_the_learning_rate_and_clips() -> None:
-    params = {"a": jnp.zeros(3), "b": {"c": jnp.zeros(())}}
-    gradient = {"a": jnp.array([30.0, 0.0, -40.0]), "b": {"c": jnp.array(0.0)}}
-    optimizer = adam(eps=1e-8, max_grad_norm=1.0)
-    params, state, norm = optimizer.update(gradient, optimizer.init(params), params, 0.1)
-    assert float(norm) == pytest.approx(50.0)
-    np.testing.assert_allclose(params["a"], [-0.1, 0.0, 0.1], rtol=1e-4)
-    np.testing.assert_allclose(state.mean["a"], [0.1 * 0.6, 0.0, -0.1 * 0.8], rtol=1e-5)
-    small = {"a": jnp.array([0.3, 0.0, -0.4]), "b": {"c": jnp.array(0.0)}}
-    state = optimizer.update(small, optimizer.init(params), params, 0.1)[1]
-    np.testing.assert_allclose(state.mean["a"], [0.03, 0.0, -0.04], rtol=1e-5)  # a small gradient stays as it is
+def test_a_small_gradient_is_not_clipped() -> None:
+    optimizer, params = adam(max_grad_norm=1.0), {"a": jnp.zeros(2)}
+    gradient = {"a": jnp.array([0.3, -0.4])}
+    _, state, norm = optimizer.update(gradient, optimizer.init(params), params, 0.1)
+    assert float(norm) == pytest.approx(0.5)
+    np.testing.assert_allclose(state.mean["a"], [0.03, -0.04], rtol=1e-5)
 
 
 def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() -> None:
@@ -185,13 +139,6 @@ def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() ->
     assert float(optimizer.update(gradient, begun_anew(state, False), params, 0.1)[0]["a"]) < -0.15
     again = begun_anew(state, jnp.bool_(True))
     assert float(optimizer.update(gradient, again, params, 0.1)[0]["a"]) == pytest.approx(-0.1, rel=1e-4)
-
-
-@pytest.mark.parametrize("shape", [(8, 3), (3, 8)])
-def test_orthogonal_columns_or_rows(shape: tuple[int, int]) -> None:
-    matrix = nn.orthogonal(KEY, shape, 2.0)
-    product = matrix.T @ matrix if shape[0] > shape[1] else matrix @ matrix.T
-    np.testing.assert_allclose(product, 4.0 * np.eye(3), atol=1e-5)
 
 
 def test_mlp_has_no_activation_after_the_last_layer() -> None:
@@ -257,15 +204,6 @@ def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
     assert float(entropy(beyond)) == pytest.approx(3 * 0.5 * math.log(2 * math.pi * math.e) - 1 - 2 - 3, rel=1e-5)
     np.testing.assert_array_equal(jax.grad(entropy)(beyond), [1.0, 1.0, 0.0])
     np.testing.assert_array_equal(jax.grad(lambda x: -entropy(x))(beyond), [0.0, -1.0, -1.0])
-
-
-def test_layer_norm_has_mean_zero_and_variance_one_before_scale_and_shift() -> None:
-    x = 3.0 + 5.0 * jax.random.normal(KEY, (7, 64))
-    y = np.asarray(nn.layer_norm(nn.layer_norm_init(64), x))
-    np.testing.assert_allclose(y.mean(axis=-1), 0.0, atol=1e-5)
-    np.testing.assert_allclose(y.std(axis=-1), 1.0, atol=1e-4)
-    params = {"scale": jnp.full(64, 2.0), "shift": jnp.full(64, -1.0)}
-    np.testing.assert_allclose(nn.layer_norm(params, x), 2.0 * y - 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("recurrent", [False, True])
