@@ -145,10 +145,6 @@ def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(t
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
 
 
-def test_a_trunk_too_low_has_fallen(gate: QuadrupedEnv) -> None:
-    assert gate.fallen(robot_state([[1.0, 0.0, 0.07], [1.0, 1.0, 0.3]])).tolist() == [True, False]
-
-
 # -- Climb on Seesaw ---------------------------------------------------------------------------------------------------
 
 

@@ -148,17 +148,6 @@ def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate
         assert np.abs(np.asarray(jax.jit(gate.reset)(key).data.qpos - after.data.qpos)).max() > 1e-3
 
 
-def test_assistance_freezes_one_agent_and_is_off_by_default(gate: QuadrupedEnv) -> None:
-    reset = jax.jit(jax.vmap(gate.reset, (0, None)))
-    keys = jax.random.split(jax.random.PRNGKey(0), 32)
-    assert not np.asarray(reset(keys, 0.0).frozen_steps).any()
-    assisted = reset(keys, 1.0)
-    frozen = np.asarray(assisted.frozen_steps)
-    assert np.all((frozen > 0).sum(1) <= 1) and (frozen[:, 0] > 0).any() and (frozen[:, 1] > 0).any()
-    times = frozen.max(axis=1) * gate.dt / gate.params.frozen_time
-    assert times.max() <= 1.0 and 0.2 < times.std() < 0.4  # uniform: 0.29
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -363,16 +352,6 @@ def test_a_mistake_in_a_task_names_the_method(mistake: str) -> None:
     with pytest.raises(ValueError, match=said):
         env: Any = type("Bad", (Go1Plane,), methods)(impl="c", control="position", num_envs=1)
         jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros((2, 12))), jax.random.PRNGKey(0))
-
-
-def test_a_recording_holds_the_last_episode_whatever_its_first_step(
-    gate: QuadrupedEnv, fresh: State, tmp_path: Any
-) -> None:
-    actions = jnp.arange(6.0)[:, None, None] * jnp.ones((2, 12))
-    states = dataclasses.replace(trajectory(gate, fresh, actions), step=jnp.array([7, 8, 9, 3, 4, 5]))
-    replay.save_recording(tmp_path / "gate.npz", gate, states, actions)
-    recording = replay.load_recording(tmp_path / "gate.npz")
-    assert recording.states["step"].tolist() == recording.actions[:, 0, 0].tolist() == [3, 4, 5]
 
 
 def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: Any) -> None:

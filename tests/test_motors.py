@@ -289,16 +289,6 @@ def test_pushes_come_once_per_period_on_average() -> None:
     assert np.abs(change).max() < 12.0 and np.abs(change.mean()) < 1.0
 
 
-def test_observation_noise_spares_the_one_hots() -> None:
-    env = make("go1gate", impl="c", control="position", randomization={"observation_noise": 0.1})
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 8))
-    blocks = env.observation_layout.split(state.obs)
-    np.testing.assert_array_equal(blocks["one_hot"], np.tile(np.eye(2), (8, 1, 1)))
-    exact = jax.vmap(lambda state: env.observe(state, env.read(state.data))["gate"])(state)
-    error = np.asarray(blocks["gate"] - exact)
-    assert 0.05 < error.std() < 0.2
-
-
 def test_the_privileged_observation_contains_the_randomised_physics_and_gait_phase() -> None:
     ranges: dict[str, Any] = {"friction": (0.5, 1.25), "payload": (0.0, 2.0), "center_of_mass": (-0.02, 0.02)}
     drawn = Randomization(**ranges, motor_strength=(0.9, 1.1), action_lag=3)

@@ -67,15 +67,6 @@ def test_a_box_slides_under_more_than_its_friction_only() -> None:
     assert moved[1] == pytest.approx(0.3 * objects.GRAVITY / 2, rel=0.1)  # (0.8 - 0.5) g for a second
 
 
-def test_a_flock_gathers_at_the_speed_of_the_paper() -> None:
-    """Of two sheep without friction and dogs, each moves inward by two thirds of the restlessness on average."""
-    place, still, far = jnp.array([[-2.0, 0.0], [2.0, 0.0]]), jnp.zeros((2, 2)), jnp.array([[0.0, 50.0]])
-    move = functools.partial(flock, restlessness=0.3, step=STEP, friction=0.0)
-    velocity = jax.vmap(lambda key: move(key, place, still, far))(jax.random.split(jax.random.PRNGKey(0), 8192))
-    np.testing.assert_allclose(velocity.mean(0), [[0.2, 0.0], [-0.2, 0.0]], atol=0.03)
-    np.testing.assert_allclose(velocity.std(0), 0.6, atol=0.03)
-
-
 def run_flock(position: Any, dogs: Any, steps: int, restlessness: float = 0.0, seed: int = 0) -> np.ndarray:
     """Positions (T, S, 2) of unobstructed sheep."""
 
@@ -299,19 +290,3 @@ def pushed(robots: int) -> float:
 
 def test_two_robots_push_the_box_clearly_faster_than_one() -> None:
     assert 0.1 < pushed(1) < 0.7 * pushed(2)
-
-
-def test_motor_strength_is_a_factor_on_all_torques() -> None:
-    """Also on those that the joint's angle and speed cause, in PD control."""
-    env = make("go1plane", impl="c", control="position", num_envs=1, randomization={"motor_strength": (0.5, 0.8)})
-    params, model = env.randomizer.sample(jax.random.PRNGKey(0)), env.compiled.model
-    data, varied, forces = mujoco.MjData(model), model.__copy__(), []
-    for name, value in env.randomizer.fields(params).items():
-        getattr(varied, name)[:] = value
-    data.ctrl[:], data.qvel[:] = data.qpos[env.index.joint_qpos].ravel() + 0.1, 0.5
-    for used in (model, varied):
-        mujoco.mj_forward(used, data)
-        forces.append(data.actuator_force[env.index.actuator])
-    strength = np.asarray(params.motor_strength)[:, None]
-    assert 0.5 <= strength.min() < strength.max() <= 0.8 and np.abs(forces[0]).min() > 1.0
-    np.testing.assert_allclose(forces[1], strength * forces[0], rtol=1e-5)

@@ -220,13 +220,6 @@ def test_gate_stands_where_each_environment_drew_it() -> None:
     np.testing.assert_allclose(gap[:, 1] - right[:, 1] - half, 0.3, atol=1e-5)
 
 
-def test_robots_start_with_velocities_of_either_sign() -> None:
-    env = made("go1gate")
-    states = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.PRNGKey(0), 32), 0.0)
-    velocity = np.asarray(states.data.qvel[:, env.index.base_qvel]) / env.params.spawn_velocity  # (32, R, 6)
-    assert np.all(np.abs(velocity) <= 1.0) and np.all(velocity.min(0) < -0.5) and np.all(velocity.max(0) > 0.5)
-
-
 def test_engine_names_are_checked() -> None:
     with pytest.raises(ValueError, match=r"impl.*'wrap'.*did you mean 'warp'"):
         engines.resolve("wrap")

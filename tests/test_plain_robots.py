@@ -145,11 +145,11 @@ def test_blocks_follow_each_other_along_the_track() -> None:
     for wall, side in zip(layout.walls[:2], (-1, 1), strict=True):
         assert wall.size == (0.2, pytest.approx(2.0), 0.6)  # (4.0 - 0.8) / 2 + 0.1 + 0.3
         assert wall.center == (0.0, pytest.approx(side * 1.4), 0.3)
-    assert {b.name: (b.point, b.length) for b in layout.barriers} == {
-        "back0": ((0.0, 0.0), 4.0),
-        "end4": ((10.5, 0.0), 4.0),
-        "side_right": ((5.25, -2.0), 10.5),
-        "side_left": ((5.25, 2.0), 10.5),
+    assert {b.name: (b.point, b.normal, b.length) for b in layout.barriers} == {
+        "back0": ((0.0, 0.0), (1.0, 0.0), 4.0),
+        "end4": ((10.5, 0.0), (-1.0, 0.0), 4.0),
+        "side_right": ((5.25, -2.0), (0.0, 1.0), 10.5),
+        "side_left": ((5.25, 2.0), (0.0, -1.0), 10.5),
     }
     spaced = Track((Plane(1.0), SpawnArea(2.0, spawn_x=0.5, spacing=0.7)), num_robots=2).layout()
     np.testing.assert_allclose(spaced.spawn, [[1.5, -0.35, 0], [1.5, 0.35, 0]])
