@@ -20,7 +20,6 @@ import pytest
 
 from mqe_jax.cli.arguments import parse
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
-from mqe_jax.errors import InputError
 from mqe_jax.planners import scripted_policy
 from mqe_jax.train.evaluate import evaluate
 from mqe_jax.train.networks import NETWORKS
@@ -86,12 +85,6 @@ def test_shell_blocks_are_commands_that_exist(page: str) -> None:
             assert (ROOT / words[1]).is_file(), words
         else:
             assert program in SHELL, words
-
-
-def test_a_wrong_command_would_be_found() -> None:
-    for wrong in (["trian", "go1gate"], ["train", "go1gate", "--confg", "demo"], ["view"]):
-        with pytest.raises((InputError, SystemExit)):
-            parse(wrong)
 
 
 # -- examples and notebooks --------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.errors import InputError
 from tests.soak import play, processes
-from tests.soak.__main__ import Options, Report, main
+from tests.soak.__main__ import Options, Report
 from tests.soak.processes import Outcome, Sample
 from tests.states import initial, made, placed
 
@@ -42,26 +42,6 @@ def test_rows_of_fewer_steps_are_repeated_and_those_of_another_engine_are_not_co
     assert [list(more.pending("play", ["a"], steps)) for steps in (1000, 1200, 1201)] == [[], [], ["a"]]
     with pytest.raises(InputError, match=r"soak\.json: has rows of the engine c; name another --folder"):
         Report(tmp_path, Options(engine="warp"), minutes=1.0)
-
-
-def test_a_killed_soak_keeps_its_rows_and_plays_only_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that ends in the second task; the same command with the same folder plays this task and the third."""
-    given = "play --robot go1 --mode random-command --task go1gate --task go1seesaw --task go1tug --steps 9"
-    monkeypatch.setattr(sys, "argv", ["soak", *given.split(), "--minutes", "1", "--folder", str(tmp_path)])
-    begun: list[str] = []
-
-    def played(task: str, *_: Any) -> dict[str, Any]:
-        begun.append(task)
-        if begun == ["go1gate", "go1seesaw"]:
-            raise SystemExit
-        return {"steps": 9} | dict.fromkeys(("diverged", "outside", "overflow", "not_finite"), 0)
-
-    monkeypatch.setattr(play, "played", played)
-    with pytest.raises(SystemExit):
-        main()
-    assert list(json.loads((tmp_path / "soak.json").read_text())["parts"]["play"]) == ["go1gate go1 random-command"]
-    assert main() == 0 and main() == 0
-    assert begun == ["go1gate", "go1seesaw", "go1seesaw", "go1tug"]
 
 
 @pytest.mark.parametrize(("grown", "files", "wrong"), [(1.02, 20, 0), (1.2, 20, 1), (1.0, 40, 1)])

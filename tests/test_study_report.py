@@ -214,19 +214,6 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
     np.testing.assert_allclose(profiles, case["profile_interval"], rtol=1e-9, atol=1e-12)
 
 
-def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
-    assert statistics.interquartile_mean([[-100.0], [1.0], [2.0], [3.0], [1000.0]]) == 2.0
-    assert statistics.interquartile_mean([[5.0], [7.0]]) == 6.0
-
-
-def test_an_interval_holds_its_statistic_and_repeats() -> None:
-    x = np.random.default_rng(3).normal(size=(8, 2))
-    iqm = statistics.interquartile_mean
-    ends = [statistics.bootstrap_interval([x], iqm, np.random.default_rng(0)) for _ in range(2)]
-    assert ends[0] == ends[1]
-    assert ends[0][0] < iqm(x) < ends[0][1]
-
-
 @pytest.mark.parametrize("scores", [np.zeros(3), np.zeros((0, 2)), np.array([[np.nan]])])
 def test_bad_scores_are_refused(scores: np.ndarray) -> None:
     with pytest.raises(InputError, match="scores"):
