@@ -48,22 +48,14 @@ class MjxEngine(Engine):
 
     @abc.abstractmethod
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """Advances by one physics step.
-
-        Args:
-            model: `mjx_model`, possibly with other field values.
-            data: state of the environment.
+        """Advances by one physics step of `mjx_model`, possibly with other field values.
 
         Returns:
             Data, and whether contacts may have been dropped () bool.
         """
 
     def unused_terms(self, fields: Collection[str]) -> int:
-        """Returns the disable flags of terms that need no computation.
-
-        Args:
-            fields: names of the model fields that environments override.
-        """
+        """Returns the disable flags of terms that need no computation where environments override some fields."""
         return 0
 
     def advance(

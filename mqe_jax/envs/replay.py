@@ -49,14 +49,7 @@ class Recording:
 
 
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
-    """Writes the last episode of a sequence of states to an .npz file, atomically.
-
-    Args:
-        file: to write.
-        env: the environment.
-        states: of one environment before each action (T, ...).
-        actions: (T, A, D).
-    """
+    """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
     first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
     about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
@@ -87,11 +80,7 @@ def load_recording(file: str | pathlib.Path) -> Recording:
 
 
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
-    """Replays a recording from its first state; returns the states after each action (T, ...).
-
-    Args:
-        recording: see `load_recording`.
-        env: from `Recording.make_env`, on any engine; by default on the recorded one.
+    """Replays a recording, by default on the recorded engine; returns the states after each action (T, ...).
 
     Raises:
         InputError: if the recording's arrays do not fit the environment.

@@ -174,12 +174,7 @@ def check_alone(run_dir: Path) -> None:
 
 
 def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
-    """Checks that a folder holds no run, or with `resume` one that can be resumed.
-
-    Args:
-        run_dir: the folder.
-        resume: whether to resume a run in it.
-        files: names of a run's files, besides its checkpoints.
+    """Checks that a folder holds no run, or with `resume` one that can be resumed; `files` are a run's, by name.
 
     Raises:
         InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files and

@@ -64,10 +64,7 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
 def next_assistance(config: TrainConfig, assistance: jax.Array, success: jax.Array) -> jax.Array:
     """Returns the assistance () after an update, before annealing, by `curriculum.assistance_step`.
 
-    Args:
-        config: settings.
-        assistance: of the update ().
-        success: rate of success of the episodes that ended in it (); NaN without any, which leaves the assistance.
+    `success` is the rate of the episodes that ended in the update (); NaN without any, which leaves the assistance.
     """
     curriculum = config.curriculum
     if not curriculum.assistance_step:

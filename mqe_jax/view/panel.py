@@ -57,15 +57,9 @@ class Panel:
         robots: Sequence[str] = (),
         menu: Menu | None = None,
     ) -> None:
-        """Adds the controls to a page.
+        """Adds the controls to a page: `bodies` are labels of those that the camera can follow, `robots` of agents.
 
-        Args:
-            server: of the page.
-            session: the simulation.
-            bodies: labels of the bodies that the camera can follow.
-            on_camera: called when another one is chosen.
-            robots: labels of the agents, by default `robot 1`, ...
-            menu: the choices of task and policies; none are offered without it.
+        `on_camera` is called when another body is chosen. Without a menu no tasks and policies are offered.
         """
         self._session, self._gui = session, server.gui
         self._on_camera = on_camera
