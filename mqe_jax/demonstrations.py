@@ -77,9 +77,8 @@ class Demonstrated(VectorEnv):
             else:
                 index = jax.random.randint(index_key, (), 0, len(fields["step"]))
                 chosen = jax.random.bernoulli(choice_key, assistance)
-            return _with_fields(
-                fresh, jax.tree.map(lambda x, y: jnp.where(chosen, x[index], y), fields, _fields(fresh))
-            )
+            begun = jax.tree.map(lambda x, y: jnp.where(chosen, x[index], y), fields, _fields(fresh))
+            return dataclasses.replace(fresh, **{**begun, "data": fresh.data.replace(**begun["data"])})
 
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action), start)
@@ -139,7 +138,3 @@ def _fields(state: State) -> dict[str, Any]:
     """Returns the fields of states that a start sets."""
     names = [field.name for field in dataclasses.fields(State) if field.name not in ("data", "key", *KEPT)]
     return {**{name: getattr(state, name) for name in names}, "data": {n: getattr(state.data, n) for n in STATE_FIELDS}}
-
-
-def _with_fields(state: State, fields: dict[str, Any]) -> State:
-    return dataclasses.replace(state, **{**fields, "data": state.data.replace(**fields["data"])})

@@ -27,7 +27,8 @@ import paper_page
 from mqe_jax.errors import InputError
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import absolute
-from mqe_jax.study.runs import REWARD, Cell, Curve, Run, number, read_runs, table
+from mqe_jax.study.runs import REWARD, Cell, Curve, Run, read_runs, table
+from mqe_jax.train.logs import number
 
 ROOT = Path(__file__).parents[1]
 MEASUREMENTS = ROOT / "results" / "measurements.json"

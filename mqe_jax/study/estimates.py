@@ -87,17 +87,16 @@ def evaluated(cells: Cells) -> Cells:
     chosen: dict[Cell, list[Run]] = {}
     for cell, runs in cells.items():
         curves = [
-            {"env_steps": [p["env_steps"] for p in run.evaluations], REWARD: [_reward(p) for p in run.evaluations]}
+            {
+                "env_steps": [point["env_steps"] for point in run.evaluations],
+                REWARD: [point["sampled"].get(REWARD) for point in run.evaluations],
+            }
             for run in runs
         ]
         if all(curve[REWARD] and None not in curve[REWARD] for curve in curves):
             arrays = [{name: np.array(x, np.float64) for name, x in curve.items()} for curve in curves]
             chosen[cell] = [dataclasses.replace(run, curve=x) for run, x in zip(runs, arrays, strict=True)]
     return chosen
-
-
-def _reward(evaluation: Mapping[str, Any]) -> float | None:
-    return evaluation["sampled"].get(REWARD)
 
 
 def curve_rows(cells: Cells) -> Rows:

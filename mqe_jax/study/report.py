@@ -14,7 +14,8 @@ from typing import Any
 from mqe_jax.files import write_atomically
 from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
-from mqe_jax.study.runs import PLAIN, REWARD, Reference, Run, number, read_runs, table
+from mqe_jax.study.runs import PLAIN, REWARD, Reference, Run, read_runs, table
+from mqe_jax.train.logs import number
 
 
 def report(folder: Path, reference: Reference | None = None) -> list[Path]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import parsing, read_rows
 from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.logs import number
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import POLICY_FILE
 from mqe_jax.train.runner import CONFIG_FILE, CSV_FILE, load_run_config
@@ -115,13 +115,6 @@ def read_curve(path: Path) -> Curve:
     if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
         raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
     return curve
-
-
-def number(value: float, digits: int = DIGITS) -> str:
-    """Returns a number with `digits` significant digits; integers, such as steps, in full."""
-    value = float(value)
-    whole = math.isfinite(value) and value.is_integer() and abs(value) < 1e15
-    return str(int(value)) if whole else f"{value:.{digits}g}"
 
 
 def table(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: int = DIGITS) -> str:

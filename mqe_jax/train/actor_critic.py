@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, Literal
@@ -98,13 +99,6 @@ def _trunk(
     return nn.dense(params["head"], x), memory
 
 
-def _over_agents(function: Callable[..., Any], share: bool) -> Callable[..., Any]:
-    """Maps `_trunk` over an agent axis before the last, with one set of parameters or A."""
-    if share:
-        return function
-    return jax.vmap(function, in_axes=(0, -2, -1, -2), out_axes=(-2, -2))
-
-
 def _build(settings: ActorCritic, dims: EnvDims) -> Network:
     agents, share = dims.agents, settings.share_policy
     own = settings.critic_input == "own"
@@ -150,11 +144,10 @@ def _build(settings: ActorCritic, dims: EnvDims) -> Network:
         )
 
     def run(params: Params, shared: bool, memory: Memory, is_first: jax.Array, x: jax.Array) -> Any:
-        def trunk(params: Params, memory: Memory, is_first: jax.Array, x: jax.Array) -> tuple[jax.Array, Memory]:
-            return _trunk(params, memory, is_first, x, settings)
-
-        is_first = jnp.broadcast_to(is_first[..., None], x.shape[:-1])
-        return _over_agents(trunk, shared)(params, memory, is_first, x)
+        trunk = functools.partial(_trunk, settings=settings)
+        if not shared:  # a set of parameters for each agent
+            trunk = jax.vmap(trunk, in_axes=(0, -2, -1, -2), out_axes=(-2, -2))
+        return trunk(params, memory, jnp.broadcast_to(is_first[..., None], x.shape[:-1]), x)
 
     def distribution(
         params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array

@@ -60,7 +60,7 @@ class CsvLog:
             _, rows = _read_rows(self._path, math.inf)
             self._columns += new
             self._rewrite(rows)
-        append(self._path, (",".join(_text(row.get(name, math.nan)) for name in self._columns) + "\n").encode())
+        append(self._path, (",".join(number(row.get(name, math.nan)) for name in self._columns) + "\n").encode())
 
     def close(self) -> None:
         """Does nothing: every row is on disk."""
@@ -73,8 +73,9 @@ class CsvLog:
         write_atomically(self._path, text.getvalue().encode())
 
 
-def _text(value: float) -> str:
-    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.8g}"
+def number(value: float, digits: int = 8) -> str:
+    """Returns a number with `digits` significant digits; integers, such as steps, in full."""
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{float(value):.{digits}g}"
 
 
 def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]]:

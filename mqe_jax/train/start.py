@@ -122,15 +122,8 @@ def without_environments(state: TrainState) -> dict[str, Any]:
 
 def learned(state: TrainState) -> dict[str, Any]:
     """Returns the learned state: parameters, optimiser and statistics, without environment states."""
-    return {
-        "params": state.params,
-        "optimizer": state.optimizer,
-        "obs_normalizer": state.obs_normalizer,
-        "value_normalizer": state.value_normalizer,
-        "learning_rate": state.learning_rate,
-        "assistance": state.assistance,
-        "extra": state.extra,
-    }
+    omitted = ("rollout", "key", "updates")
+    return {field.name: getattr(state, field.name) for field in dataclasses.fields(state) if field.name not in omitted}
 
 
 def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:

@@ -1,6 +1,6 @@
 """Recording of episodes as numpy arrays."""
 
-from dataclasses import dataclass
+import dataclasses
 from typing import Any
 
 import jax
@@ -15,7 +15,7 @@ from mqe_jax.train.policy import Policy
 from mqe_jax.train.types import PolicyOrAct, RandomKey
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Episode:
     """Frames of one episode, with all data needed for rendering."""
 
@@ -39,9 +39,8 @@ class Episode:
 
     def cut(self, frames: slice) -> "Episode":
         """Returns the episode with a part of its frames, such as every n-th; `settled` stays that of the whole."""
-        poses = (x[frames] for x in (self.qpos, self.mocap_pos, self.mocap_quat))
-        rest = {"success": self.success, "reward": self.reward, "settled": self.settled}
-        return Episode(*poses, dt=self.dt * (frames.step or 1), **rest)
+        poses = {name: getattr(self, name)[frames] for name in ("qpos", "mocap_pos", "mocap_quat")}
+        return dataclasses.replace(self, **poses, dt=self.dt * (frames.step or 1))
 
 
 @checked(policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
