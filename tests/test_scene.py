@@ -81,7 +81,8 @@ def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
     data.qpos[scene.index.base_qpos[0]] = [1.0, 2.0, 3.0, 1, 0, 0, 0]
     data.qpos[scene.index.joint_qpos[0]] = joints
     mujoco.mj_kinematics(scene.model, data)
-    feet = data.geom_xpos[scene.index.foot_geom[0]] - [1.0, 2.0, 3.0]
+    geoms = [scene.model.geom(f"robot0/{leg}_foot").id for leg in LEGS]
+    feet = data.geom_xpos[geoms] - [1.0, 2.0, 3.0]
     np.testing.assert_allclose(foot_positions(robot, jnp.asarray(joints)), feet, atol=1e-5)
     knees = data.xpos[scene.index.bodies[0, 3::3]] - [1.0, 2.0, 3.0]
     np.testing.assert_allclose(knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)

@@ -31,8 +31,7 @@ DRAWN = (OLDER, UNIFORM)
 """Opponents that are members of the pool."""
 
 _FADE = 0.95  # of the counts behind the metrics, per update
-_GAIN = 1.0  # Elo points per game
-_SWING = 30.0  # Elo points per update, at most
+_SWING = 30.0  # Elo points per update, at most; one per game beyond what was expected
 
 
 class LeagueState(NamedTuple):
@@ -141,7 +140,7 @@ class League(Versus):
         return league._replace(
             pool=pool.record(league.pool, league.member, jnp.where(self._moving, score, 0.0), members),
             played=league.played + games.astype(jnp.int32),
-            rating=league.rating + jnp.clip(_GAIN * gain, -_SWING, _SWING),
+            rating=league.rating + jnp.clip(gain, -_SWING, _SWING),
             recent=_FADE * league.recent + counts,
         )
 

@@ -26,6 +26,7 @@ CSV, PICTURE = "tournament.csv", "tournament.png"
 
 _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 500
+_SAMPLES = 200  # of the bootstrap
 _LONG = 28  # characters of a name in the picture, at most
 
 
@@ -80,14 +81,14 @@ def scores(results: NDArray[Any]) -> Array:
     return points + (results.sum(axis=-1) - points).T
 
 
-def rate(results: NDArray[np.int64], anchor: int, samples: int = 200, seed: int = 0) -> Ratings:
+def rate(results: NDArray[np.int64], anchor: int) -> Ratings:
     """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0, and their intervals.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
     of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
     """
     games = results + np.array([0.0, 0.5, 0.0])
-    weights = np.random.default_rng(seed).standard_gamma(games, (samples, *games.shape))
+    weights = np.random.default_rng(0).standard_gamma(games, (_SAMPLES, *games.shape))
     weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
     resampled = np.stack([_strengths(scores(again), anchor) for again in weights])
     low, high = np.quantile(resampled, [0.025, 0.975], axis=0)

@@ -33,8 +33,6 @@ class RobotIndex:
     """Trunk body ids (R,)."""
     bodies: np.ndarray
     """All body ids of each robot (R, 13)."""
-    foot_geom: np.ndarray
-    """Foot geom ids (R, 4)."""
     geoms: np.ndarray
     """Collision geom ids of each robot (R, G)."""
     trunk_force: np.ndarray
@@ -110,7 +108,6 @@ def index_robots(
         actuator=table(lambda name: model.actuator(name).id, JOINT_NAMES),
         trunk_body=table(lambda name: model.body(name).id, ["trunk"])[:, 0],
         bodies=table(lambda name: model.body(name).id, body_names),
-        foot_geom=table(lambda name: model.geom(name).id, foot_names),
         geoms=table(lambda name: model.geom(name).id, geom_names),
         trunk_force=force(_geom_names(robot, "trunk")),
         foot_force=force(foot_names) if feet else np.zeros((0, NUM_LEGS, 3), np.int32),

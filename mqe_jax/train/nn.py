@@ -44,9 +44,7 @@ def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) ->
     return jnp.matmul(x, params["weight"], precision=precision) + params["bias"]
 
 
-def mlp_init(
-    key: jax.Array, sizes: Sequence[int], *, scale: float = math.sqrt(2.0), final_scale: float = 1.0
-) -> Params:
+def mlp_init(key: jax.Array, sizes: Sequence[int], *, final_scale: float = 1.0) -> Params:
     """Initialises a chain of affine layers `"0"`, `"1"`, ... of widths `sizes`; the last has gain `final_scale`.
 
     Shapes: layer i is (sizes[i], sizes[i + 1]). `sizes` holds at least two widths.
@@ -55,10 +53,8 @@ def mlp_init(
         raise ValueError(f"sizes: {tuple(sizes)}; at least an input and an output width are needed")
     count = len(sizes) - 1
     keys = jax.random.split(key, count)
-    return {
-        str(i): dense_init(keys[i], sizes[i], sizes[i + 1], final_scale if i == count - 1 else scale)
-        for i in range(count)
-    }
+    gains = [math.sqrt(2.0)] * (count - 1) + [final_scale]
+    return {str(i): dense_init(keys[i], sizes[i], sizes[i + 1], gains[i]) for i in range(count)}
 
 
 def mlp(
@@ -111,13 +107,13 @@ def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
     return {"input": three_gates(keys[:3], n_in), "hidden": three_gates(keys[3:], n_hidden)}
 
 
-def gru(params: Params, h: jax.Array, x: jax.Array, *, precision: str | None = PRECISION) -> jax.Array:
+def gru(params: Params, h: jax.Array, x: jax.Array) -> jax.Array:
     """Returns the next hidden state: h (..., n_hidden), x (..., n_in) -> (..., n_hidden).
 
     Source: Cho et al., arXiv 1406.1078, with the reset gate applied after the hidden product.
     """
-    reset_x, update_x, candidate_x = jnp.split(dense(params["input"], x, precision=precision), 3, axis=-1)
-    reset_h, update_h, candidate_h = jnp.split(dense(params["hidden"], h, precision=precision), 3, axis=-1)
+    reset_x, update_x, candidate_x = jnp.split(dense(params["input"], x), 3, axis=-1)
+    reset_h, update_h, candidate_h = jnp.split(dense(params["hidden"], h), 3, axis=-1)
     reset = jax.nn.sigmoid(reset_x + reset_h)
     update = jax.nn.sigmoid(update_x + update_h)
     candidate = jnp.tanh(candidate_x + reset * candidate_h)

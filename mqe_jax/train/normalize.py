@@ -49,13 +49,13 @@ def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningSt
     return RunningStatistics(mean, variance, samples)
 
 
-def running_normalize(statistics: RunningStatistics, x: jax.Array, limit: float = 10.0) -> jax.Array:
-    """Returns x (..., size) normalised to mean 0 and standard deviation 1, clipped to +-limit.
+def running_normalize(statistics: RunningStatistics, x: jax.Array) -> jax.Array:
+    """Returns x (..., size) normalised to mean 0 and standard deviation 1, clipped to +-10.
 
     The standard deviation is floored at 0.01, so that a constant entry becomes 0.
     """
     std = jnp.maximum(jnp.sqrt(statistics.variance), _OBSERVATION_MIN_STD)
-    return jnp.clip((x - statistics.mean) / std, -limit, limit)
+    return jnp.clip((x - statistics.mean) / std, -10.0, 10.0)
 
 
 class ValueStatistics(NamedTuple):

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 
 from mqe_jax.train.types import PyTree
 
+_B1, _B2 = 0.9, 0.999  # decays of the moments
+
 
 class AdamState(NamedTuple):
     """First and second moments (shaped as the parameters) and the number of updates, () int32."""
@@ -40,7 +42,7 @@ def global_norm(tree: PyTree) -> jax.Array:
     return jnp.sqrt(sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.float32(0.0)))
 
 
-def adam(eps: float = 1e-5, b1: float = 0.9, b2: float = 0.999, max_grad_norm: float | None = None) -> Optimizer:
+def adam(eps: float = 1e-5, max_grad_norm: float | None = None) -> Optimizer:
     """Returns Adam with gradients clipped to a global norm of at most `max_grad_norm`.
 
     `grad_norm` is the norm before clipping. Source: Kingma and Ba, arXiv 1412.6980.
@@ -62,10 +64,10 @@ def adam(eps: float = 1e-5, b1: float = 0.9, b2: float = 0.999, max_grad_norm: f
             grads = jax.tree.map(lambda g: g * scale, grads)
         updates = state.updates + 1
         steps = updates.astype(jnp.float32)
-        mean = jax.tree.map(lambda m, g: b1 * m + (1.0 - b1) * g, state.mean, grads)
-        square = jax.tree.map(lambda s, g: b2 * s + (1.0 - b2) * jnp.square(g), state.square, grads)
-        mean_scale = 1.0 / (1.0 - b1**steps)
-        square_scale = 1.0 / (1.0 - b2**steps)
+        mean = jax.tree.map(lambda m, g: _B1 * m + (1.0 - _B1) * g, state.mean, grads)
+        square = jax.tree.map(lambda s, g: _B2 * s + (1.0 - _B2) * jnp.square(g), state.square, grads)
+        mean_scale = 1.0 / (1.0 - _B1**steps)
+        square_scale = 1.0 / (1.0 - _B2**steps)
 
         def move(p: jax.Array, m: jax.Array, s: jax.Array) -> jax.Array:
             return p - learning_rate * (m * mean_scale) / (jnp.sqrt(s * square_scale) + eps)

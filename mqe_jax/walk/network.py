@@ -101,15 +101,12 @@ def mirror_action(action: jax.Array) -> jax.Array:
     return action[..., MIRRORED_JOINTS] * MIRRORED_SIGNS
 
 
-def symmetry_loss(
-    params: walk_policy.Params, flat: jax.Array, mean: jax.Array, *, precision: str = "highest"
-) -> jax.Array:
+def symmetry_loss(params: walk_policy.Params, flat: jax.Array, mean: jax.Array) -> jax.Array:
     """Returns the mean square difference () between actions of mirrored histories and mirrored actions.
 
-    `flat` are histories (B, 2100) and `mean` their actions (B, 12); `precision` is that of matrix products.
+    `flat` are histories (B, 2100) and `mean` their actions (B, 12).
     """
-    mirrored = mirror_history(flat)
-    other, _ = walk_policy.infer(params, mirrored, precision=precision)
+    other, _ = walk_policy.infer(params, mirror_history(flat), precision=_PRECISION)
     return jnp.mean(jnp.square(other - mirror_action(mean)))
 
 
@@ -161,9 +158,7 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
         losses = {"adaptation": settings.adaptation_coef * error}
         if settings.symmetry_coef > 0:
-            losses["symmetry"] = settings.symmetry_coef * symmetry_loss(
-                params["policy"], flat, mean, precision=_PRECISION
-            )
+            losses["symmetry"] = settings.symmetry_coef * symmetry_loss(params["policy"], flat, mean)
         return Evaluation(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),
             entropy(log_std)[..., None],
