@@ -50,24 +50,6 @@ def filled(*games: tuple[float, float]) -> pool.Pool:
     return result._replace(born=born, score=score, games=count)
 
 
-def test_win_rates_start_at_a_half_and_follow_the_games() -> None:
-    now = filled((0.0, 0.0), (96.0, 96.0))
-    np.testing.assert_allclose(pool.win_rate(now)[:2], [0.5, 0.98])
-    assert float(pool.mean_win_rate(now)) == pytest.approx(0.74)
-    now = pool.record(now, jnp.array([0, 0, 1]), jnp.array([1.0, 2.0, 0.0]), jnp.array([4.0, 4.0, 0.0]))
-    np.testing.assert_allclose(now.games, [8, 96, 0])
-    np.testing.assert_allclose(now.score, [3, 96, 0])  # a member that is not met keeps its games
-    again = pool.record(now, jnp.array([0]), jnp.array([0.0]), jnp.array([2.0]))
-    assert 9 < float(again.games[0]) < 10 and float(again.score[0]) < 3  # earlier games fade
-
-
-def test_members_that_resist_play_more_often() -> None:
-    now = filled((0.0, 1e6), (0.9e6, 1e6), (1e6, 1e6))
-    older = jax.nn.softmax(pool.chances(now, uniform=False))
-    np.testing.assert_allclose(older, [1 / 1.01, 0.01 / 1.01, 0, 0], atol=2e-4)
-    np.testing.assert_allclose(jax.nn.softmax(pool.chances(now, uniform=True)), [1 / 3, 1 / 3, 1 / 3, 0], atol=1e-6)
-
-
 def test_a_new_member_takes_a_free_place_then_that_of_the_member_beaten_most() -> None:
     new, nobody = {"x": jnp.ones(2)}, jnp.zeros(3, bool)
     now = pool.add(filled((1.0, 9.0), (9.0, 9.0)), new, jnp.int32(7), jnp.float32(50.0), nobody)
@@ -253,29 +235,6 @@ def test_the_time_limit_may_end_episodes_for_the_learner(task: str) -> None:
     np.testing.assert_allclose(state.privileged_obs[:, -1], 1.0)
 
 
-def test_the_rating_follows_results_against_the_scripted_policy() -> None:
-    sources = ("scripted", "older")
-    config = config_of(sources, num_envs=2, total_steps=64)
-    env = League(matches(num_envs=2, control="command"), sources, config)
-    learner = make_learner(env, config)
-    state = jax.jit(learner.init)(KEY)
-    scripted, older = state.rollout.env_state.opponents
-    rate = jax.jit(env.after)
-
-    def after(wins: int, losses: int, before: float = 0.0) -> float:
-        beaten = dataclasses.replace(scripted, outcomes=jnp.array([wins, 0, losses], scripted.outcomes.dtype))
-        env_state = dataclasses.replace(state.rollout.env_state, opponents=(beaten, older))
-        rated = state.extra._replace(rating=jnp.float32(before))
-        changed = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state), extra=rated)
-        now, metrics = rate(changed)
-        assert float(metrics["league/win/scripted"]) == pytest.approx(wins / (wins + losses))
-        return float(now.extra.rating)
-
-    assert after(3, 1) == pytest.approx(1.0) and after(2, 2) == 0.0 and after(0, 500) == -30.0
-    # 400 points above the scripted policy 10 wins of 11 games are expected
-    assert after(10, 1, 400.0) == pytest.approx(400.0) and after(11, 0, 400.0) == pytest.approx(401.0)
-
-
 def test_a_pool_too_small_for_its_blocks_is_refused() -> None:
     config = config_of(league={**SMALL, "members": 2})
     with pytest.raises(InputError, match=r"league.members: 2 .*more than the blocks that play members, 2"):
@@ -293,8 +252,9 @@ def training(steps: int, *more: str) -> list[str]:
 
 @pytest.mark.soak
 def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """Two seeds in one program."""
-    arguments = training(96, "--checkpoint.every", "2", "--num-seeds", "2")
+    """Two seeds in one program; evaluations meet the fixed opponent."""
+    evaluations = ["--evaluation.every", "4", "--evaluation.episodes", "2"]
+    arguments = training(96, "--checkpoint.every", "2", "--num-seeds", "2", *evaluations)
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     assert cli.main([*arguments, "--run-dir", str(whole)]) == 0
     assert cli.main([*arguments, "--run-dir", str(halves)]) == 0
