@@ -28,3 +28,8 @@ def test_imports_follow_the_table_of_modules() -> None:
         module = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         above = {*order[: order.index(module) + 1]}
         assert modules_of(ast.parse(path.read_text(encoding="utf-8"))) <= above, path
+
+
+def test_networks_and_optimisers_are_our_own() -> None:
+    for path in PACKAGE.rglob("*.py"):
+        assert not re.search(r"^\s*(import|from) (flax|optax)\b", path.read_text(encoding="utf-8"), re.MULTILINE), path
