@@ -93,6 +93,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("max_steps: ", lambda x, v: _evaluate(x, max_steps=v), (0, NAN, -1)),
     ("key: ", lambda x, v: _evaluate(x, key=v), (3, None, "k")),
     ("policy: ", lambda x, v: _evaluate(x, act=v), (None, 3, dict)),
+    ("policy: ", lambda x, v: _evaluate(x, env=x["matches"], act=mqe_jax.load_policy(v, x["match"])), ("idle",)),
     ("memory: ", lambda x, v: _evaluate(x, act=mqe_jax.load_policy("forward", x["fake"]), memory=v), (np.zeros(2),)),
     ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
     ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),

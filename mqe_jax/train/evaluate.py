@@ -83,13 +83,16 @@ class _Progress(NamedTuple):
     """Sums over the last steps of counted episodes (N,) each."""
 
 
-def acting(policy: Policy | Act, task: str, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
-    """Returns the function of a policy of a task, or a function itself, and its initial recurrent state."""
+def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
+    """Returns the function of a policy of all agents, or a function itself, and its initial recurrent state."""
     either: Any = policy
     if not hasattr(either, "act"):
         return functools.partial(_given, either), memory
-    if (trained := getattr(either, "task", "")) and trained != task:
-        fail("policy", f"one of {trained}", f"one of {task}; its `act` may be given alone")
+    if (trained := getattr(either, "task", "")) and trained != env.name:
+        fail("policy", f"one of {trained}", f"one of {env.name}; its `act` may be given alone")
+    if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
+        allowed = f"one of all {env.num_agents}; `mqe_jax.versus` shows one team of a match"
+        fail("policy", f"one of {agents} agents", allowed)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
     return either.act, either.initial_memory(num_envs)
@@ -133,7 +136,7 @@ def evaluate(
         InputError: for `episodes` < 1, a policy of another task or with a `memory` too, or episodes that do not end
             within `max_steps`.
     """
-    act, memory = acting(policy, env.name, env.num_envs, memory)
+    act, memory = acting(policy, env, env.num_envs, memory)
 
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)

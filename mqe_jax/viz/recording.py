@@ -60,7 +60,7 @@ def record(
     if 4 * numbers > CLIP_BYTES:
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     length = 50
-    act, memory = acting(policy, env.name, episodes)
+    act, memory = acting(policy, env, episodes)
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
