@@ -40,7 +40,7 @@ BAD = {
     "no scripted policy": (["eval", "fake", "--policy", "scripted", "--episodes", "2"], ["fake", "go1gate"]),
     "joints of scripted": (
         ["eval", "go1gate", "--control", "position", "--policy", "scripted"],
-        ["'position'", "--policy random or idle"],
+        ["policy: 'scripted'", "'position'", "random"],
     ),
     "commands of scripted": (
         ["eval", "go1gate", "--policy", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
