@@ -180,8 +180,9 @@ def test_bad_calls_are_named() -> None:
         vector.step(action[:2])
     with pytest.raises(InputError, match="NaN or infinity"):
         vector.step(action * np.nan)
-    with pytest.raises(InputError, match="2 seeds for 3 environments"):
-        vector.reset(seed=[1, 2])
+    for seed in ([1, 2], 1.5, "abc"):
+        with pytest.raises(InputError, match=r"seed: .*3 integers"):
+            vector.reset(seed=seed)
     with pytest.raises(InputError, match=r"allowed: 0 to 2\^32 - 1"):
         vector.reset(seed=2**32)
     with pytest.raises(InputError, match="reset_mask"):

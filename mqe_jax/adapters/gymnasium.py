@@ -24,7 +24,7 @@ from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments
-from mqe_jax.settings import check
+from mqe_jax.settings import check, fail
 
 
 def register() -> None:
@@ -145,12 +145,12 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seeds: list[int | None]
         if isinstance(seed, int | np.integer):
             seeds = [int(seed) + i for i in range(self.num_envs)]
-        elif seed is not None:
-            seeds = list(seed)
-            if len(seeds) != self.num_envs:
-                raise InputError(f"seed: {len(seeds)} seeds for {self.num_envs} environments")
-        else:
+        elif seed is None:
             seeds = [None] * self.num_envs
+        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str) and len(seed) == self.num_envs:
+            seeds = list(seed)
+        else:
+            fail("seed", seed, f"an integer, {self.num_envs} integers or None")
         self._ended &= ~mask
         return self._host.reset(seeds, self.np_random, mask), {}
 
