@@ -125,7 +125,8 @@ def load_as(field: str, source: str | Path, env: QuadrupedEnv, *, deterministic:
     try:
         return load_policy(source, env, deterministic=deterministic)
     except InputError as error:
-        raise InputError(str(error).replace("policy:", f"{field}:", 1)) from None
+        optional = "" if field == "opponent" else ", or none"
+        raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
 
 
 def check_policy(policy: TrainedPolicy, env: QuadrupedEnv, name: str = "policy") -> None:

@@ -369,11 +369,21 @@ def test_what_a_host_function_raises_ends_the_program() -> None:
 
 
 def test_a_used_environment_can_be_copied() -> None:
-    env = make("go1gate", impl="c", num_envs=1)
-    step = lambda env: jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), jnp.ones((2, 3)))  # noqa: E731
-    obs = step(env).obs
+    env: Any = make("go1gate", impl="c", control="torque", num_envs=1)  # with the motors' limits
+
+    def last(env: Any) -> jax.Array:
+        def run(key: jax.Array) -> jax.Array:
+            return jax.lax.scan(lambda s, _: (env.step(s, jnp.ones((2, 12))), ()), env.reset(key), None, 9)[0].obs
+
+        return jax.jit(run)(jax.random.PRNGKey(0))
+
+    expected = last(env)
     for copied in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        np.testing.assert_array_equal(step(copied).obs, obs)
+        np.testing.assert_array_equal(last(copied), expected)
+    stepper: Any = copied.physics._stepper
+    del copied
+    gc.collect()
+    assert stepper._retired
 
 
 def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:

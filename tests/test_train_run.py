@@ -142,7 +142,7 @@ def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> N
     [
         ({"task": "go1gate"}, r"env.gate_width: .* differs from the environments, which have 0\.7"),
         ({"env": {"gate_width": 0.7, "rewards.approach": 9.0}}, r"env.rewards.approach: 9\.0 differs .*, which have"),
-        ({"env": {"gate_width": 0.7}, "train_env": {"control": "torque"}}, r"env.control: 'torque' differs"),
+        ({"env": {"gate_width": 0.7}, "train_env": {"control": "torque"}}, r"train_env.control: 'torque' differs"),
     ],
 )
 def test_environments_with_other_parameters_than_the_settings_are_refused(
@@ -156,14 +156,15 @@ def test_environments_with_other_parameters_than_the_settings_are_refused(
         check_parameters(batch, settings(**same), settings(**same).env)
 
 
-@pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml", "notes.txt"])
+@pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml", "notes.md"])
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: bool, tmp_path: Path) -> None:
     (tmp_path / left).write_text("a user's work")
     (tmp_path / "checkpoints").mkdir()  # of a training that was killed at its start
+    (tmp_path / "nohup.out").touch()
     with pytest.raises(InputError, match=f"{left}.*name another folder"):
         train(PROBE, settings(), tmp_path, resume=resume)
-    assert {path.name for path in tmp_path.iterdir()} == {left, "checkpoints"}
+    assert {path.name for path in tmp_path.iterdir()} == {left, "checkpoints", "nohup.out"}
     assert (tmp_path / left).read_text() == "a user's work"
 
 
@@ -182,6 +183,7 @@ def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path
     def kill(state: TrainState, row: dict[str, float]) -> None:
         raise Killed
 
+    (tmp_path / "nohup.out").touch()  # the output of its command
     with pytest.raises(Killed):
         train(PROBE, settings(), tmp_path, on_update=kill)
     assert [path.name for path in list_checkpoints(tmp_path)] == ["step_000000000000.safetensors"]

@@ -45,6 +45,10 @@ class CEngine(Engine):
         self._stepper = _Stepper(own, self.motors)
         weakref.finalize(self, self._stepper.retire).atexit = False
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        weakref.finalize(self, self._stepper.retire).atexit = False
+
     @classmethod
     def preferred(cls) -> bool:
         return jax.default_backend() == "cpu"

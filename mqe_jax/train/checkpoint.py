@@ -23,6 +23,7 @@ VERSION = 3
 
 _LARGEST = {"policy": limits.POLICY_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
+_OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of their run
 
 
 class Checkpoint(NamedTuple):
@@ -177,8 +178,8 @@ def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
     """Checks that a folder holds no run, or with `resume` one that can be resumed; `files` are a run's, by name.
 
     Raises:
-        InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files and
-            empty folders.
+        InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files,
+            empty folders, and the output of commands.
     """
     checkpoint = latest(run_dir)
     found = [name for name in files if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
@@ -186,11 +187,10 @@ def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
         raise InputError(
             f"run_dir: {run_dir} already holds a run ({', '.join(found)}); resume it (--resume) or name another folder"
         )
-    held = [path.name for path in sorted(run_dir.glob("[!.]*")) if not path.is_dir() or any(path.glob("[!.]*"))]
+    inside = [path for path in sorted(run_dir.glob("[!.]*")) if path.suffix not in _OUTPUT]
+    held = [path.name for path in inside if not path.is_dir() or any(path.glob("[!.]*"))]
     if held and checkpoint is None:
-        raise InputError(
-            f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint to resume from; name another folder"
-        )
+        raise InputError(f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint; name another folder")
 
 
 def nonfinite(tree: Any) -> list[str]:

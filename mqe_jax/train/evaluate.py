@@ -100,7 +100,7 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
 
 def _given(function: Act, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
     returned = function(obs, memory, key)
-    if not isinstance(returned, tuple) or len(returned) != 2:
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
         fail("policy", f"a function that returns {type(returned).__name__}", "one that returns (action, memory)")
     return returned
 

@@ -97,7 +97,8 @@ def train_seeds(
         if processes.leads:
             for folder in folders:
                 check_alone(folder)
-            _common_checkpoints(folders)
+            if resume:
+                _common_checkpoints(folders)
             for folder in folders:
                 check_folder(folder)
                 locks.enter_context(locked(folder))

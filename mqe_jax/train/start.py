@@ -150,7 +150,8 @@ def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[st
     found = dict(_leaves({"control": task.control, **to_mapping(task.params)}))
     for name, value in _leaves({"control": control, **to_mapping(override(type(task.params)(), overrides))}):
         if found.get(name) != value:
-            raise InputError(f"env.{name}: {value!r} differs from the environments, which have {found.get(name)!r}")
+            field = "train_env" if parameters != config.env and name in dict(_leaves(config.train_env)) else "env"
+            raise InputError(f"{field}.{name}: {value!r} differs from the environments, which have {found.get(name)!r}")
 
 
 def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
