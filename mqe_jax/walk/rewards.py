@@ -68,9 +68,12 @@ class RewardInputs:
     strength: jax.Array
 
 
+_BLUR = 0.07  # of a gait period: standard deviation of the smoothing of desired contacts
+
+
 def desired_contact(phases: jax.Array) -> jax.Array:
     """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off and touch-down."""
-    cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=0.07)  # noqa: E731
+    cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=_BLUR)  # noqa: E731
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
 
 
