@@ -45,7 +45,7 @@ def test_package_sites_get_a_readme_with_the_repositorys_address() -> None:
     assert all((ROOT / path).exists() for _, path in paths)
     assert not re.search(r"\]\((?!https?:|#)", made)
     for readme in (made, release.absolute(text, "")):
-        assert 'pip install "mqe-jax[render]" ' in readme and '".[' not in readme and "repository, with" not in readme
+        assert 'pip install "mqe-jax[render]" ' in readme and '".[' not in readme
 
 
 def test_badges_are_of_the_repositorys_workflows() -> None:

@@ -140,7 +140,6 @@ def absolute(readme: str, address: str) -> str:
     It installs the package by name. With the repository's address it has badges, and links and pictures lead there.
     """
     readme = readme.replace('pip install ".[', 'pip install "mqe-jax[').replace('GPU: ".[', 'GPU: "mqe-jax[')
-    readme = readme.replace("In the folder of this repository, with", "With")
     if not address:
         return readme
 
