@@ -21,6 +21,10 @@ __version__ = "0.2.0"
 __all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks", "versus"]
 
 
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
 def __getattr__(name: str) -> Any:
     # Heavy imports (JAX, MuJoCo) are deferred to keep `mqe --help` fast.
     if name not in __all__:

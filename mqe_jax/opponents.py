@@ -94,6 +94,9 @@ class Versus(OneTeam):
         self.opponents = tuple(opponents)
         self._check_blocks(self.num_envs)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.num_envs} against {list(self.opponents)}: {self.inner!r}>"
+
     def share(self, parts: int) -> Self:
         """Returns the environments of one of several processes; each process meets all opponents."""
         self._check_blocks(self.num_envs // parts)

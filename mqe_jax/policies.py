@@ -36,8 +36,10 @@ class SimplePolicy:
     """Id of the task."""
     agents: int
     """Number of agents of the team."""
-    plan: Callable[[jax.Array, jax.Array], jax.Array]
+    plan: Callable[[jax.Array, jax.Array], jax.Array] = dataclasses.field(repr=False)
     """Observations (N, A, O) and a key to actions (N, A, D)."""
+    name: str = ""
+    """The name by which `load_policy` knows it; empty for another one."""
 
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns an empty recurrent state."""
@@ -105,7 +107,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     if str(source) in (*NAMES, *further):
         if env is None:
             raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
-        return SimplePolicy(env.name, len(env.teams[0]), _plan(str(source), env))
+        return SimplePolicy(env.name, len(env.teams[0]), _plan(str(source), env), str(source))
     if str(source) in zoo.names():
         policy = zoo.load(str(source))
     elif not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:

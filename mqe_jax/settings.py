@@ -183,6 +183,18 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
     return type(settings)(**_merged(settings, _nested(type(settings), changes)))
 
 
+def differences(settings: Any, default: Any) -> dict[str, Any]:
+    """Returns the fields of a record that differ from another of its type, by dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in _fields(settings).items():
+        other = getattr(default, name)
+        if is_record(value) and type(value) is type(other):
+            found |= {f"{name}.{inner}": each for inner, each in differences(value, other).items()}
+        elif value != other:
+            found[name] = value
+    return found
+
+
 def joined(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
     """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
 

@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 
 from mqe_jax.cli.arguments import parse
+from mqe_jax.cli.setup import for_task
+from mqe_jax.cli.train import parse_train
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.planners import scripted_policy
 from mqe_jax.train.evaluate import evaluate
@@ -30,7 +32,10 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").r
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # Blocks that are not run, by page and first line, with the reason.
-NOT_RUN = {("docs/training.md", "import jax"): "needs a run folder"}
+NOT_RUN = {
+    ("docs/training.md", "from mqe_jax.train.runner import train"): "trains for minutes or hours",
+    ("docs/training.md", "import jax"): "needs a run folder",
+}
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
 SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
 
@@ -58,6 +63,14 @@ def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path:
     finally:
         for name in {*TASKS} - tasks:
             del TASKS[name]
+
+
+def test_training_from_python_has_the_settings_of_the_command() -> None:
+    """The first Python block of the page about training against the first `mqe train` with flags."""
+    namespace: dict[str, Any] = {}
+    exec(run_blocks("docs/training.md")[0], namespace)
+    command = ["go1gate", "--num-envs", "256", "--ppo.clip", "0.1"]
+    assert namespace["config"] == for_task(parse_train(command).settings, "go1gate")
 
 
 def commands(page: str) -> list[list[str]]:

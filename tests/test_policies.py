@@ -11,11 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mqe_jax
 from mqe_jax import cli, skills, zoo
+from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
 from mqe_jax.errors import InputError
+from mqe_jax.opponents import versus
 from mqe_jax.planners import planner_of
 from mqe_jax.planners.cooperative import plan_seesaw
 from mqe_jax.planners.matches import plan_tug
@@ -306,3 +309,16 @@ def test_contract(name: str) -> None:
     assert target.shape == (12,) and np.abs(target - GO1.default_joints).max() < 1.0
     assert command.shape == (len(skill.commands),) and np.isfinite(command).all()
     assert jax.tree.map(jnp.shape, memory) == jax.tree.map(jnp.shape, after)
+
+
+def test_what_a_user_makes_says_what_it_is() -> None:
+    """The `repr` of environments, wrappers and policies; `dir(mqe_jax)` lists the API."""
+    env = make("go1tug", impl="c", num_envs=4, episode_length=3.0, rewards={"push": 4})
+    sizes = "1 vs 1 agents, observation 10, action command 3, engine c"
+    task = f"<go1tug: {sizes}, episode_length=3.0, rewards.push=4.0>"
+    batch, scripted = VectorEnv(env, 4), load_policy("scripted", env)
+    policy = "SimplePolicy(task='go1tug', agents=1, name='scripted')"
+    assert repr(env) == task and repr(scripted) == policy
+    assert repr(versus(batch, [scripted])) == f"<Versus of 4 against [{policy}]: <VectorEnv of 4: {task}>>"
+    assert repr(TeamEnv(env, scripted)) == f"<TeamEnv against {policy}: {task}>"
+    assert {*mqe_jax.__all__} <= {*dir(mqe_jax)} and "annotations" not in dir(mqe_jax)

@@ -62,6 +62,9 @@ class TeamEnv:
             )
         self._source = str(opponent) if isinstance(opponent, str | Path) else None
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} against {self.opponent}: {self.match}>"
+
     def __getattr__(self, name: str) -> Any:
         if name == "match":  # while an instance is being copied
             raise AttributeError(name)

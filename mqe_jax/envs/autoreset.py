@@ -67,6 +67,9 @@ class Batch:
     max_episode_steps: int
     """Environment steps until the time limit."""
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
+
     def check_action(self, action: jax.Array) -> None:
         """Raises an InputError for actions of another shape than (N, A, action_size)."""
         shape = (self.num_envs, self.num_agents, self.action_size)

@@ -33,7 +33,7 @@ from mqe_jax.limits import Environments
 from mqe_jax.robots.index import RobotState, placed, read_robots
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
-from mqe_jax.settings import check, checked, fail
+from mqe_jax.settings import check, checked, differences, fail
 from mqe_jax.train.types import RandomKey
 
 if TYPE_CHECKING:
@@ -116,6 +116,13 @@ class QuadrupedEnv(Task[S, P]):
             clock_size=jax.eval_shape(lambda: self.controller.clock(self.controller.reset())).shape[1],
             contact_forces=self.params.privileged_contact_forces,
         )
+
+    def __repr__(self) -> str:
+        size, actions = self.observation_size, f"{self.control} {self.action_size}"
+        agents = " vs ".join(str(len(team)) for team in self.teams)
+        changed = [f"{name}={value!r}" for name, value in differences(self.params, self.Params()).items()]
+        facts = [f"{agents} agents", f"observation {size}", f"action {actions}", f"engine {self.impl}", *changed]
+        return f"<{self.name}: {', '.join(facts)}>"
 
     # -- public API ---------------------------------------------------------------------------------------------
 

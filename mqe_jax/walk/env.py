@@ -73,6 +73,9 @@ class WalkEnv:
         randomization = RANDOMIZATION if self.task.randomize else Randomization()
         self._randomizer = Randomizer(randomization, self.compiled.model, self.index, 1.0)
 
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.robot.name}, engine {self.physics.impl}>"
+
     @property
     def max_steps(self) -> int:
         """Steps until the time limit."""
