@@ -21,7 +21,7 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
 from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 
 # Step 1: a terrain block defines its walls.
 
@@ -174,7 +174,7 @@ def main() -> None:
     """Evaluates the scripted policy over 32 episodes and prints its success rate."""
     env = VectorEnv(make("go1catch", num_envs=32), 32)
     plan = jax.vmap(scripted_policy(env.env))
-    result = evaluate(env, lambda obs, memory, _: (plan(obs), memory), 32, jax.random.PRNGKey(0))
+    result = evaluate_batch(env, lambda obs, memory, _: (plan(obs), memory), 32, jax.random.PRNGKey(0))
     print(f"caught {result.success_rate:.0%} of 32 mice, average step reward {result.average_step_reward:.3f}")
 
 

@@ -13,12 +13,12 @@ import jax
 from mqe_jax import VectorEnv, make, versus
 from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import EvalResult, evaluate
+from mqe_jax.train.evaluate import Result, evaluate_batch
 from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.policy import policy_of
 
 
-def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episodes: int = 32) -> list[EvalResult]:
+def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episodes: int = 32) -> list[Result]:
     """Trains, and returns evaluations against the last snapshot and the scripted policy."""
     network = {"recurrent": False, "hidden_sizes": [64, 64], "openrl_layers": True}
     settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
@@ -43,7 +43,7 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
 
     policy = policy_of(state, env_dims(env, config), config, task=matches.name)
     fights = [versus(matches, [opponent]) for opponent in (snapshot, "scripted")]
-    return [evaluate(fight, policy, episodes, jax.random.PRNGKey(1)) for fight in fights]
+    return [evaluate_batch(fight, policy, episodes, jax.random.PRNGKey(1)) for fight in fights]
 
 
 if __name__ == "__main__":

@@ -70,15 +70,15 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The task `fake` in addition to the real ones, for `mqe`, and an empty working folder."""
     import fake_env
 
-    from mqe_jax.cli import setup
+    from mqe_jax import build
 
     monkeypatch.chdir(tmp_path)
-    real = setup.make_env
+    real = build.make_env
 
     def make_env(task: str, *arguments: Any, **named: Any) -> Any:
         return (fake_env.make_env if task == "fake" else real)(task, *arguments, **named)
 
-    monkeypatch.setattr(setup, "make_env", make_env)
+    monkeypatch.setattr(build, "make_env", make_env)
 
 
 @functools.cache

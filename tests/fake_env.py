@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.cli import launch, main, setup
+from mqe_jax import build
+from mqe_jax.cli import launch, main
 from mqe_jax.envs import EnvironmentState
 from mqe_jax.train import devices
 
@@ -135,7 +136,7 @@ class FakeVectorEnv:
 
 
 def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
-    """Replaces `mqe_jax.cli.setup.make_env`."""
+    """Replaces `mqe_jax.build.make_env`."""
     return made(num_envs)
 
 
@@ -147,6 +148,6 @@ def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
 
 
 if __name__ == "__main__":
-    setattr(setup, "make_env", make_env)  # noqa: B010
+    setattr(build, "make_env", make_env)  # noqa: B010
     setattr(launch, "PROGRAM", [sys.executable, __file__])  # noqa: B010
     sys.exit(main())

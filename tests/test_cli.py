@@ -15,8 +15,8 @@ import pytest
 from fake_env import SMALL, FakeEnv
 
 import mqe_jax
-from mqe_jax import cli
-from mqe_jax.cli import arguments, profile, setup
+from mqe_jax import build, cli
+from mqe_jax.cli import arguments, profile
 from mqe_jax.cli.profile import Operation
 from mqe_jax.cli.train import parse_train, parse_walk_train
 from mqe_jax.envs import QuadrupedEnv, make
@@ -37,7 +37,7 @@ def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) 
     """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(setup, "make_env", fake_env.make_env)
+        patch.setattr(build, "make_env", fake_env.make_env)
         assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     return folder
 
@@ -209,14 +209,14 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
 
 def test_set_keeps_the_other_parameters_of_a_run(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    config = override(setup.run_config(str(run_folder)), {"env": {"rewards": {"collision": -5.0}}})
-    monkeypatch.setattr(setup, "run_config", lambda target: config)
+    config = override(build.run_config(str(run_folder)), {"env": {"rewards": {"collision": -5.0}}})
+    monkeypatch.setattr(build, "run_config", lambda target: config)
 
     def make_env(task: str, impl: str, overrides: Any, num_envs: int) -> None:
         made.append(overrides)
         raise InputError("stop")
 
-    monkeypatch.setattr(setup, "make_env", make_env)
+    monkeypatch.setattr(build, "make_env", make_env)
     assert cli.main(["eval", str(run_folder), "--set", "rewards={success: 9}", "--set", "rewards={approach: 1}"]) == 2
     assert made == [{"rewards": {"collision": -5.0, "success": 9, "approach": 1}}]
 
@@ -240,7 +240,7 @@ def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: py
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
     parsed = parse_train(["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"])
     assert parsed.settings == override(
-        setup.base_config("go1gate", "demo"), {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
+        build.base_config("go1gate", "demo"), {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
     )
     parsed = parse_train(["--network.name", "mat", "--network.heads", "2", "go1gate", "--checkpoint.no-environments"])
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
@@ -329,10 +329,10 @@ print([name for name in ("glfw", "mqe_jax.study.runs") if name in sys.modules], 
 
 
 def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:
-    demo = setup.base_config("go1seesaw", "demo")
-    assert setup.for_task(demo, "go1seesaw").task == "go1seesaw"
+    demo = build.base_config("go1seesaw", "demo")
+    assert build.for_task(demo, "go1seesaw").task == "go1seesaw"
     assert "the settings are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
-    setup.for_task(demo, "go1gate")
+    build.for_task(demo, "go1gate")
     assert not capfd.readouterr().err
 
 

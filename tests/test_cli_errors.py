@@ -9,8 +9,8 @@ import jax
 import pytest
 from fake_env import SMALL
 
-from mqe_jax import cli
-from mqe_jax.cli import commands, setup
+from mqe_jax import build, cli
+from mqe_jax.cli import commands
 from mqe_jax.cli.train import runner
 from mqe_jax.errors import NonFiniteError
 from mqe_jax.train.nn import mlp_init
@@ -169,6 +169,6 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any)
 )
 def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also a ValueError that code of the package raises, unless it is an InputError."""
-    monkeypatch.setattr(setup, "make_env", lambda *arguments: defect())
+    monkeypatch.setattr(build, "make_env", lambda *arguments: defect())
     with pytest.raises(error):
         cli.main(["bench", "fake"])

@@ -23,7 +23,7 @@ from mqe_jax.cli.setup import for_task
 from mqe_jax.cli.train import parse_train
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.planners import scripted_policy
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.networks import NETWORKS
 
 ROOT = Path(__file__).parents[1]
@@ -123,9 +123,9 @@ def example(script_folder: None) -> Any:
 def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:
     env = VectorEnv(make("go1catch", impl="c", num_envs=8), 8)
     plan = jax.vmap(scripted_policy(env.env))
-    result = evaluate(env, lambda obs, memory, _: (plan(obs), memory), 8, jax.random.PRNGKey(0))
+    result = evaluate_batch(env, lambda obs, memory, _: (plan(obs), memory), 8, jax.random.PRNGKey(0))
     assert result.success_rate >= 0.5
-    idle = evaluate(env, lambda obs, memory, _: (jnp.zeros((8, 1, 3)), memory), 8, jax.random.PRNGKey(0))
+    idle = evaluate_batch(env, lambda obs, memory, _: (jnp.zeros((8, 1, 3)), memory), 8, jax.random.PRNGKey(0))
     assert idle.success_rate == 0
     np.testing.assert_allclose(
         example.flee(jnp.array([3.0, 1.0]), jnp.array([3.0, 0.0]), speed=0.4), [0, 0.4], atol=1e-6

@@ -21,7 +21,7 @@ import mqe_jax
 from mqe_jax import limits, memory, robots
 from mqe_jax.adapters import gymnasium
 from mqe_jax.cli.arguments import parse
-from mqe_jax.cli.setup import parse_overrides
+from mqe_jax.cli.options import parse_overrides
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
@@ -30,7 +30,7 @@ from mqe_jax.settings import build, check, load_yaml, override
 from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train
 from mqe_jax.view import messages
@@ -59,7 +59,7 @@ def made() -> dict[str, Any]:
 
 
 def _evaluate(x: Any, episodes: Any = 2, key: Any = KEY, **options: Any) -> Any:
-    return evaluate(options.pop("env", x["batch"]), options.pop("act", x["act"]), episodes, key, **options)
+    return evaluate_batch(options.pop("env", x["batch"]), options.pop("act", x["act"]), episodes, key, **options)
 
 
 def _record(x: Any, key: Any = KEY, **options: Any) -> Any:

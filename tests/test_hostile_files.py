@@ -20,7 +20,7 @@ import pytest
 from safetensors.numpy import save
 
 from mqe_jax import cli, limits
-from mqe_jax.cli.setup import parse_overrides
+from mqe_jax.cli.options import parse_overrides
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.files import parse_json, parse_yaml, read_rows, read_tensors

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax import build as setup
 from mqe_jax import cli
-from mqe_jax.cli import setup
-from mqe_jax.cli.setup import base_config
+from mqe_jax.build import base_config
 from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.cli.setup import base_config, preset
+from mqe_jax.build import base_config, preset
 from mqe_jax.cli.train import parse_train
 from mqe_jax.errors import InputError
 from mqe_jax.export import translate
@@ -28,7 +28,7 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.settings import build, override
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import NETWORKS, EnvDims, Network
@@ -311,7 +311,7 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     assert any(not np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
     policy = read_policy(whole / "seed1")
-    result = evaluate(env, policy, 8, jax.random.PRNGKey(0), block=3)
+    result = evaluate_batch(env, policy, 8, jax.random.PRNGKey(0), block=3)
     assert result.episode_length == 3.0 and -4.0 < result.average_step_reward < 0.0
     monkeypatch.setattr(Session, "moment", lambda self: None)  # the probe has no bodies
     session = Session(env, env, policy)

@@ -249,11 +249,11 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
 )
 def test_the_planner_wins(task: str, share: float) -> None:
     """Through the walk policy, over a few episodes; `mqe eval TASK --policy scripted` measures many."""
-    from mqe_jax.train.evaluate import evaluate
+    from mqe_jax.train.evaluate import evaluate_batch
 
     batch = VectorEnv(make(task, impl="c", num_envs=16), 16)
     plan = jax.vmap(scripted_policy(batch.env))
-    result = evaluate(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0))
+    result = evaluate_batch(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0))
     assert result.to_dict()["success_rate"] >= share
 
 

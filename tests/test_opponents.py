@@ -23,7 +23,7 @@ from mqe_jax.policies import BothTeams, all_agents, load_policy
 from mqe_jax.settings import build
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import score
 from mqe_jax.train.normalize import running_init
@@ -224,7 +224,7 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
 def test_a_team_wins_from_both_sides() -> None:
     inner = matches("go1revolvingdoor", 4, control="command", episode_length=3.0, line_x=1.2)
     env = versus(BothSides(inner), ["idle"])
-    result = evaluate(env, load_policy("forward", inner.env), 4, KEY)
+    result = evaluate_batch(env, load_policy("forward", inner.env), 4, KEY)
     assert (result.success_rate, result.match["win_rate"]) == (1.0, 1.0)
     assert result.episode_return > 0.0 and result.average_step_reward > 0.0
 
@@ -262,7 +262,7 @@ def even(task: str, episodes: int, num_envs: int) -> None:
     env = matches(task, num_envs, episode_length=5.0, position_scale=3.0)
     policy = new_policy(versus(env, ["idle"]), 3, network={"recurrent": False, "action_gain": 1.0})
     fight: Versus = versus(env, [policy])
-    result = evaluate(fight, policy, episodes, KEY)
+    result = evaluate_batch(fight, policy, episodes, KEY)
     win, loss = result.match["win_rate"], result.match["loss_rate"]
     error = np.sqrt(max(win + loss - (win - loss) ** 2, 1 / episodes) / episodes)
     print(f"{task}: {win:.3f} won, {loss:.3f} lost of {episodes}")

@@ -27,7 +27,7 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.settings import override
 from mqe_jax.skills import SKILLS, Command, Skill
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 
@@ -56,7 +56,7 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
     """32 episodes of the gate: within four standard errors of the rate on the card."""
     env = VectorEnv(make("go1gate", impl="c", num_envs=32), 32)
     policy = load_policy("go1gate", env.env)
-    result = evaluate(env, policy, 32, jax.random.PRNGKey(0))
+    result = evaluate_batch(env, policy, 32, jax.random.PRNGKey(0))
     assert result.success_rate > zoo.card("go1gate").results["success"] - 4 * 0.02
 
 

@@ -12,9 +12,9 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
+from mqe_jax import build as setup
 from mqe_jax import cli, zoo
-from mqe_jax.cli import setup
-from mqe_jax.cli.setup import preset
+from mqe_jax.build import preset
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import locked
 from mqe_jax.settings import build, override, to_mapping

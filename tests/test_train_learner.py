@@ -14,7 +14,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.policies import SimplePolicy
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Evaluator, evaluate
+from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
@@ -294,7 +294,7 @@ def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered
 def test_a_policy_of_another_task_is_not_evaluated() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
     with pytest.raises(InputError, match=f"policy: 'one of go1tug' is not allowed; it must be one of {env.name}"):
-        evaluate(env, SimplePolicy("go1tug", 2, lambda obs, key: obs[..., :1]), 4, jax.random.PRNGKey(0))
+        evaluate_batch(env, SimplePolicy("go1tug", 2, lambda obs, key: obs[..., :1]), 4, jax.random.PRNGKey(0))
 
 
 def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:

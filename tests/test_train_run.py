@@ -24,7 +24,7 @@ from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner, start
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
@@ -335,7 +335,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     assert policy.metadata["task"] == "probe"
     with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
         policy.act(np.zeros((3, 3, 2)), memory)
-    result = evaluate(PROBE, policy, 8, jax.random.PRNGKey(0))
+    result = evaluate_batch(PROBE, policy, 8, jax.random.PRNGKey(0))
     assert result.episodes == 8 and result.episode_length == 4.0
 
 
@@ -381,5 +381,5 @@ def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
     assert training.all[0].action.shape == (4, 4, 2, 1) and training.all[0].diverged.shape == (4, 4)
     # The environment gets unbounded samples, which it clips to what it allows.
     assert max(float(np.abs(trace.action).max()) for trace in training.all) > 1.0
-    evaluate(PROBE, read_policy(tmp_path), 4, KEY, recorder=evaluation)
+    evaluate_batch(PROBE, read_policy(tmp_path), 4, KEY, recorder=evaluation)
     assert evaluation.all[0].snapshot.shape == (50, 4)

@@ -100,7 +100,7 @@ class Eval(PolicyOptions):
         num_envs = min(self.num_envs, self.episodes)
         env, vector_env, policy, about = self.environments(num_envs)
         recorder = None if self.dump_diverged is None else DivergenceRecorder(env, self.dump_diverged)
-        result = evaluation.evaluate(
+        result = evaluation.evaluate_batch(
             vector_env, policy, self.episodes, jax.random.PRNGKey(self.seed), recorder=recorder
         )
         if recorder is not None:
@@ -188,7 +188,8 @@ class Bench(TaskOptions):
         """Measures throughput; prints a table, or returns the object for `--json`."""
         import jax
 
-        from mqe_jax.cli import bench, setup
+        from mqe_jax import build
+        from mqe_jax.cli import bench
 
         if not self.profile and (self.sizes or self.output):
             raise InputError("sizes and output need --profile")
@@ -196,7 +197,7 @@ class Bench(TaskOptions):
             from mqe_jax.cli.profile import run
 
             return run(self)
-        env, vector_env = setup.make_env(self.task, self.impl, self.overrides(), self.num_envs)
+        env, vector_env = build.make_env(self.task, self.impl, self.overrides(), self.num_envs)
         key = jax.random.PRNGKey(self.seed)
         result = bench.bench(env, vector_env, key, steps=self.steps, repeats=self.repeats)
         if not self.json:

@@ -11,10 +11,10 @@ from typing import Any
 import jax
 
 from mqe_jax import interrupts
+from mqe_jax.build import base_config, environments, for_task, make_env
 from mqe_jax.cli.commands import Demo
 from mqe_jax.cli.options import echo
 from mqe_jax.cli.render import draw
-from mqe_jax.cli.setup import base_config, environments, for_task, make_env
 from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
@@ -70,7 +70,7 @@ def demo(arguments: Demo) -> None:
 def _measure(env: VectorEnv, policy: TrainedPolicy, episodes: int, config: TrainConfig) -> dict[str, Any]:
     """Evaluates a policy with its mean actions."""
     mean = dataclasses.replace(policy, deterministic=True)
-    return evaluation.evaluate(env, mean, episodes, jax.random.PRNGKey(config.seed + 1000)).to_dict()
+    return evaluation.evaluate_batch(env, mean, episodes, jax.random.PRNGKey(config.seed + 1000)).to_dict()
 
 
 def _summary(result: Mapping[str, Any]) -> str:

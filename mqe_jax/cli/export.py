@@ -27,7 +27,7 @@ class Export:
 
     def run(self) -> dict[str, Any]:
         """Writes the graph if it agrees with JAX; prints a table, or returns the object for `--json`."""
-        from mqe_jax.cli.setup import make_env
+        from mqe_jax.build import make_env
         from mqe_jax.policies import load_policy
 
         _check_installed()

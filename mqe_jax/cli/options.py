@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 import tyro
 
 from mqe_jax import settings
-from mqe_jax.settings import record
+from mqe_jax.errors import InputError, shown
+from mqe_jax.files import parse_yaml
+from mqe_jax.settings import joined, record
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
@@ -51,8 +53,6 @@ class TaskOptions:
 
     def overrides(self) -> dict[str, Any]:
         """Returns the task parameters given by --set, --control and --robot."""
-        from mqe_jax.cli.setup import parse_overrides
-
         flags = {"control": self.control, "robot": self.robot}
         return parse_overrides(self.set) | {name: value for name, value in flags.items() if value is not None}
 
@@ -82,8 +82,7 @@ class PolicyOptions(TaskOptions):
         A run has its own task, parameters and policy; a task has its shipped policy, if its parameters are the default
         ones, its scripted policy, or forward if it has neither; random, where actions are not commands.
         """
-        from mqe_jax import zoo
-        from mqe_jax.cli import setup
+        from mqe_jax import build, zoo
         from mqe_jax.envs import ALIASES, PLANNERS, TASKS
         from mqe_jax.policies import all_agents, load_as, load_policy
         from mqe_jax.train.policy import TrainedPolicy
@@ -94,9 +93,9 @@ class PolicyOptions(TaskOptions):
         default = walking if params.get("control", "command") == "command" else "random"
         name = task if shipped else self.policy or default
         if task not in (*TASKS, *zoo.names()) and (os.sep in self.target or Path(self.target).exists()):
-            config = setup.run_config(self.target)
+            config = build.run_config(self.target)
             task, params, name = config.task, settings.joined(config.env, params), self.policy or self.target
-        env, vector_env = setup.make_env(task, self.impl, params, num_envs)
+        env, vector_env = build.make_env(task, self.impl, params, num_envs)
         own = load_policy(name, env, deterministic=self.deterministic)
         match = len(env.teams) > 1
         opponent, against = (own, name) if shipped and match else (None, "idle")
@@ -107,6 +106,18 @@ class PolicyOptions(TaskOptions):
             about["actions"] = "mean" if own.deterministic else "sampled"
         about |= {"opponent": against, "seed": self.seed} if match else {"seed": self.seed}
         return env, vector_env, all_agents(env, own, opponent), about
+
+
+def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
+    """Parses KEY=VALUE pairs, values as YAML; raises an InputError naming the malformed pair."""
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name.strip():
+            raise InputError(f"set: {shown(pair)} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
+        value = parse_yaml(text, f"set: the value of {shown(pair)}")
+        values = joined(values, {name.strip().replace("-", "_"): value})
+    return values
 
 
 def echo(text: str) -> None:

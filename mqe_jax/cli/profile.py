@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
-from mqe_jax.cli import setup
+from mqe_jax import build
 from mqe_jax.cli.bench import device_name, programs
 from mqe_jax.cli.options import print_table
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
@@ -196,9 +196,9 @@ def _in_turn(runs: dict[str, tuple[Callable[..., Any], Any]], amount: int, repea
 
 def profile_training(task: str, impl: str, env: dict[str, Any], num_envs: int) -> dict[str, Any]:
     """Returns the seconds of a training update with the task's settings and its shares, `learner` among them."""
-    config = setup.for_task(setup.base_config(task, None), task, env)
+    config = build.for_task(build.base_config(task, None), task, env)
     config = override(config, {"num_envs": num_envs, "evaluation.every": None})
-    learner = make_learner(setup.environments(impl, config, 1)[0], config)
+    learner = make_learner(build.environments(impl, config, 1)[0], config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     update = jax.jit(learner.update).lower(state).compile()
     state, _ = jax.block_until_ready(update(state))
@@ -213,7 +213,7 @@ def run(command: Any) -> dict[str, Any]:
     """Returns the object of `mqe bench --profile`: a profile for each number of environments."""
     rows, impl = [], command.impl
     for num_envs in command.sizes or (command.num_envs,):
-        env, vector = setup.make_env(command.task, command.impl, command.overrides(), num_envs)
+        env, vector = build.make_env(command.task, command.impl, command.overrides(), num_envs)
         row = profile(env, vector, jax.random.PRNGKey(command.seed), steps=command.steps, repeats=command.repeats)
         row["training"] = profile_training(command.task, command.impl, command.overrides(), num_envs)
         rows.append(row)

@@ -47,7 +47,7 @@ class Sweep:
 
     def run(self) -> dict[str, Any]:
         """Trains the remaining runs and writes the report, or prints their estimated time."""
-        from mqe_jax.cli.setup import base_config, check_start, environments, for_task
+        from mqe_jax.build import base_config, check_start, environments, for_task
         from mqe_jax.envs import ALIASES, TASKS
         from mqe_jax.study import report as reports
         from mqe_jax.study import sweep as sweeps
@@ -161,7 +161,7 @@ class Tournament(TaskOptions):
         """Plays all pairs; prints a table, or returns the object for `--json`."""
         import jax
 
-        from mqe_jax.cli.setup import anchors, make_env
+        from mqe_jax.build import anchors, make_env
         from mqe_jax.league import tournament
         from mqe_jax.policies import load_policy
 

@@ -14,8 +14,8 @@ import pydantic
 import tyro
 
 from mqe_jax import interrupts, robots, walk_policy
+from mqe_jax.build import base_config, environments, for_task
 from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
-from mqe_jax.cli.setup import base_config, environments, for_task
 from mqe_jax.envs import ALIASES, TASKS, QuadrupedEnv
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.envs.wrappers import WrappedState

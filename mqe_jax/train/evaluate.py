@@ -38,7 +38,7 @@ Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 
 
 @dataclass(frozen=True)
-class EvalResult:
+class Result:
     """Results of an evaluation; means are over the steps of the counted episodes or over episodes."""
 
     task: str
@@ -106,7 +106,7 @@ def _given(function: Act, obs: jax.Array, memory: Memory, key: jax.Array) -> tup
 
 
 @checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
-def evaluate(
+def evaluate_batch(
     env: VectorEnv,
     policy: Policy | Act,
     episodes: int,
@@ -116,7 +116,7 @@ def evaluate(
     block: int = 50,
     max_steps: int = 1_000_000,
     recorder: Recorder | None = None,
-) -> EvalResult:
+) -> Result:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
     Environment i contributes its first `episodes // N` episodes (one more if i < `episodes % N`); later ones are
@@ -146,7 +146,7 @@ def evaluate(
 
 
 class Evaluator:
-    """Evaluates B policies in one compiled program; see `evaluate`.
+    """Evaluates B policies in one compiled program; see `evaluate_batch`.
 
     `act(params, obs (N, A, O), memory, key) -> (action, memory)` is the policy; `params` has a leading axis B, one
     set for each evaluation, or is None if all evaluations share one policy.
@@ -183,8 +183,8 @@ class Evaluator:
         self._begin = jax.jit(jax.vmap(lambda key: _begin(env, jax.random.split(key)[0], memory)))
         self._run = jax.jit(run)
 
-    def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[EvalResult]:
-        """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate`."""
+    def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[Result]:
+        """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate_batch`."""
         episodes = check("episodes", episodes, Episodes)
         count = self._env.num_envs
         quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
@@ -247,14 +247,14 @@ def _run_block(
     return jax.lax.scan(one_step, progress, jax.random.split(key, block))
 
 
-def _result(task: str, episodes: int, progress: _Progress) -> EvalResult:
+def _result(task: str, episodes: int, progress: _Progress) -> Result:
     def total(x: jax.Array) -> float:
         return float(np.sum(np.asarray(x, np.float64)))
 
     steps = total(progress.steps)
     per_step = {name: total(x) / steps for name, x in progress.step_sums.items()}
     per_episode = {name: total(x) / episodes for name, x in progress.end_sums.items()}
-    return EvalResult(
+    return Result(
         task=task,
         episodes=episodes,
         success_rate=per_episode.get("success", float("nan")),

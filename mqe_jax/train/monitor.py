@@ -23,7 +23,7 @@ from typing_extensions import TypedDict
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_locks, make_folder, read_json, write_atomically
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import EvalResult, Evaluator
+from mqe_jax.train.evaluate import Evaluator, Result
 from mqe_jax.train.learner import env_dims
 from mqe_jax.train.policy import TrainedPolicy, policy_act, read_policy, save_policy
 from mqe_jax.train.types import Memory, VectorEnv
@@ -91,7 +91,7 @@ class Monitor:
         ]
 
 
-def _plain(result: EvalResult) -> dict[str, Any]:
+def _plain(result: Result) -> dict[str, Any]:
     """Returns a result as JSON values; non-finite numbers become null."""
     values = {k: v for k, v in result.to_dict().items() if k not in ("task", "episodes", "terms")}
     values |= {f"reward/{name}": value for name, value in result.terms.items()}

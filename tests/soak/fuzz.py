@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
+from mqe_jax import build as setup
 from mqe_jax import cli, zoo
-from mqe_jax.cli import setup
 from mqe_jax.cli.arguments import COMMANDS
 from mqe_jax.envs import TASKS, make
 from mqe_jax.errors import InputError, NonFiniteError

@@ -1,63 +1,49 @@
-"""Environments and training settings from arguments."""
+"""Environments and training settings from what users name: tasks, runs, settings and their changes."""
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from mqe_jax.cli.options import echo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.errors import InputError, nearest, shown
-from mqe_jax.files import parse_yaml
+from mqe_jax.errors import InputError, nearest
 from mqe_jax.league.league import League
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_as, load_policy
-from mqe_jax.settings import Parameters, check, fail, joined, load_yaml, override
+from mqe_jax.settings import Parameters, check, fail, load_yaml, override
 from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
 from mqe_jax.train.learner import env_dims
+from mqe_jax.train.runner import CONFIG_FILE, load_run_config
 from mqe_jax.train.start import initial_key, policy_to_start
 
-CONFIG_FOLDER = Path(__file__).parent.parent / "configs"
-
-
-def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
-    """Parses KEY=VALUE pairs, values as YAML; raises an InputError naming the malformed pair."""
-    values: dict[str, Any] = {}
-    for pair in pairs:
-        name, equals, text = pair.partition("=")
-        if not equals or not name.strip():
-            raise InputError(f"set: {shown(pair)} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
-        value = parse_yaml(text, f"set: the value of {shown(pair)}")
-        values = joined(values, {name.strip().replace("-", "_"): value})
-    return values
+CONFIG_FOLDER = Path(__file__).parent / "configs"
 
 
 def run_config(target: str) -> Any:
     """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
-    from mqe_jax.train import runner
-
     if target.endswith(".safetensors"):
         return load_policy(target).config
     if not Path(target).is_dir():
         allowed = "a run folder, a policy file (*.safetensors), or a task's id"
         raise InputError(f"run: {target!r} is {'not a' if Path(target).exists() else 'no'} folder; allowed: {allowed}")
-    if not (Path(target) / runner.CONFIG_FILE).is_file():
-        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{runner.CONFIG_FILE}"))
+    if not (Path(target) / CONFIG_FILE).is_file():
+        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{CONFIG_FILE}"))
         hint = f"; did you mean {runs[0]}?" if runs else ""
-        raise InputError(f"run: {target!r} has no {runner.CONFIG_FILE}; it is not a run folder{hint}")
-    config = runner.load_run_config(target)
+        raise InputError(f"run: {target!r} has no {CONFIG_FILE}; it is not a run folder{hint}")
+    config = load_run_config(target)
     if config.task is None:
-        raise InputError(f"{target}: {runner.CONFIG_FILE} has no 'task' entry")
+        raise InputError(f"{target}: {CONFIG_FILE} has no 'task' entry")
     return config
 
 
@@ -219,5 +205,5 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
 def for_task(config: TrainConfig, task: str, env: Mapping[str, Any] | None = None) -> TrainConfig:
     """Returns the settings with a task and its parameters; says so where they are those of another task."""
     if config.task not in (None, task):
-        echo(f"mqe: the settings are for {config.task!r}; training {task!r} with them")
+        print(f"mqe: the settings are for {config.task!r}; training {task!r} with them", file=sys.stderr)
     return override(config, {"task": task, "env": dict(env or {})})
