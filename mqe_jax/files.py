@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import fcntl
 import json
 import os
+import platform
 import re
 import shutil
 import stat
@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-_HOST = f"{zlib.crc32(os.uname().nodename.encode()):08x}"
+_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _TEMPORARY = re.compile(r"\..+?(?:\.([0-9a-f]{8}))?\.(\d+)\.tmp(?:\.\w+)?")  # host, process
 _ABANDONED = 3600.0  # s after its last change another host's temporary file counts as left
 _TAGS = {f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")}
-_locks: dict[Path, int] = {}  # folders that this process has locked, with the handle of each
+LOCK = ".lock"
+"""Name of the file that a process locks in a run folder."""
+_locks: dict[Path, os.stat_result] = {}  # folders that this process has locked, with the lock file of each
 
 
 # -- writers: below a locked folder they write only while the folder's path still leads to it --------------------------
@@ -93,7 +95,7 @@ def check_locks(path: Path) -> None:
     for folder in path.parents:
         if folder in _locks:
             with contextlib.suppress(OSError):
-                if os.path.samestat(folder.stat(), os.fstat(_locks[folder])):
+                if os.path.samestat((folder / LOCK).stat(), _locks[folder]):
                     continue
             raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
 
@@ -284,17 +286,21 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         InUseError: where another process (or this one) already holds it.
     """
-    handle, outer = os.open(folder, os.O_RDONLY), _locks.get(folder)
+    import filelock  # 30 ms, which most commands need not wait for
+
+    lock, outer = filelock.FileLock(folder / LOCK, blocking=False), _locks.get(folder)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InUseError(f"run_dir: {folder} is in use by another process") from None
-        _locks[folder] = handle
+        lock.acquire()
+    except filelock.Timeout:
+        raise InUseError(f"run_dir: {folder} is in use by another process") from None
+    try:
+        _locks[folder] = (folder / LOCK).stat()
         yield
     finally:
-        os.close(handle)
-        if outer is None:
-            _locks.pop(folder, None)
-        else:
+        with contextlib.suppress(OSError, InputError):
+            check_locks(folder / LOCK)
+            (folder / LOCK).unlink()  # before the release: another process takes no lock on a file that is gone
+        lock.release()
+        _locks.pop(folder, None)
+        if outer is not None:
             _locks[folder] = outer
