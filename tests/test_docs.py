@@ -18,8 +18,8 @@ import matplotlib
 import numpy as np
 import pytest
 
+from mqe_jax.build import for_task
 from mqe_jax.cli.arguments import parse
-from mqe_jax.cli.setup import for_task
 from mqe_jax.cli.train import parse_train
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.planners import scripted_policy
