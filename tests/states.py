@@ -13,6 +13,7 @@ import numpy as np
 
 from mqe_jax.envs import Moment, QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
+from mqe_jax.envs.state import ENDINGS
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import RobotState
 from mqe_jax.rotation import euler_to_quaternion
@@ -68,6 +69,11 @@ def _quaternion(euler: Any) -> jax.Array:
 def _with(state: State, **fields: np.ndarray) -> State:
     data = state.data.replace(**{name: jnp.asarray(x, jnp.float32) for name, x in fields.items()})
     return dataclasses.replace(state, data=data)
+
+
+def ending(state: State) -> list[str]:
+    """Returns how the episode ended, or nothing while it continues."""
+    return [name.removeprefix("ending/") for name in ENDINGS if state.metrics[name]]
 
 
 def moving(env: Any, state: State, velocity: Sequence[float | jax.Array]) -> State:

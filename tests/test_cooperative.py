@@ -19,7 +19,7 @@ from mqe_jax.planners.cooperative import plan_seesaw
 from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import angles, initial, made, moving, placed, robot_state, stepper, still
+from tests.states import angles, ending, initial, made, moving, placed, robot_state, stepper, still
 
 
 @pytest.fixture(scope="module")
@@ -91,15 +91,17 @@ def test_endings(task: str) -> None:
     position, euler = np.c_[pose[:, :2], height], np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
 
     after = step(placed(env, position, euler), still(env))
-    assert not after.terminated and not after.truncated
+    assert not after.terminated and not after.truncated and not ending(after)
 
     late = dataclasses.replace(placed(env, position, euler), step=jnp.int32(env.max_steps - 1))
     after = step(late, still(env))
-    assert after.truncated and not after.terminated
+    assert after.truncated and not after.terminated and ending(after) == ["time_limit"]
 
     rolled, high = euler.copy(), position.copy()
     rolled[-1, 0], high[-1, 2] = env.params.max_roll + 0.1, high[-1, 2] + 0.5
-    assert step(placed(env, high, rolled), still(env)).terminated
+    for start in (placed(env, high, rolled), placed(env, high, rolled, state=late)):
+        after = step(start, still(env))
+        assert after.terminated and ending(after) == ["fall"]
     rolled[-1, 0] = env.params.max_roll - 0.1
     assert not step(placed(env, high, rolled), still(env)).terminated
 
@@ -111,6 +113,7 @@ def test_endings(task: str) -> None:
         bumped = step(placed(env, touching, across), still(env))
         assert bool(bumped.metrics["collision"])
         assert bool(bumped.terminated) == env.params.end_on_collision
+        assert ending(bumped) == ["collision"] * env.params.end_on_collision
 
 
 @pytest.mark.parametrize(

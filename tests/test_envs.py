@@ -20,7 +20,7 @@ from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.errors import InputError
 from tests import engines
-from tests.states import initial, made, stepper
+from tests.states import ending, initial, made, stepper
 
 Array = jax.Array
 
@@ -121,6 +121,7 @@ def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     assert np.all(np.asarray(after.reward) == 0) and np.isfinite(after.obs).all()
     last = dataclasses.replace(broken, step=jnp.int32(gate.max_steps - 1))
     ended = [gate_step(start, jnp.zeros((2, 12))) for start in (last, dataclasses.replace(last, data=state.data))]
+    assert [ending(state) for state in (after, *ended)] == [["divergence"], ["divergence"], ["time_limit"]]
     assert [(bool(s.terminated), bool(s.truncated)) for s in ended] == [(True, False), (False, True)]  # never both
     bad = gate_step(state, jnp.full((2, 12), jnp.nan))
     assert bad.terminated and float(bad.metrics["diverged"]) == 1

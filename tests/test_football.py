@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.planners import scripted_policy
-from tests.states import initial, made, moment, observation, placed, stepper, still, terms_of, with_object
+from tests.states import ending, initial, made, moment, observation, placed, stepper, still, terms_of, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -245,7 +245,7 @@ def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
     np.testing.assert_allclose(fallen.reward[0], -fallen.reward[1], atol=1e-6)
     for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
         goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), still(duel))
-        assert goal.terminated and float(goal.metrics["team0/win"]) == (sign == 1)
+        assert goal.terminated and float(goal.metrics["team0/win"]) == (sign == 1) and ending(goal) == ["task"]
         assert float(goal.metrics["reward/goal"]) == 10 * sign
         np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
 

@@ -42,6 +42,7 @@ class Rich(Probe):
         number, step = jnp.arange(self.num_envs), state.step
         more = {
             "success/way": state.hidden + number,
+            "ending/fall": (step + number) % 2 == 0,
             "team0/draw": (step + number) % 3 == 0,
             "pace": state.reward[:, 1],
         }
@@ -134,6 +135,7 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
         outcomes = (
             "success",
             "success/way",
+            "ending/fall",
             "team0/win",
             "team0/draw",
             "team0/loss",
@@ -178,7 +180,7 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
         expected = {"success_rate": mean("success", ends), "average_step_reward": mean("average_step_reward", rows)}
         expected |= {"episode_return": np.sum(rewards) / 9, "episode_length": len(rows) / 9}
         expected |= {"overflow": sum(row["overflow"] for row in rows), "diverged": sum(row["diverged"] for row in ends)}
-        expected |= {"success/way": mean("success/way", ends)}
+        expected |= {name: mean(name, ends) for name in ("success/way", "ending/fall")}
         expected |= {f"{name}_rate": mean(f"team0/{name}", ends) for name in ("win", "draw", "loss")}
         values = result.to_dict()
         terms = values.pop("terms")

@@ -26,7 +26,7 @@ from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.returned import alike, numbers, shaped, weights_of
 from mqe_jax.envs.reward import faded, weigh
-from mqe_jax.envs.state import Moment, S, State
+from mqe_jax.envs.state import ENDINGS, Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments
@@ -218,7 +218,7 @@ class QuadrupedEnv(Task[S, P]):
         now = Moment(state, robot_state)
         _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams)
         outcome = numbers("outcome", self.outcome(state, robot_state, no))
-        names = (*logged, *outcome, "collision", "diverged", "overflow")
+        names = (*logged, *outcome, *ENDINGS, "collision", "diverged", "overflow")
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
 
@@ -268,14 +268,19 @@ class QuadrupedEnv(Task[S, P]):
         if (floor := self.params.shaping_floor) < 1.0:
             terms = faded(terms, weights_of(self.Params()), floor + (1.0 - floor) * state.assistance)
         reward, logged = weigh(terms, self.weights, self.teams)
-        failed = jnp.any(self.fallen(robot_state)) | diverged | (collision & self.params.end_on_collision)
-        terminated = failed | shaped("ending", self.ending(state, robot_state), (), dtype=bool)
+        fall, crash = jnp.any(self.fallen(robot_state)), collision & self.params.end_on_collision
+        failed = diverged | fall | crash
+        decided = shaped("ending", self.ending(state, robot_state), (), dtype=bool)
+        terminated, late = failed | decided, state.step >= self.max_steps
         outcome = numbers("outcome", self.outcome(state, robot_state, failed))
         metrics = {**logged, **outcome, "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
         metrics = {name: clean(value, self.metrics_if_diverged.get(name, 0.0)) for name, value in metrics.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
-        truncated = ~terminated & (state.step >= self.max_steps)
+        causes = jnp.stack([diverged, fall, crash, decided, late])
+        first = causes & (jnp.cumsum(causes) == 1)
+        metrics |= {name: cause.astype(jnp.float32) for name, cause in zip(ENDINGS, first, strict=True)}
+        truncated = ~terminated & late
         reward = clean(reward)
         return dataclasses.replace(state, reward=reward, terminated=terminated, truncated=truncated, metrics=metrics)
 

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 """A task's own state."""
 
+ENDINGS = ("ending/divergence", "ending/fall", "ending/collision", "ending/task", "ending/time_limit")
+"""Metrics of how an episode ends: 1 for the first of them that holds in its last step. `ending/task` is an end by the
+task's own rules, which decides a match."""
+
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentState:
@@ -52,8 +56,8 @@ class EnvironmentState:
 class State(EnvironmentState, Generic[S]):
     """State of one environment with A agents, R robots and G anchors.
 
-    Its metrics include `average_step_reward`, `success`, `collision`, `diverged` and `overflow` (1 where the physics
-    engine may have dropped contacts or constraints in any physics step of this step).
+    Its metrics include `average_step_reward`, `success`, `ENDINGS`, `collision`, `diverged` and `overflow` (1 where the
+    physics engine may have dropped contacts or constraints in any physics step of this step).
     """
 
     data: mjx.Data

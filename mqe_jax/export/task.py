@@ -103,8 +103,8 @@ class TaskFunctions:
     def judge(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns the observation, the result and the task's next fields after a step.
 
-        `obs` (A, O), `outcome`: the metrics `outcomes` as if the episode ended here, and as 0 or 1
-        `terminated`, `truncated`, `fell` (any robot), `collided` (where collisions end the episode), `next_task_NAME`.
+        `obs` (A, O), `outcome`: the metrics `outcomes` as if the episode ended here, `next_task_NAME`, and as 0 or 1
+        `terminated`, `truncated`, `fell` and `collided`: the metrics `ending/fall` and `ending/collision`.
         """
         env, after = self.env, self.state(inputs)
         before = self.state({**inputs, **{name: inputs[f"before_{name}"] for name in PHYSICS}})
@@ -117,8 +117,8 @@ class TaskFunctions:
             "outcome": jnp.stack([state.metrics[name] for name in self.outcomes]),
             "terminated": state.terminated,
             "truncated": state.truncated,
-            "fell": jnp.any(env.fallen(robots)),
-            "collided": state.metrics["collision"] * env.params.end_on_collision,
+            "fell": state.metrics["ending/fall"],
+            "collided": state.metrics["ending/collision"],
             **named("next_task", state.task),
         }
         return {name: x.astype(jnp.float32) for name, x in outputs.items()}

@@ -57,15 +57,19 @@ class Result:
     """Number of counted steps in which the engine dropped contacts."""
     diverged: int
     """Number of episodes that ended because the physics diverged."""
+    endings: dict[str, float]
+    """Fraction of episodes that ended by each cause, from metrics `ending/<name>`."""
     success: dict[str, float]
     """Other outcomes by name, mean over episodes, from metrics `success/<name>`."""
     match: dict[str, float]
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; the entries of `success` and `match` become top-level keys."""
-        values = {k: v for k, v in vars(self).items() if k not in ("success", "match")}
-        return {**values, **self.match, **{f"success/{name}": value for name, value in self.success.items()}}
+        """Returns plain values for JSON; the entries of `endings`, `success` and `match` become top-level keys."""
+        values = {k: v for k, v in vars(self).items() if k not in ("endings", "success", "match")}
+        named = {"ending": self.endings, "success": self.success}
+        flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
+        return {**values, **self.match, **flat}
 
 
 class _Progress(NamedTuple):
@@ -264,6 +268,7 @@ def _result(task: str, episodes: int, progress: _Progress) -> Result:
         episode_length=steps / episodes,
         overflow=round(per_step.get("overflow", 0.0) * steps),
         diverged=round(per_episode.get("diverged", 0.0) * episodes),
+        endings={n.removeprefix("ending/"): v for n, v in per_episode.items() if n.startswith("ending/")},
         success={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
         match={f"{n}_rate": per_episode[f"team0/{n}"] for n in ("win", "draw", "loss") if f"team0/{n}" in per_episode},
     )

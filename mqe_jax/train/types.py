@@ -162,9 +162,9 @@ def teams_of(env: VectorEnv) -> Teams:
 
 
 def is_outcome(metric: str) -> bool:
-    """Returns whether a metric is an episode outcome, read at its last step, such as `success` or `team0/win`."""
+    """Returns whether a metric is an episode outcome, read at its last step: `success`, `team0/win`, `ending/fall`."""
     reward = metric.removeprefix("team1/").startswith(("reward/", "average_step_reward"))
-    return metric.startswith(("success", "team")) and not reward
+    return metric.startswith(("success", "team", "ending/")) and not reward
 
 
 class NetworkMemory(NamedTuple):
