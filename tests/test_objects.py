@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from mqe_jax import objects
-from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs import Moment, QuadrupedEnv, VectorEnv, make
 from mqe_jax.npc import defend, flock
 from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import go_to, scripted_policy
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
-from tests.states import initial, made, terms_of, with_object
+from tests.states import angles, initial, made, placed, terms_of, with_object
 
 STEP = 0.02
 
@@ -219,7 +219,9 @@ def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
         state = with_object(herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0])
     reward = terms_of(herd, state, state)[1]
     np.testing.assert_allclose(reward, [2 + 7 * np.exp(-2.5)] * 2, atol=1e-4)
-    assert float(herd.outcome(state, herd.read(state.data), jnp.array(False))["success"]) == pytest.approx(2 / 9)
+    for failed, share in ((False, 2 / 9), (True, 0.0)):
+        outcome = herd.outcome(state, herd.read(state.data), jnp.array(failed))
+        assert [float(x) for x in outcome.values()] == pytest.approx([share, 2 / 9])
 
 
 def test_shaping_terms_of_sheep_dog(herd: Any) -> None:
@@ -232,7 +234,13 @@ def test_shaping_terms_of_sheep_dog(herd: Any) -> None:
     forth, back = terms_of(herd, before, after)[0], terms_of(herd, after, before)[0]
     assert float(forth["crossing"]) == 1 and float(forth["gathering"]) == pytest.approx(1.5, abs=1e-5)
     assert float(back["crossing"]) == -1 and float(back["gathering"]) == pytest.approx(-1.5, abs=1e-5)
-    assert herd.params.rewards.crossing == herd.params.rewards.gathering == 0
+    weights = herd.params.rewards
+    assert weights.crossing == weights.gathering == weights.failure == 0
+    fallen = placed(herd, [[2.0, -1.0, 0.5], [2.0, 1.0, 0.3]], angles(roll=(0.9, 0.0)))
+    standing = placed(herd, [[2.0, -1.0, 0.3], [2.0, 1.0, 0.3]])
+    moments = [Moment(state, herd.read(state.data)) for state in (standing, fallen)]
+    failures = [herd.rewards(now, now, jnp.array(bump))["failure"] for now in moments for bump in (False, True)]
+    assert [bool(x) for x in failures] == [False, True, True, True]
 
 
 def test_the_herd_starts_as_listed(herd: Any) -> None:

@@ -39,6 +39,8 @@ class SheepRewards:
     """Per sheep that passes the gate in a step, less those that come back. For training alone."""
     gathering: float = 0.0
     """Per m of decrease of the sheep's summed distances to the gate's centre, 0 past it. For training alone."""
+    failure: float = 0.0
+    """In steps with a fall or a collision of a robot. For training alone."""
 
 
 @record
@@ -107,7 +109,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front of it.
     - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2, each sheep's x, y.
     - Reward: see `SheepRewards`; shared.
-    - End: a fall, a collision, or 15 s. Success: the fraction of the sheep that are past the gate.
+    - End: a fall, a collision, or 15 s. Success: the share of the sheep that are past the gate at the time limit.
 
     Source: paper, section III and table of rewards.
     """
@@ -187,6 +189,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
             "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-way / 2.0))),
             "crossing": passed - jnp.sum(through_before),
             "gathering": jnp.sum(way_before) - jnp.sum(way),
+            "failure": collision | jnp.any(self.fallen(after.robots)),
         }
 
     def _flock(self, state: State) -> tuple[jax.Array, jax.Array]:
@@ -195,8 +198,12 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return through, jnp.where(through, 0.0, jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1))
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: the fraction of the sheep that are past the gate, however the episode ended."""
-        return {"success": jnp.mean(self.through(state))}
+        """Success: the share of the sheep that are past the gate, 0 after a fall or a collision.
+
+        `success/through`: the share that are, however the episode ended.
+        """
+        through = jnp.mean(self.through(state))
+        return {"success": jnp.where(failed, 0.0, through), "success/through": through}
 
 
 class Go1SheepHard(Go1SheepEasy):
