@@ -14,7 +14,7 @@ import numpy as np
 
 from mqe_jax.engines import Engine
 from mqe_jax.errors import InputError
-from mqe_jax.files import read_tensors
+from mqe_jax.files import linear_layers, read_tensors
 from mqe_jax.robots.index import RobotIndex, placed
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 
@@ -69,15 +69,8 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
     if not file.is_file():
         raise InputError(f"actuator_network: no file {file}")
     flat = read_tensors(file, "actuator_network")
-    params: ActuatorParams = {}
-    for layer, (n_in, n_out) in zip(("0", "2", "4"), ((6, 32), (32, 32), (32, 1)), strict=True):
-        for kind, shape in (("weight", (n_out, n_in)), ("bias", (n_out,))):
-            name = f"{layer}.{kind}"
-            found = tuple(flat[name].shape) if name in flat else "nothing"
-            if found != shape:
-                raise InputError(f"actuator_network {file}: {name} has shape {found}; expected {shape}")
-            params.setdefault(layer, {})[kind] = jnp.asarray(flat[name], jnp.float32)
-    return params
+    layers = linear_layers(f"actuator_network {file}", flat, {"0": (6, 32), "2": (32, 32), "4": (32, 1)})
+    return jax.tree.map(jnp.asarray, layers)
 
 
 def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:

@@ -14,7 +14,7 @@ import tempfile
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -249,6 +249,30 @@ def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
             if array.dtype.kind not in "fV" or not np.isfinite(array).all():  # V: bfloat16
                 raise ValueError(f"{name} is not, dtype {array.dtype}")
         return arrays
+
+
+def linear_layers(
+    what: str, arrays: Mapping[str, np.ndarray], sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Returns the arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer, as float32.
+
+    `sizes` holds inputs and outputs of each layer. An InputError says `what` has a missing or unexpected name, or
+    another shape.
+    """
+    import numpy as np
+
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layer, (n_in, n_out) in sizes.items():
+        shapes |= {f"{layer}.weight": (n_out, n_in), f"{layer}.bias": (n_out,)}
+    for name in (*shapes, *arrays):
+        if name not in arrays:
+            raise InputError(f"{what}: {name} is missing; expected {', '.join(shapes)}")
+        if name not in shapes:
+            raise InputError(f"{what}: {name} is not expected; expected {', '.join(shapes)}")
+        if tuple(arrays[name].shape) != shapes[name]:
+            raise InputError(f"{what}: {name} has shape {tuple(arrays[name].shape)}; expected {shapes[name]}")
+    kinds = ("weight", "bias")
+    return {layer: {kind: np.asarray(arrays[f"{layer}.{kind}"], np.float32) for kind in kinds} for layer in sizes}
 
 
 @contextlib.contextmanager

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_locks, read_tensors, write_atomically
+from mqe_jax.files import check_locks, linear_layers, read_tensors, write_atomically
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.settings import PathText, check
@@ -278,19 +278,12 @@ def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
     """Returns flat weights as nested float32 arrays.
 
     Raises:
-        InputError: for missing names or other shapes; the message starts with `source`.
+        InputError: for missing or unexpected names, or other shapes; the message names `source`.
     """
     params: Params = {"adaptation": {}, "body": {}}
-    shapes: dict[str, tuple[int, ...]] = {}
-    for layer, (n_in, n_out) in _LAYERS.items():
-        shapes |= {f"{layer}.weight": (n_out, n_in), f"{layer}.bias": (n_out,)}
-    for name, shape in shapes.items():
-        if name not in flat:
-            raise InputError(f"walk policy {source}: {name} is missing; expected {', '.join(shapes)}")
-        if tuple(flat[name].shape) != shape:
-            raise InputError(f"walk policy {source}: {name} has shape {tuple(flat[name].shape)}; expected {shape}")
-        part, layer, kind = name.split(".")
-        params[part].setdefault(layer, {})[kind] = jax.device_put(np.asarray(flat[name], np.float32))
+    for name, arrays in linear_layers(f"walk policy {source}", flat, _LAYERS).items():
+        part, layer = name.split(".")
+        params[part][layer] = jax.device_put(arrays)
     return params
 
 

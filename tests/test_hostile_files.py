@@ -171,8 +171,8 @@ def test_policies_with_metadata_of_another_type(metadata: str, tmp_path: Path) -
 
 
 # A pickle by its opcodes: a module with the attributes that follow on the stack as a dict.
-def module(*attributes: bytes) -> bytes:
-    return b"c__torch__.x\nM\n)\x81}(" + b"".join(attributes) + b"ub"
+def module(*attributes: bytes, kind: str = "x\nM") -> bytes:
+    return f"c__torch__.torch.nn.modules.{kind}\n".encode() + b")\x81}(" + b"".join(attributes) + b"ub"
 
 
 def named(name: str, value: bytes) -> bytes:
@@ -235,8 +235,9 @@ ARCHIVES: dict[str, Callable[[], bytes]] = {
 
 def test_a_small_archive_is_read(tmp_path: Path) -> None:
     """The opcodes of the cases below are right."""
-    (tmp_path / "good.jit").write_bytes(archived(module(LINEAR), struct.pack("<f", 3.0)))
-    assert read_torchscript(tmp_path / "good.jit") == {"weight": np.array([3.0], np.float32)}
+    layers = module(named("0", module(LINEAR, kind="linear\nLinear")), kind="container\nSequential")
+    (tmp_path / "good.jit").write_bytes(archived(layers, struct.pack("<f", 3.0)))
+    assert read_torchscript(tmp_path / "good.jit") == {"0.weight": np.array([3.0], np.float32)}
 
 
 @pytest.mark.parametrize("name", ["task", "impl", "num_envs", "control"])

@@ -7,6 +7,7 @@ import functools
 import itertools
 import pathlib
 import pickle
+import re
 import zipfile
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from mqe_jax import actuators, cli, make, skills, walk_policy
 from mqe_jax.control import Controller
@@ -101,8 +103,16 @@ class _Stored:
         self.key, self.count = key, count
 
 
-def write_torchscript(path: pathlib.Path, layers: dict[str, np.ndarray]) -> None:
-    """Writes an archive laid out as torch.jit.save lays out a Sequential of Linear and ELU."""
+def write_torchscript(
+    path: pathlib.Path,
+    layers: dict[str, np.ndarray],
+    *,
+    activation: str = "ELU",
+    alpha: str = "1.",
+    root: str = "torch.nn.modules.container.Sequential",
+    further: dict[str, Any] | None = None,
+) -> None:
+    """Writes an archive laid out as torch.jit.save does for a Sequential of Linear and ELU, with `further` attributes."""
     files: dict[str, bytes] = {}
 
     def tensor(value: np.ndarray) -> _Called:
@@ -112,21 +122,26 @@ def write_torchscript(path: pathlib.Path, layers: dict[str, np.ndarray]) -> None
         rebuild = _Global("torch._utils", "_rebuild_tensor_v2")
         return _Called(rebuild, (_Stored(key, value.size), 0, value.shape, stride, False, {}))
 
-    linear = _Global("__torch__.torch.nn.modules.linear", "Linear")
-    activation = _Global("__torch__.torch.nn.modules.activation", "ELU")
-    children: dict[str, Any] = {"training": True}
-    count = len(layers) // 2
-    for i in range(count):
-        state = {"training": True, "weight": tensor(layers[f"{2 * i}.weight"]), "bias": tensor(layers[f"{2 * i}.bias"])}
-        children[str(2 * i)] = _Made(linear, state)
-        if i < count - 1:
-            children[str(2 * i + 1)] = _Made(activation, {"training": True, "alpha": 1.0})
-    root = _Made(_Global("__torch__.torch.nn.modules.container", "Sequential"), children)
+    def module(name: str, state: dict[str, Any]) -> _Made:
+        return _Made(_Global(*f"__torch__.{name}".rsplit(".", 1)), {"training": True, **state})
+
+    children: dict[str, Any] = {}
+    for name in sorted({name.split(".")[0] for name in layers}, key=int):
+        if children:
+            children[str(int(name) - 1)] = module(f"torch.nn.modules.activation.___torch_mangle_3.{activation}", {})
+        linear = {kind: tensor(layers[f"{name}.{kind}"]) for kind in ("weight", "bias")}
+        children[name] = module("torch.nn.modules.linear.Linear", linear)
+    for name, value in (further or {}).items():
+        children[name] = tensor(value) if isinstance(value, np.ndarray) else value
+        if isinstance(value, str):
+            children[name] = module(value, {})
+    source = f"    _0 = __torch__.torch.nn.functional.elu(input, {alpha}, False, )\n    return _0\n"
     with zipfile.ZipFile(path, "w") as archive:
         with archive.open("net/data.pkl", "w") as file:
-            _Pickler(file, 2).dump(root)
+            _Pickler(file, 2).dump(module(root, children))
         for key, content in files.items():
             archive.writestr(f"net/data/{key}", content)
+        archive.writestr("net/code/__torch__/torch/nn/modules/activation/___torch_mangle_3.py", source)
         archive.writestr("net/version", "3\n")
 
 
@@ -186,6 +201,47 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
     with pytest.raises(ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"):
         torchscript.convert(tmp_path / "small.jit", tmp_path / "small.jit")
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        ({"activation": "ReLU"}, "1 is a torch.nn.modules.activation.ReLU"),
+        ({"activation": "Tanh"}, "1 is a torch.nn.modules.activation.Tanh"),
+        ({"alpha": "0.5"}, "1 is an ELU with alpha 0.5"),
+        ({"alpha": "1., 1.5e+00"}, "1 is an ELU with alpha 1.5e"),
+        ({"root": "policy.Scaled"}, "the network is a policy.Scaled"),
+        ({"further": {"7": "torch.nn.modules.activation.Tanh"}}, "7 is a torch.nn.modules.activation.Tanh"),
+        ({"further": {"7": "torch.nn.modules.activation.___torch_mangle_3.ELU"}}, "the last must be Linear"),
+        ({"further": {"scale": np.full(1, 2.0, np.float32)}}, "scale is not expected"),
+        ({"further": {"scale": 2.0}}, "scale is not expected"),
+        ({"further": {"1": None}}, "1 is a NoneType"),
+    ],
+)
+def test_other_networks_are_refused_by_name(network: dict[str, Any], message: str, tmp_path: pathlib.Path) -> None:
+    write_torchscript(tmp_path / "a.jit", random_layers((6, 5, 4, 3, 2), 0), **network)
+    with pytest.raises(InputError, match=rf"a\.jit: .*{re.escape(message)}"):
+        torchscript.read_torchscript(tmp_path / "a.jit")
+
+
+@pytest.mark.parametrize("read", [functools.partial(walk_policy.load_params, GO1), actuators.load_actuator_network])
+def test_weights_with_other_names_or_shapes_are_refused(read: Any, tmp_path: pathlib.Path) -> None:
+    arrays = random_layers((6, 32, 32, 1), 0)
+    if read is not actuators.load_actuator_network:
+        parts = {"adaptation": random_layers(ADAPTATION_SIZES, 0), "body": random_layers(BODY_SIZES, 1)}
+        arrays = {f"{part}.{name}": value for part, layers in parts.items() for name, value in layers.items()}
+    first, file = next(iter(arrays)), tmp_path / "weights.safetensors"
+    save_file(arrays, file)
+    read(file)
+    changed = {
+        "8.weight is not expected": {**arrays, "8.weight": np.zeros((1, 1), np.float32)},
+        f"{first} is missing": {name: value for name, value in arrays.items() if name != first},
+        f"{first} has shape": {**arrays, first: arrays[first].T.copy()},
+    }
+    for message, wrong in changed.items():
+        save_file(wrong, file)
+        with pytest.raises(InputError, match=rf"weights\.safetensors: {re.escape(message)}.*; expected"):
+            read(file)
 
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:

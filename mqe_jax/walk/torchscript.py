@@ -1,8 +1,8 @@
 """Official TorchScript checkpoints of walk-these-ways, read without torch and without executing code from them.
 
 The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw storages in
-`<name>/data/<key>`. The unpickler below supports only tensors and containers; every module class becomes a plain
-object that keeps its attributes.
+`<name>/data/<key>`, and `<name>/code` holds the source of its classes. The unpickler below supports only tensors and
+containers; every module class becomes a plain object that keeps its attributes.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import io
 import math
 import os
 import pickle
+import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,17 +23,18 @@ from mqe_jax.files import archive
 from mqe_jax.settings import PathText, checked
 from mqe_jax.walk_policy import Params, nested_params
 
-_DTYPES = {
-    "FloatStorage": "<f4",
-    "DoubleStorage": "<f8",
-    "HalfStorage": "<f2",
-    "LongStorage": "<i8",
-    "IntStorage": "<i4",
-}
+_DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}
+_MANGLED = re.compile(r"\.___torch_mangle_\d+")
+_NUMBER = re.compile(r", (-?[\d.]+(?:e[+-]?\d+)?)(?=[,)])")  # as an argument in TorchScript's source
 
 
 class _Module:
-    """Placeholder for any module class of the archive."""
+    """Placeholder for a module class of the archive."""
+
+    kind: ClassVar[str]
+    """Qualified name of the class."""
+    source: ClassVar[str]
+    """Name of the archive's member that defines it."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -50,7 +52,9 @@ class _Unpickler(_PurePython):
 
     def find_class(self, module: str, name: str) -> Any:
         if module.startswith("__torch__"):
-            return _Module
+            kind = f"{_MANGLED.sub('', module)}.{name}".removeprefix("__torch__.")
+            source = f"{self._root}/code/{module.replace('.', '/')}.py"
+            return type(name, (_Module,), {"kind": kind, "source": source})
         if module == "torch._utils" and name in ("_rebuild_tensor_v2", "_rebuild_tensor"):
             return self._rebuild_tensor
         if module == "torch._utils" and name == "_rebuild_parameter":
@@ -89,30 +93,41 @@ class _Unpickler(_PurePython):
 
 @checked(path=PathText)
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Returns the tensors of a TorchScript file by dotted name, float32, such as 0.weight of a `Sequential`.
+    """Returns the tensors of a scripted or traced `Sequential` by dotted name, float32, such as 0.weight.
 
     Raises:
-        InputError: if the file is not such an archive, or exceeds the limits.
+        InputError: if the file is not such an archive, exceeds the limits, or holds anything but linear layers with an
+            ELU (alpha 1) between each two.
     """
-    with archive(Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of float32 layers") as opened:
+    with archive(Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of Linear and ELU layers") as opened:
         names = [name for name in opened.namelist() if name.endswith("/data.pkl") and name.count("/") == 1]
         if len(names) != 1:
             raise ValueError("no data.pkl in it")
+        root = _Unpickler(opened.read(names[0]), opened, names[0].split("/")[0]).load()
+        children = _parts("the network", root, "container.Sequential")
         state: dict[str, np.ndarray] = {}
-        _collect(_Unpickler(opened.read(names[0]), opened, names[0].split("/")[0]).load(), "", state, set())
+        for index, (name, child) in enumerate(children.items()):
+            if name != str(index):
+                raise ValueError(f"{name} is not expected")
+            parts = _parts(name, child, "activation.ELU" if index % 2 else "linear.Linear")
+            alphas = _NUMBER.findall(opened.read(child.source).decode()) if index % 2 else []
+            if wrong := [alpha for alpha in alphas if float(alpha) != 1]:
+                raise ValueError(f"{name} is an ELU with alpha {wrong[0]}, not 1")
+            for part, value in parts.items():
+                if part not in ("weight", "bias") or not isinstance(value, np.ndarray):
+                    raise ValueError(f"{name}.{part} is not expected")
+                state[f"{name}.{part}"] = value
+        if len(children) % 2 == 0:
+            raise ValueError(f"{len(children)} layers; the last must be Linear")
         return state
 
 
-def _collect(module: Any, prefix: str, state: dict[str, np.ndarray], seen: set[int]) -> None:
-    """Adds the tensors of a tree of modules, in which none occurs twice, to `state`."""
-    if not isinstance(module, _Module) or id(module) in seen:
-        raise ValueError("its modules are not a tree")
-    seen.add(id(module))
-    for name, value in vars(module).items():
-        if isinstance(value, np.ndarray):
-            state[f"{prefix}{name}"] = value
-        elif isinstance(value, _Module):
-            _collect(value, f"{prefix}{name}.", state, seen)
+def _parts(name: str, module: Any, kind: str) -> dict[str, Any]:
+    """Returns the attributes of a module of `torch.nn.modules`, such as linear.Linear, without torch's own."""
+    found = getattr(module, "kind", type(module).__name__)
+    if found != f"torch.nn.modules.{kind}":
+        raise ValueError(f"{name} is a {found}, not a torch.nn.modules.{kind}")
+    return {key: value for key, value in vars(module).items() if key not in ("training", "_is_full_backward_hook")}
 
 
 def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:
