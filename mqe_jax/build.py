@@ -23,8 +23,8 @@ from mqe_jax.policies import all_agents, load_as, load_policy
 from mqe_jax.settings import Parameters, check, fail, load_yaml, override
 from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
+from mqe_jax.train.folder import CONFIG_FILE, load_run_config
 from mqe_jax.train.learner import env_dims
-from mqe_jax.train.runner import CONFIG_FILE, load_run_config
 from mqe_jax.train.start import initial_key, policy_to_start
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"

@@ -25,10 +25,11 @@ from mqe_jax.train import runner, start
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
+from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.monitor import Monitor, read_evaluations
+from mqe_jax.train.monitor import Monitor, read_evaluations, score
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
-from mqe_jax.train.runner import load_run_config, train
+from mqe_jax.train.runner import open_training, train
 from mqe_jax.train.start import check_parameters, check_same, without_environments
 from mqe_jax.viz.curves import draw_curve
 from tests import training as probes
@@ -107,6 +108,22 @@ def test_what_a_run_leaves_behind(straight: tuple[Path, TrainState]) -> None:
         "step_000000000080.safetensors",
     ]
     assert not [p for p in run_dir.rglob("*") if p.name.endswith(".tmp")]
+
+
+def test_a_training_without_a_folder_learns_the_same_and_writes_nothing(
+    straight: tuple[Path, TrainState], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = settings(evaluation={"every": 2, "episodes": 4}, loggers=("wandb",))
+    with open_training(PROBE, [config], [None], eval_env=PROBE) as training:
+        assert_same(training.run(None, lambda: False)[0], straight[1])
+    (log,), (history,) = training.evaluations, training.rows
+    assert [e["env_steps"] for e in log.evaluations] == [32, 64, 80] and log.absolute is not None
+    assert log.absolute["env_steps"] == log.best_policy()[1] == max(log.evaluations, key=score)["env_steps"]
+    assert [f"{row['loss/value']:.8g}" for row in history] == [row["loss/value"] for row in rows(straight[0])]
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="resume: True is not allowed; it must be false without a run_dir"):
+        train(PROBE, settings(), None, resume=True)
 
 
 def test_a_checkpoint_without_environments_has_all_else(straight: tuple[Path, TrainState]) -> None:

@@ -167,7 +167,7 @@ def test_contact_forces_carry_the_robots() -> None:
 
 
 def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Path) -> None:
-    from mqe_jax.train.start import CONFIG_FILE
+    from mqe_jax.train.folder import CONFIG_FILE
     from mqe_jax.view.menu import Choice, Menu, find_runs
 
     for name, task in (("b", "go1gate"), ("a", "go1tug"), ("no task", None)):

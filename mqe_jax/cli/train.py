@@ -24,8 +24,9 @@ from mqe_jax.limits import Seeds
 from mqe_jax.opponents import TeamState
 from mqe_jax.settings import is_record, override, record
 from mqe_jax.train import runner
-from mqe_jax.train.checkpoint import check_alone, check_run, latest
+from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.folder import check_alone, check_run
 from mqe_jax.train.networks import NETWORKS
 from mqe_jax.train.types import Trace
 from mqe_jax.viz import curves
@@ -92,7 +93,7 @@ class Train(TaskOptions):
         if self.resume and not any(map(latest, folders)):
             for folder in folders:  # as the trainer does later, after this line would have been wrong
                 check_alone(folder)
-                check_run(folder, True, (runner.CONFIG_FILE, runner.CSV_FILE, runner.POLICY_FILE))
+                check_run(folder, resume=True)
             echo(f"mqe: {run_dir} has no checkpoint to resume from; starting a new run")
         with interrupts.before_exit(lambda: _HINT.format(run_dir)):
             try:

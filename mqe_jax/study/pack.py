@@ -18,9 +18,9 @@ from mqe_jax.files import check_file, check_folder, read_text, remove_temporarie
 from mqe_jax.settings import fail
 from mqe_jax.study.sweep import SWEEP_FILE
 from mqe_jax.train.checkpoint import copy_without, latest
+from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE
 from mqe_jax.train.monitor import EVALUATIONS_FILE
 from mqe_jax.train.policy import POLICY_FILE
-from mqe_jax.train.runner import CONFIG_FILE, CSV_FILE
 
 ROWS = 500
 """Rows of a packed metrics.csv, at most about: every n-th, and the last one."""

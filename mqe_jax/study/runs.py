@@ -17,10 +17,10 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import parsing, read_rows
 from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
 from mqe_jax.train.logs import number
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import POLICY_FILE
-from mqe_jax.train.runner import CONFIG_FILE, CSV_FILE, load_run_config
 
 REWARD = "average_step_reward"
 PLAIN = "plain"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ VERSION = 3
 
 _LARGEST = {"policy": limits.POLICY_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
-_OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of their run
 
 
 class Checkpoint(NamedTuple):
@@ -161,36 +160,6 @@ def checkpoint_step(path: Path) -> int:
 def latest(run_dir: str | Path) -> Path | None:
     """Returns a run's newest checkpoint, or None."""
     return next(reversed(list_checkpoints(run_dir)), None)
-
-
-def check_alone(run_dir: Path) -> None:
-    """Raises an InputError for a folder in that of another run, or around runs of several seeds."""
-    seeds = [folder for folder in sorted(run_dir.glob("seed*")) if latest(folder)]
-    others = [run_dir.parent] * (latest(run_dir.parent) is not None) + seeds
-    if others:
-        raise InputError(
-            f"run_dir: {run_dir} cannot hold a run, because {others[0]} holds another run; "
-            "resume that one with its own --num-seeds, or name another folder"
-        )
-
-
-def check_run(run_dir: Path, resume: bool, files: Sequence[str]) -> None:
-    """Checks that a folder holds no run, or with `resume` one that can be resumed; `files` are a run's, by name.
-
-    Raises:
-        InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files,
-            empty folders, and the output of commands.
-    """
-    checkpoint = latest(run_dir)
-    found = [name for name in files if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
-    if found and not resume:
-        raise InputError(
-            f"run_dir: {run_dir} already holds a run ({', '.join(found)}); resume it (--resume) or name another folder"
-        )
-    inside = [path for path in sorted(run_dir.glob("[!.]*")) if path.suffix not in _OUTPUT]
-    held = [path.name for path in inside if not path.is_dir() or any(path.glob("[!.]*"))]
-    if held and checkpoint is None:
-        raise InputError(f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint; name another folder")
 
 
 def nonfinite(tree: Any) -> list[str]:

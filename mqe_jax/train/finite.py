@@ -32,12 +32,12 @@ def nonfinite_metrics(row: Mapping[str, float]) -> list[str]:
     return [name for name in _METRICS if not math.isfinite(row[name])]
 
 
-def check_finite(learned: PyTree, row: Mapping[str, float], run_dir: Path) -> None:
+def check_finite(learned: PyTree, row: Mapping[str, float], run_dir: Path | None) -> None:
     """Raises a NonFiniteError naming the first metrics and learned arrays that an update made NaN or infinite."""
     wrong = nonfinite_metrics(row) + nonfinite(learned)
     if wrong:
-        kept = latest(run_dir)
+        kept = None if run_dir is None else latest(run_dir)
         raise NonFiniteError(
-            f"{run_dir}: update {row['updates']:.0f} ({row['env_steps']:.0f} environment steps) made "
+            f"{run_dir or 'training'}: update {row['updates']:.0f} ({row['env_steps']:.0f} environment steps) made "
             f"{', '.join(wrong[:3])} NaN or infinite; the last finite checkpoint is {kept.name if kept else 'missing'}"
         )

@@ -110,22 +110,26 @@ def score(evaluation: dict[str, Any]) -> tuple[float, float]:
 
 
 class EvaluationLog:
-    """One run's evaluations on disk; those past `env_steps` are dropped when a run is resumed."""
+    """One run's evaluations and its best policy, in its folder if it has one.
 
-    def __init__(self, run_dir: Path, env_steps: int) -> None:
-        self._run_dir = run_dir
-        self._path = run_dir / EVALUATIONS_FILE
-        before = read_evaluations(run_dir)
+    Those past `env_steps` are dropped when a run is resumed.
+    """
+
+    def __init__(self, run_dir: Path | None, env_steps: int) -> None:
+        self._run_dir, self._best = run_dir, None
+        before: dict[str, Any] = {"evaluations": [], "absolute": None} if run_dir is None else read_evaluations(run_dir)
         self.evaluations = [e for e in before["evaluations"] if e["env_steps"] <= env_steps]
         self.absolute = before["absolute"] if before["absolute"] and before.get("ended_at") == env_steps else None
 
     def add(self, evaluation: dict[str, Any], policy: TrainedPolicy) -> None:
-        """Appends an evaluation, and saves its policy if it scores higher than those on disk."""
+        """Appends an evaluation, and saves its policy if it scores higher than those before."""
         best = self.best()
         if best is None or score(evaluation) > score(best):
-            path = _best_path(self._run_dir, evaluation)
-            make_folder(path.parent)
-            save_policy(path.parent, policy, path.name)
+            self._best = evaluation, policy
+            if self._run_dir is not None:
+                path = _best_path(self._run_dir, evaluation)
+                make_folder(path.parent)
+                save_policy(path.parent, policy, path.name)
         self.evaluations.append(evaluation)
         self.absolute = None
         self._write({})
@@ -135,7 +139,9 @@ class EvaluationLog:
         return self.evaluations[-1]["env_steps"] if self.evaluations else None
 
     def best(self) -> dict[str, Any] | None:
-        """Returns the best evaluation whose policy is on disk."""
+        """Returns the best evaluation whose policy is on disk, or without a folder in memory."""
+        if self._run_dir is None:
+            return self._best and self._best[0]
         there = [e for e in self.evaluations if _best_path(self._run_dir, e).is_file()]
         return max(there, key=score, default=None)
 
@@ -143,24 +149,33 @@ class EvaluationLog:
         """Returns the policy of the best evaluation and its environment steps."""
         best = self.best()
         assert best is not None
+        if self._run_dir is None:
+            assert self._best is not None
+            return self._best[1], best["env_steps"]
         return read_policy(_best_path(self._run_dir, best)), best["env_steps"]
 
     def end(self, absolute: dict[str, Any], env_steps: int) -> None:
-        """Writes the absolute metric of a run that ended after `env_steps`."""
+        """Stores the absolute metric of a run that ended after `env_steps`."""
         self.absolute = absolute
         self._write({"ended_at": env_steps})
 
     def prune(self) -> None:
         """Removes all policies but the best; called once the checkpoint that includes it is on disk."""
-        check_locks(self._path)
+        assert self._run_dir is not None
+        check_locks(self._run_dir / EVALUATIONS_FILE)
         best = self.best()
         for path in (self._run_dir / "best").glob("*.safetensors"):
             if best is None or path != _best_path(self._run_dir, best):
                 path.unlink(missing_ok=True)
 
     def _write(self, more: dict[str, Any]) -> None:
-        text = json.dumps({"evaluations": self.evaluations, "absolute": self.absolute, **more}, indent=1) + "\n"
-        write_atomically(self._path, text.encode())
+        if self._run_dir is not None:
+            write_evaluations(self._run_dir, {"evaluations": self.evaluations, "absolute": self.absolute, **more})
+
+
+def write_evaluations(run_dir: Path, evaluations: dict[str, Any]) -> None:
+    """Writes a run's evaluations, as `read_evaluations` returns them."""
+    write_atomically(run_dir / EVALUATIONS_FILE, (json.dumps(evaluations, indent=1) + "\n").encode())
 
 
 def read_evaluations(run_dir: Path) -> dict[str, Any]:

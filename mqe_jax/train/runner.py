@@ -1,4 +1,4 @@
-"""The training loop: updates, logs, and a run folder with settings, metrics, checkpoints and the policy."""
+"""The training loop: updates, evaluations, logs, and what it writes into a run folder."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
-import yaml
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
 from mqe_jax.settings import PathText, check, fail, to_mapping
-from mqe_jax.train.checkpoint import check_alone, check_run, checkpoint_step, list_checkpoints, save_checkpoint
-from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.checkpoint import checkpoint_step, save_checkpoint
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes, connected
 from mqe_jax.train.finite import all_finite, check_finite, nonfinite_metrics
+from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims
-from mqe_jax.train.logs import CSV_FILE, LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
-from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EVALUATIONS_FILE, EvaluationLog, Monitor
-from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, policy_of, save_policy
+from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
+from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
+from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
-from mqe_jax.train.start import CONFIG_FILE, check_parameters, first_state, learned, own_learner, without_environments
+from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
 from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -35,7 +34,7 @@ OnUpdate = Callable[[TrainState, dict[str, float]], None]
 def train(
     env: VectorEnv,
     config: TrainConfig,
-    run_dir: str | Path,
+    run_dir: str | Path | None,
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
@@ -46,7 +45,7 @@ def train(
     Args:
         env: the environments; of a task, with the parameters in the settings, where these name any or the task.
         config: settings.
-        run_dir: folder for config.yaml, metrics.csv, logs of other loggers, checkpoints/ and policy.safetensors.
+        run_dir: folder of the run (see `mqe_jax.train.folder`); None writes nothing.
         resume: resume a run in the folder from its newest checkpoint; an empty folder starts a new run.
         on_update: called after every update with the state and its row of metrics.csv.
         eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
@@ -65,7 +64,7 @@ def train(
 def train_seeds(
     env: VectorEnv,
     configs: Sequence[TrainConfig],
-    run_dirs: Sequence[str | Path],
+    run_dirs: Sequence[str | Path | None],
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
@@ -78,10 +77,24 @@ def train_seeds(
     The recorder receives the environments of all seeds as one batch. Where `stop()` is true before an update, the runs
     are saved and end there, to be resumed.
     """
+    with open_training(env, configs, run_dirs, resume, eval_env, recorder) as training:
+        return training.run(on_update, stop)
+
+
+@contextlib.contextmanager
+def open_training(
+    env: VectorEnv,
+    configs: Sequence[TrainConfig],
+    run_dirs: Sequence[str | Path | None],
+    resume: bool = False,
+    eval_env: VectorEnv | None = None,
+    recorder: Recorder | None = None,
+) -> Iterator[Training]:
+    """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
     for config, run_dir in zip(configs, run_dirs, strict=True):
         check("config", config, TrainConfig)
-        check("run_dir", run_dir, PathText)
+        check("run_dir", run_dir, PathText | None)
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
@@ -89,52 +102,28 @@ def train_seeds(
     check_parameters(env, configs[0], configs[0].training_env)
     if eval_env is not None:
         check_parameters(eval_env, configs[0], configs[0].env)
-    check_loggers(configs[0].loggers)
-    folders = [Path(run_dir) for run_dir in run_dirs]
+    folders = [Path(run_dir) for run_dir in run_dirs if run_dir is not None]
+    if folders:
+        check_loggers(configs[0].loggers)
+    elif resume:
+        fail("resume", True, "false without a run_dir")
     learner, processes = own_learner(env, configs[0], recorder)
-    run_files = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
-    with connected(), contextlib.ExitStack() as locks:
-        if processes.leads:
-            for folder in folders:
-                check_alone(folder)
-            if resume:
-                _common_checkpoints(folders)
-            for folder in folders:
-                check_folder(folder)
-                locks.enter_context(locked(folder))
-                for inner in (folder, *folder.glob("*/")):
-                    remove_temporaries(inner)
-            for folder in folders:
-                check_run(folder, resume, run_files)
+    with connected(), open_folders(folders, resume) if processes.leads else contextlib.nullcontext():
         processes.gather([0])  # the others wait for these checks
-        checkpoints = _common_checkpoints(folders)
+        checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
-        training = _Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
-        return training.run(on_update, stop)
+        yield Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
 
 
-def _common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
-    """Returns each folder's checkpoint at the newest step common to all; None (start from scratch) if any has none.
+class Training:
+    """A training of S seeds, with their states stacked, in checked and locked folders or in none."""
 
-    Raises:
-        InputError: if the folders have no step in common.
-    """
-    by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
-    common = set.intersection(*map(set, by_step))
-    if common:
-        return [steps[max(common)] for steps in by_step]
-    if all(not steps or 0 in steps for steps in by_step):
-        return [None] * len(folders)
-    newest = ", ".join(
-        f"{folder.name} {max(steps, default='none')}" for folder, steps in zip(folders, by_step, strict=True)
-    )
-    raise InputError(
-        f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds ({newest}); resume them separately"
-    )
-
-
-class _Training:
-    """A training run of S seeds, with their states stacked, in checked and locked folders."""
+    env_steps: int
+    """Environment steps done by each seed."""
+    rows: list[list[dict[str, float]]]
+    """The rows of metrics.csv that `run` has added, of each seed."""
+    evaluations: list[EvaluationLog]
+    """Evaluations of each seed; empty without evaluation."""
 
     def __init__(
         self,
@@ -157,13 +146,13 @@ class _Training:
         self._stacked = processes.stacked(seeds.shared)
         self._state = self._stacked.together(seeds.stack([state for state, _ in first]))
         self._update = self._stacked.compile(seeds.map(learner.update), more=True)
-        self._env_steps = int(first[0][0].updates) * self._config.steps_per_update
-        self._saved = -1 if checkpoints[0] is None else self._env_steps
+        self.env_steps = int(first[0][0].updates) * self._config.steps_per_update
+        self._saved = -1 if checkpoints[0] is None else self.env_steps
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
         if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
             self._monitor = Monitor(eval_env, self._config)
-        self._evaluations: list[EvaluationLog] = []
+        self.rows, self.evaluations = [[] for _ in configs], []
         self._logs = contextlib.ExitStack()
         self._writing = threading.RLock()  # held while files are written and the state is exchanged
         self._signal, self._ended = threading.Event(), threading.Event()  # in one of several processes
@@ -171,27 +160,29 @@ class _Training:
     def run(self, on_update: OnUpdate | None, stop: Callable[[], bool]) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
         config = self._config
-        if self._saved == self._env_steps:
+        if self._saved == self.env_steps and self._folders:
             self._save_policies()  # a run that ended between checkpoint and policy has an older one
         self._save()  # so that a run killed before its first regular checkpoint can be resumed too
-        for own, folder in zip(self._configs, self._folders, strict=True) if self._processes.leads else ():
-            write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(own), sort_keys=False).encode())
-        self._evaluations = [EvaluationLog(folder, self._env_steps) for folder in self._folders if self._monitor]
+        if self._monitor is not None:
+            places = self._folders or [None] * len(self._configs)
+            self.evaluations = [EvaluationLog(place, self.env_steps) for place in places]
         total_steps = config.num_updates * config.steps_per_update
         with self._logs as logs:
-            makers = (CsvLog, *(LOGGERS[name] for name in config.loggers))
-            files: list[list[MetricsLog]] = [[] for _ in self._folders]
-            for folder, own_logs in zip(self._folders, files, strict=True):
-                for make_log in makers if self._processes.leads else ():
-                    own_logs.append(make_log(folder, self._env_steps))
+            files: list[list[MetricsLog]] = [[] for _ in self._configs]
+            for folder, own, own_logs in zip(self._folders, self._configs, files, strict=False):
+                if not self._processes.leads:
+                    break
+                write_config(folder, own)
+                for make_log in (CsvLog, *(LOGGERS[name] for name in config.loggers)):
+                    own_logs.append(make_log(folder, self.env_steps))
                     logs.callback(own_logs[-1].close)
-            progress_log = ProgressLog(config.task or self._env.name, self._env_steps, total_steps)
+            progress_log = ProgressLog(config.task or self._env.name, self.env_steps, total_steps)
             if self._processes.leads:
                 logs.enter_context(progress_log)
             logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
-                while self._env_steps < total_steps and not self._stopped(stop):
+                while self.env_steps < total_steps and not self._stopped(stop):
                     rows = self._step(files)
                     if self._processes.leads:
                         progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
@@ -201,7 +192,7 @@ class _Training:
                     if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
                         self._save()
                 self._save()
-                if self._env_steps >= total_steps:
+                if self.env_steps >= total_steps:
                     self._measure_best()
                 self._processes.gather([0])  # the others wait for the one that evaluates
             except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
@@ -226,7 +217,7 @@ class _Training:
         The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
         Several processes finish it, where the one before is not saved, to save the same one.
         """
-        if self._processes.count > 1 and self._saved != self._env_steps:
+        if self._processes.count > 1 and self._saved != self.env_steps:
             self._signal.set()
             self._ended.wait()
         self._writing.acquire()  # for ever, so that the main thread writes nothing more
@@ -252,33 +243,36 @@ class _Training:
         if self._recorder is not None:
             self._recorder.add(join_traces(metrics.pop("trace")))
         metrics, finite = jax.device_get((metrics, all_finite(learned(after))))
-        updates, rows = self._env_steps // self._config.steps_per_update + 1, []
-        for i, folder in enumerate(self._folders):
+        updates, rows = self.env_steps // self._config.steps_per_update + 1, []
+        for i in range(len(self._configs)):
             own = {name: value[i] for name, value in metrics.items()}
             row = row_of(updates, own, self._config, self._start_time, began)
-            row["fps"] *= len(self._folders)
+            row["fps"] *= len(self._configs)
             if not finite or nonfinite_metrics(row):
+                folder = self._folders[i] if self._folders else None
                 check_finite(learned(self._seeds.take(self._stacked.own(after), i)), row, folder)
             rows.append(row)
         with self._writing:
-            for logs, row in zip(files, rows, strict=True):
+            for logs, done, row in zip(files, self.rows, rows, strict=True):
                 for log in logs:
                     log.write(row)
+                done.append(row)
             # Assigned after logging, so that an interrupted run saves no update that is not logged.
-            self._state, self._env_steps = after, int(rows[0]["env_steps"])
+            self._state, self.env_steps = after, int(rows[0]["env_steps"])
         return rows
 
-    def _policies(self) -> list[TrainedPolicy]:
+    def policies(self) -> list[TrainedPolicy]:
+        """Returns the newest policy of every seed."""
         dims = env_dims(self._env, self._config)
         return [
-            policy_of(state, dims, config, task=self._env.name, env_steps=self._env_steps)
+            policy_of(state, dims, config, task=self._env.name, env_steps=self.env_steps)
             for state, config in zip(self._own(), self._configs, strict=True)
         ]
 
     def _save(self) -> None:
         """Writes checkpoint and policy of every seed, once per update."""
         with self._writing:
-            if self._saved == self._env_steps:
+            if self._saved == self.env_steps or not self._folders:
                 return
             seconds = time.perf_counter() - self._start_time
             # A process killed between two seeds' checkpoints has the older one in common.
@@ -291,21 +285,21 @@ class _Training:
                 else:
                     tree = without_environments(state)
                 if self._processes.leads:
-                    save_checkpoint(folder, tree, self._env_steps, metadata, kept)
+                    save_checkpoint(folder, tree, self.env_steps, metadata, kept)
             self._save_policies()
-            self._saved = self._env_steps
-            for log in self._evaluations:
+            self._saved = self.env_steps
+            for log in self.evaluations:
                 log.prune()
 
     def _save_policies(self) -> None:
         if not self._processes.leads:
             return
-        for folder, policy in zip(self._folders, self._policies(), strict=True):
+        for folder, policy in zip(self._folders, self.policies(), strict=True):
             save_policy(folder, policy)
 
     def _evaluate_if_due(self) -> bool:
         """Evaluates after every `evaluation.every` updates and after the last one; returns whether it was due."""
-        updates, last = self._env_steps // self._config.steps_per_update, self._config.num_updates
+        updates, last = self.env_steps // self._config.steps_per_update, self._config.num_updates
         every = self._config.evaluation.every
         due = every is not None and updates > 0 and updates % every == 0
         if due or updates >= last:
@@ -314,28 +308,23 @@ class _Training:
 
     def _evaluate(self) -> None:
         """Evaluates every seed's policy, once per update."""
-        if self._monitor is None or self._evaluations[0].last_steps() == self._env_steps:
+        if self._monitor is None or self.evaluations[0].last_steps() == self.env_steps:
             return
-        policies = self._policies()
-        steps = [self._env_steps] * len(policies)
+        policies = self.policies()
+        steps = [self.env_steps] * len(policies)
         results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
         with self._writing:
-            for log, result, policy in zip(self._evaluations, results, policies, strict=True):
+            for log, result, policy in zip(self.evaluations, results, policies, strict=True):
                 log.add(result, policy)
 
     def _measure_best(self) -> None:
         """Measures the absolute metric of every seed's best policy, once."""
-        if self._monitor is None or all(log.absolute is not None for log in self._evaluations):
+        if self._monitor is None or all(log.absolute is not None for log in self.evaluations):
             return
         self._evaluate()
-        policies, steps = zip(*(log.best_policy() for log in self._evaluations), strict=True)
+        policies, steps = zip(*(log.best_policy() for log in self.evaluations), strict=True)
         episodes = ABSOLUTE_FACTOR * self._config.evaluation.episodes
         results = self._monitor.evaluate(policies, steps, episodes, absolute=True)
         with self._writing:
-            for log, result in zip(self._evaluations, results, strict=True):
-                log.end(result, self._env_steps)
-
-
-def load_run_config(run_dir: str | Path) -> TrainConfig:
-    """Reads the settings of a run folder; raises an InputError that names the file."""
-    return load_config(Path(run_dir) / CONFIG_FILE)
+            for log, result in zip(self.evaluations, results, strict=True):
+                log.end(result, self.env_steps)

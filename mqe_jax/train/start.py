@@ -15,12 +15,12 @@ from mqe_jax.settings import fail, is_record, override, to_mapping
 from mqe_jax.train.checkpoint import checkpoint_step, load_tree, nonfinite, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
+from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
 from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv
 
-CONFIG_FILE = "config.yaml"
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 _MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
 """Settings of a network that the policy to start from may have otherwise."""

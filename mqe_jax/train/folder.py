@@ -1,0 +1,111 @@
+"""A run folder: its files, and what is checked and locked before a training writes to it.
+
+config.yaml            settings
+metrics.csv            one row an update (`logs.CsvLog`); tensorboard/ and wandb/ by the other loggers
+policy.safetensors     the newest policy (`policy.save_policy`)
+checkpoints/           complete learner states (`checkpoint.save_checkpoint`)
+evaluations.json       evaluations during training, best/ the policy of the best one (`monitor.EvaluationLog`)
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import yaml
+
+from mqe_jax.errors import InputError
+from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
+from mqe_jax.settings import to_mapping
+from mqe_jax.train.checkpoint import checkpoint_step, latest, list_checkpoints
+from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.logs import CSV_FILE
+from mqe_jax.train.monitor import EVALUATIONS_FILE
+from mqe_jax.train.policy import POLICY_FILE
+
+CONFIG_FILE = "config.yaml"
+RUN_FILES = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
+"""Names of a run's files beside its checkpoints."""
+
+_OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of their run
+
+
+@contextlib.contextmanager
+def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
+    """Creates and locks run folders; raises an InputError for one that holds a run, or what `resume` cannot resume."""
+    with contextlib.ExitStack() as locks:
+        for folder in folders:
+            check_alone(folder)
+        if resume:
+            common_checkpoints(folders)
+        for folder in folders:
+            check_folder(folder)
+            locks.enter_context(locked(folder))
+            for inner in (folder, *folder.glob("*/")):
+                remove_temporaries(inner)
+        for folder in folders:
+            check_run(folder, resume)
+        yield
+
+
+def write_config(folder: Path, config: TrainConfig) -> None:
+    """Writes the settings of a run."""
+    write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(config), sort_keys=False).encode())
+
+
+def load_run_config(run_dir: str | Path) -> TrainConfig:
+    """Reads the settings of a run folder; raises an InputError that names the file."""
+    return load_config(Path(run_dir) / CONFIG_FILE)
+
+
+def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
+    """Returns each folder's checkpoint at the newest step common to all; None (start from scratch) if any has none.
+
+    Raises:
+        InputError: if the folders have no step in common.
+    """
+    if not folders:
+        return []
+    by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
+    common = set.intersection(*map(set, by_step))
+    if common:
+        return [steps[max(common)] for steps in by_step]
+    if all(not steps or 0 in steps for steps in by_step):
+        return [None] * len(folders)
+    newest = ", ".join(
+        f"{folder.name} {max(steps, default='none')}" for folder, steps in zip(folders, by_step, strict=True)
+    )
+    raise InputError(
+        f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds ({newest}); resume them separately"
+    )
+
+
+def check_alone(run_dir: Path) -> None:
+    """Raises an InputError for a folder in that of another run, or around runs of several seeds."""
+    seeds = [folder for folder in sorted(run_dir.glob("seed*")) if latest(folder)]
+    others = [run_dir.parent] * (latest(run_dir.parent) is not None) + seeds
+    if others:
+        raise InputError(
+            f"run_dir: {run_dir} cannot hold a run, because {others[0]} holds another run; "
+            "resume that one with its own --num-seeds, or name another folder"
+        )
+
+
+def check_run(run_dir: Path, resume: bool = False) -> None:
+    """Checks that a folder holds no run, or with `resume` one that can be resumed.
+
+    Raises:
+        InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files,
+            empty folders, and the output of commands.
+    """
+    checkpoint = latest(run_dir)
+    found = [name for name in RUN_FILES if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
+    if found and not resume:
+        raise InputError(
+            f"run_dir: {run_dir} already holds a run ({', '.join(found)}); resume it (--resume) or name another folder"
+        )
+    inside = [path for path in sorted(run_dir.glob("[!.]*")) if path.suffix not in _OUTPUT]
+    held = [path.name for path in inside if not path.is_dir() or any(path.glob("[!.]*"))]
+    if held and checkpoint is None:
+        raise InputError(f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint; name another folder")
