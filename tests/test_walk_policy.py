@@ -112,7 +112,7 @@ def write_torchscript(
     root: str = "torch.nn.modules.container.Sequential",
     further: dict[str, Any] | None = None,
 ) -> None:
-    """Writes an archive laid out as torch.jit.save does for a Sequential of Linear and ELU, with `further` attributes."""
+    """Writes an archive laid out as torch.jit.save lays out a Sequential of Linear and ELU."""
     files: dict[str, bytes] = {}
 
     def tensor(value: np.ndarray) -> _Called:
