@@ -267,6 +267,10 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
     assert late.truncated and not late.terminated and float(late.metrics["success"]) == 0
     fallen = standing(attack, state, [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)], roll=1.0)
     assert attack_step(fallen, still(attack)).terminated
+    assert [int(terms_of(attack, state, after)[0]["fall"]) for after in (state, fallen)] == [0, 1]
+    defender = placed(attack, [[4, -2, 0.31], [4, 2, 0.31], [10, 0, 0.31]], [[0, 0, 0], [0, 0, 0], [1.0, 0, 0]])
+    assert int(terms_of(attack, state, defender)[0]["fall"]) == 0
+    assert attack.params.rewards.fall == 0
 
 
 # -- the defender -----------------------------------------------------------------------------------------------------

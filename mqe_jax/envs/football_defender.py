@@ -34,6 +34,8 @@ class DefenderRewards:
     """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper: shaping."""
     first_goal: float = 0.0
     """In the step of an episode's first goal. Not in the paper: for training, where `goal` favours early goals."""
+    fall: float = 0.0
+    """In steps in which an attacker has fallen. Not in the paper: for training, where `first_goal` pays only once."""
 
 
 @record
@@ -123,6 +125,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
             "progress": goal_before - goal,
             "approach": near_before - near,
             "first_goal": after.state.task.scored & ~before.state.task.scored,
+            "fall": jnp.any(self.fallen(after.robots)[:2]),
         }
 
     def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
