@@ -109,6 +109,7 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
 
     name = "go1catch"
     title = "Catch a Mouse"
+    aim = "Catch the mouse."
     Params = CatchParams
 
     def scene(self) -> Scene:

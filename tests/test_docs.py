@@ -1,4 +1,4 @@
-"""The documentation's pages: their code, notebooks and examples run, their commands exist."""
+"""The documentation's pages: their code, notebooks and examples run, their commands are parsed by the program."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.build import for_task
-from mqe_jax.cli.arguments import parse
+from mqe_jax.cli.arguments import COMMANDS, FIRST_STEPS, parse
 from mqe_jax.cli.train import parse_train
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.planners import scripted_policy
@@ -28,7 +28,7 @@ from mqe_jax.train.networks import NETWORKS
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *(ROOT / "docs").rglob("*.md")])
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # Blocks that are not run, by page and first line, with the reason.
@@ -40,15 +40,18 @@ NOT_RUN = {
 SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
 
 
-def blocks(page: str, language: str) -> list[str]:
-    """The fenced blocks of a language on a page."""
-    text = (ROOT / page).read_text(encoding="utf-8")
+def read(page: str) -> str:
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def blocks(text: str, language: str) -> list[str]:
+    """The fenced blocks of a language in a text."""
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
 def run_blocks(page: str) -> list[str]:
     """The Python blocks of a page but the exceptions."""
-    return [block for block in blocks(page, "python") if (page, block.splitlines()[0]) not in NOT_RUN]
+    return [block for block in blocks(read(page), "python") if (page, block.splitlines()[0]) not in NOT_RUN]
 
 
 @pytest.mark.parametrize("page", [name for name in NAMES if run_blocks(name)])
@@ -73,17 +76,33 @@ def test_training_from_python_has_the_settings_of_the_command() -> None:
     assert namespace["config"] == for_task(parse_train(command).settings, "go1gate")
 
 
-def commands(page: str) -> list[list[str]]:
-    """The words of every line of the shell blocks of a page, without comments."""
-    lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
-    found = [shlex.split(line, comments=True) for line in lines]
+def commands(text: str) -> list[list[str]]:
+    """The words of every line of the shell blocks of a text, and of every `mqe ...` in it, without comments."""
+    lines = "\n".join(blocks(text, "bash")).replace("\\\n", " ").splitlines()
+    lines += re.findall(r"`(mqe [^`]+)`", text)
+    found = [shlex.split(line, comments=True) for line in dict.fromkeys(lines)]
     return [words for words in found if words]
 
 
-@pytest.mark.parametrize("page", [name for name in NAMES if commands(name)])
-def test_shell_blocks_are_commands_that_exist(page: str) -> None:
-    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    for words in commands(page):
+def accepted(words: list[str]) -> bool:
+    """Whether the program's own parser accepts a command; `mqe eval` alone names one."""
+    if " ".join(words[1:]) in (*COMMANDS, "--version"):
+        return True
+    standing = {
+        "COMMAND": "train",
+        "HOST:PORT": "host:1",
+        "...": "go1gate",
+        **dict.fromkeys(("N", "I", "GPU", "SEED"), "1"),
+    }
+    try:
+        return bool(parse([standing.get(word, word) for word in words[1:]]))
+    except SystemExit as stop:
+        return stop.code == 0
+
+
+def check_commands(text: str) -> None:
+    targets = re.findall(r"^([a-z]+):", read("Makefile"), re.MULTILINE)
+    for words in commands(text):
         while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
             words = words[1:]
         if words[0] in ("|", ">"):
@@ -91,13 +110,34 @@ def test_shell_blocks_are_commands_that_exist(page: str) -> None:
         program = words[0].rsplit("/", 1)[-1]
         if program == "mqe":
             end = next((i for i, word in enumerate(words) if word in ("|", "&&", ">", "&")), len(words))
-            assert parse(words[1:end]), words
+            assert accepted(words[:end]), words
         elif program == "make":
             assert words[1] in targets, words
         elif program == "python" and words[1].endswith(".py"):
             assert (ROOT / words[1]).is_file(), words
         else:
             assert program in SHELL, words
+
+
+@pytest.mark.parametrize("page", NAMES)
+def test_commands_on_pages_exist(page: str) -> None:
+    check_commands(read(page))
+
+
+def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
+    """Of a task's page after the aim; the first steps that `mqe` prints are commands too."""
+    pytest.importorskip("mkdocs")
+    docs_pages = importlib.import_module("docs_pages")
+    pages = docs_pages.pages()
+    for name, task in TASKS.items():
+        page = pages[f"tasks/{name}.md"]
+        assert page.startswith(f"# {task.title} (`{name}`)\n\n{task.aim}\n") and task.aim.endswith(".")
+        assert {"render", "train", "view"} == {words[1] for words in commands(page)}
+    for text in [*pages.values(), *(path.read_text(encoding="utf-8") for path in (ROOT / "mqe_jax").rglob("*.py"))]:
+        check_commands(text)
+    check_commands(
+        "```bash\n" + re.sub(r"   .*", "", "\n".join(re.findall(r"^  (mqe .*)", FIRST_STEPS, re.M))) + "\n```"
+    )
 
 
 # -- examples and notebooks --------------------------------------------------------------------------------------------

@@ -143,16 +143,22 @@ def overview(tasks: Mapping[str, Any]) -> str:
 
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
+    from mqe_jax.envs import PLANNERS
+
     env, name = task(num_envs=1, impl="c"), task.name
     bodies = (inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__)
     body = next(filter(None, bodies))  # that of a base class where the task's is one line
-    policy = "shipped" if name in zoo.names() else "scripted"
-    command = f"mqe render {name}" + (" --opponent scripted" if len(env.teams) > 1 else "")
-    against = " against the scripted one" if len(env.teams) > 1 else ""
-    clip = f"A typical success of the {policy} policy{against} (`{command}`):\n\n![{_seen(task)}]({_clip(name)})"
-    watch = f"`mqe view {name}` shows the {policy} policy live ([how good](../results/strength.md) it is)."
-    training = f"`mqe train {name}` trains one: [settings, and what to expect](../results/settings.md)."
-    media = [clip, f"{watch} {training}"] if _clip(name) else []
+    policy = "shipped" if name in zoo.names() else "scripted" if name in PLANNERS else "forward"
+    flags, against = (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
+    caption = f"A typical success of the {policy} policy{against}: [how good it is](../results/strength.md)."
+    media = [f"![{_seen(task)}]({_clip(name)})", caption] if _clip(name) else []
+    commands = {
+        f"mqe render {name}{flags} -o clip.webp": f"a clip of the {policy} policy",
+        f"mqe view {name}{flags}": "live, in the browser",
+        f"mqe train {name}": "train a policy",
+    }
+    width = max(map(len, commands))
+    lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
         "- action per agent: command 3 (velocities for the walk policy), position 12, torque 12",
@@ -162,7 +168,10 @@ def task_page(task: Any) -> str:
     rows = [f"| `{b.name}` | {b.width} | {b.meaning or ''} |" for b in env.observation_layout.blocks]
     sections = [
         f"# {task.title} (`{name}`)",
+        task.aim,
         *media,
+        f"```bash\n{lines}\n```",
+        "[Settings of the training, and what to expect](../results/settings.md).",
         body,
         "\n".join(facts),
         "## Observation of an agent\n\n| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),

@@ -212,7 +212,7 @@ class Demo:
     run_dir: Path = Path("runs/demo")
     """Run folder; an interrupted demo resumes from it."""
     config: str = "demo"
-    """Settings, as in `mqe train --config`."""
+    """Settings, as `--config` of `mqe train`."""
     episodes: Episodes = 256
     """Number of episodes per evaluation."""
     impl: Impl = "auto"

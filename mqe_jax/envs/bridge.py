@@ -79,6 +79,7 @@ class Go1Bridge(Duel[None, BridgeParams]):
 
     name = "go1bridge"
     title = "Traverse Bridge"
+    aim = "Push the opponent off the bridge, or stand on the other side when time is up."
     Params = BridgeParams
 
     @property

@@ -73,6 +73,7 @@ class Go1RevolvingDoor(Duel[None, DoorParams]):
 
     name = "go1revolvingdoor"
     title = "Revolving Door"
+    aim = "Be the first through the revolving door."
     symmetry = "reflect"
     Params = DoorParams
 

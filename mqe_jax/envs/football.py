@@ -281,6 +281,7 @@ class Go1Football1vs1(FootballMatch[Football1vs1Params]):
 
     name = "go1football-1vs1"
     title = "Football (1 vs 1)"
+    aim = "Score in the opponent's goal."
     Params = Football1vs1Params
     kick_off = ((4.0, 0.0, 0.0), (10.0, 0.0, np.pi))
     colors = (0, 2)
@@ -291,6 +292,7 @@ class Go1Football2vs2(FootballMatch[Football2vs2Params]):
 
     name = "go1football-2vs2"
     title = "Football (2 vs 2)"
+    aim = "Score in the opponents' goal."
     Params = Football2vs2Params
     # The second team's poses are the first's after a half turn about the centre.
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 2.0, np.pi), (10.0, -2.0, np.pi))

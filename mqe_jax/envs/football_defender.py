@@ -72,6 +72,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
 
     name = "go1football-defender"
     title = "Football (2 vs 1)"
+    aim = "Score in the goal behind the defender."
     Params = DefenderParams
     kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi))
     ball_spot = (5.0, -2.1)

@@ -77,6 +77,7 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
 
     name = "go1gate"
     title = "Narrow Gate"
+    aim = "Get both robots through the gap, which is wide enough for one. Touch nothing."
     Params = GateParams
 
     def scene(self) -> Scene:

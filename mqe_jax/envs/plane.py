@@ -45,6 +45,7 @@ class Go1Plane(QuadrupedEnv[None, PlaneParams]):
 
     name = "go1plane"
     title = "Plane"
+    aim = "Walk forward."
     Params = PlaneParams
     variable_num_agents = True
 

@@ -105,6 +105,7 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
 
     name = "go1pushbox"
     title = "Push Box"
+    aim = "Push the box through the gate."
     Params = PushBoxParams
 
     def scene(self) -> Scene:

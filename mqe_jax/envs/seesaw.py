@@ -84,6 +84,7 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
 
     name = "go1seesaw"
     title = "Climb on Seesaw"
+    aim = "Get a robot onto the platform: one holds the plank down, the other climbs."
     Params = SeesawParams
 
     def scene(self) -> Scene:

@@ -116,6 +116,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
 
     name = "go1sheep-easy"
     title = "Sheep Dog (Easy)"
+    aim = "Drive the sheep through the gate."
     Params = SheepEasyParams
 
     @property
@@ -211,4 +212,5 @@ class Go1SheepHard(Go1SheepEasy):
 
     name = "go1sheep-hard"
     title = "Sheep Dog (Hard)"
+    aim = "Drive the nine sheep through the gate."
     Params = SheepHardParams

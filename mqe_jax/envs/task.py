@@ -33,6 +33,8 @@ class Task(Generic[S, P]):
     """Version of scene, observation and reward: policies of another one are outdated (`mqe_jax.zoo`)."""
     title: ClassVar[str] = ""
     """Display title: the paper's name if the task is in the paper."""
+    aim: ClassVar[str] = ""
+    """What a team has to do, in one line, as told to somebody who drives a robot."""
     Params: ClassVar[type[Any]] = TaskParams
     """Class of the task's parameters, P."""
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}

@@ -86,6 +86,7 @@ class Go1Tug(Duel[TugState, TugParams]):
 
     name = "go1tug"
     title = "Push Cylinder"
+    aim = "Have the cylinder on the opponent's half when time is up."
     Params = TugParams
 
     @property

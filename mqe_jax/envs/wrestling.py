@@ -80,6 +80,7 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
 
     name = "go1wrestling"
     title = "Sumo Wrestling"
+    aim = "Push the opponent out of the ring, or over."
     Params = WrestlingParams
 
     @property

@@ -43,7 +43,7 @@ class Sweep:
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
-    """Names of the algorithms, as in `mqe train --algorithm`; `default` has the settings of `mqe train` without."""
+    """Names of the algorithms, as `--algorithm` of `mqe train`; `default` has the settings of `mqe train` without."""
     seeds: Annotated[tuple[Seed, ...], MinLen(1), MaxLen(1000)] = (0, 1, 2, 3, 4)
     """Random seeds."""
     seeds_together: Seeds | None = None
