@@ -37,7 +37,7 @@ class Object:
     """Base of all objects."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the body `name` to a scene, with its purely visual geoms if `visual`."""
+        """Adds the body `name` to a scene, with its purely visual geoms if `visual`; no actuator, no mocap body."""
         raise NotImplementedError(f"object {type(self).__name__}: add() is not defined")
 
 

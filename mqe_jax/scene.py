@@ -13,7 +13,7 @@ import numpy as np
 from mqe_jax import robots
 from mqe_jax.appearance.grounds import add_light
 from mqe_jax.collision import MAX_ROBOTS
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, one_line
 from mqe_jax.objects import Object
 from mqe_jax.robots.build import build_robot
 from mqe_jax.robots.index import RobotIndex, add_sensors, index_robots, prefix
@@ -119,9 +119,12 @@ class CompiledScene:
 
 
 def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
-    """Compiles a scene, with or without visual geoms."""
+    """Compiles a scene, with or without visual geoms; InputError where MuJoCo rejects it."""
     spec, layout = build_spec(scene, visual=visual)
-    return spec.compile(), layout
+    try:
+        return spec.compile(), layout
+    except ValueError as error:
+        raise InputError(f"scene: MuJoCo rejects it ({one_line(error)})") from None
 
 
 def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
@@ -150,11 +153,27 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
         )
         spec.attach(body, prefix=prefix(number), frame=spec.worldbody.add_frame())
     for name, item in scene.objects.items():
-        item.add(spec, f"object/{name}", visual)
+        _add_object(spec, name, item, visual)
     add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
     if visual:
         add_light(spec, (scene.track.length / 2, 0, 8))
     return spec, layout
+
+
+def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> None:
+    """Adds an object, which may bring bodies, geoms, joints, sensors, tendons and equality constraints."""
+
+    def fixed() -> dict[str, float]:
+        mocap = sum(body.mocap for body in spec.bodies)
+        return {"actuators": len(spec.actuators), "mocap bodies": mocap, "timestep": spec.option.timestep}
+
+    what, before = f"objects: {name}: {type(item).__name__}.add()", fixed()
+    item.add(spec, f"object/{name}", visual)
+    for key, value in fixed().items():
+        if value != before[key]:
+            raise InputError(f"{what} changes the scene's {key} from {before[key]:g} to {value:g}; it must not")
+    if spec.body(f"object/{name}") is None:
+        raise InputError(f"{what} adds no body 'object/{name}'; it must")
 
 
 def compile_scene(scene: Scene) -> CompiledScene:

@@ -14,6 +14,7 @@ import pytest
 
 from mqe_jax import objects
 from mqe_jax.envs import Moment, QuadrupedEnv, VectorEnv, make
+from mqe_jax.errors import InputError
 from mqe_jax.npc import defend, flock
 from mqe_jax.objects import Ball, Box, Sheep
 from mqe_jax.planners import go_to, scripted_policy
@@ -270,6 +271,40 @@ def test_objects_are_indexed_by_name() -> None:
     assert scene.objects["box"].qpos.shape == (7,) and scene.objects["box"].qvel.shape == (6,)
     assert scene.objects["dolly"].qpos.shape == (2,)
     assert scene.model.body(scene.objects["dolly"].body).name == "object/dolly"
+
+
+def motor(spec: mujoco.MjSpec, name: str) -> None:
+    spec.worldbody.add_body(name=name).add_joint(name=name)
+    spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+
+
+def weightless(spec: mujoco.MjSpec, name: str) -> None:
+    spec.worldbody.add_body(name=name).add_freejoint()
+
+
+def faster(spec: mujoco.MjSpec, name: str) -> None:
+    spec.worldbody.add_body(name=name)
+    spec.option.timestep = 0.001
+
+
+@pytest.mark.parametrize(
+    ("add", "message"),
+    [
+        (motor, r"objects: thing: Own.add\(\) changes the scene's actuators from 12 to 13"),
+        (lambda spec, name: spec.worldbody.add_body(name=name, mocap=True), "mocap bodies from 0 to 1"),
+        (lambda spec, name: spec.delete(spec.actuator("robot0/FL_hip")), "actuators from 12 to 11"),
+        (lambda spec, name: spec.worldbody.add_body(name="crate"), "adds no body 'object/thing'"),
+        (faster, "timestep from 0.005 to 0.001"),
+        (weightless, r"scene: MuJoCo rejects it \(Error: mass and inertia"),
+    ],
+)
+def test_objects_that_engines_cannot_step_are_refused(add: Any, message: str) -> None:
+    class Own(objects.Object):
+        def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+            add(spec, name)
+
+    with pytest.raises(InputError, match=message):
+        plain(thing=Own())
 
 
 def pushed(robots: int) -> float:
