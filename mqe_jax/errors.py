@@ -6,6 +6,7 @@ import reprlib
 from collections.abc import Iterable
 
 from mqe_jax.limits import SHOWN
+from mqe_jax.literal import line
 
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, SHOWN, SHOWN
@@ -30,8 +31,8 @@ class NonFiniteError(ArithmeticError):
 def one_line(error: BaseException) -> str:
     """Returns an error's message as one line; that of an OSError is its file and the reason."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
+        return line(f"{error.filename}: {error.strerror}")
+    return line(error)
 
 
 def shown(value: object) -> str:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
 from mqe_jax.errors import one_line
+from mqe_jax.literal import line
 
 Act = Callable[[], str | None]
 
@@ -118,10 +119,10 @@ def _end(number: int) -> None:
 
 
 def _exit(number: int, *said: str) -> None:
-    line = "; ".join([f"mqe: {_WORDS[signal.Signals(number)]}", *said])
+    text = line("; ".join([f"mqe: {_WORDS[signal.Signals(number)]}", *said]))
     with contextlib.suppress(OSError):
         if select.select([], [2], [], 1.0)[1]:  # a reader that has stopped would block for ever
-            os.write(2, f"{line}\n".encode())
+            os.write(2, f"{text}\n".encode())
     for path in tuple(temporaries):
         with contextlib.suppress(OSError):
             os.unlink(path)

@@ -162,8 +162,8 @@ def test_the_page_agrees_with_the_committed_tables() -> None:
     [
         (3.2, 3.3, 3.4, 3, "above"),
         (3.0, 3.3, 3.4, 3, "above, within the interval"),
-        (1.0, 2.0, 3.4, 3, "**below**, within the interval"),
-        (1.0, 2.0, 3.0, 3, "**below**"),
+        (1.0, 2.0, 3.4, 3, "below, within the interval"),
+        (1.0, 2.0, 3.0, 3, "below"),
         (1.0, 2.0, 3.0, 2, ""),
         (math.nan, math.nan, math.nan, 3, ""),
     ],

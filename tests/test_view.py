@@ -1,5 +1,6 @@
 """The viewer: its simulation, its scene and its arguments."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -190,15 +191,15 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
 
 
 def test_bars_point_to_the_side_of_their_sign_and_observations_come_in_blocks() -> None:
-    from mqe_jax.view.panel import bars, observation_table
+    from mqe_jax.view.markup import bars, observation_table
 
     page = bars(["up & on", "down", "none"], [0.2, -0.1, 0.0])
     assert "up &amp; on" in page and "left:50%;width:50.0%" in page and "right:50%;width:25.0%" in page
     layout = make("go1gate", impl="c", control="position", num_envs=1).observation_layout
     table = observation_table(layout, np.arange(layout.size, dtype=float))
-    assert [row.split(" | ")[0][2:] for row in table.splitlines()[2:]] == [block.name for block in layout.blocks]
-    assert "0.00 1.00" in table and f"{layout.size - 1}.00 |" in table
-    assert observation_table(None, np.zeros(2)).endswith("| observation | 0.00 0.00 |")
+    assert re.findall(r"<tr><td[^>]*>([^<]*)<", table) == [block.name for block in layout.blocks]
+    assert "0.00 1.00" in table and f"{layout.size - 1}.00</td>" in table
+    assert re.findall(r"<td[^>]*>([^<]*)<", observation_table(None, np.zeros(2))) == ["observation", "0.00 0.00"]
 
 
 def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewer import CAMERA, Client, Driven, free_port, session
+from viewer import CAMERA, Client, Driven, free_port, open_page, session
 
 pytest.importorskip("viser")
 
@@ -156,8 +156,8 @@ def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> N
         until(lambda: not run.paused)
     with Client(shown.port) as client:
         text = client.panel().values["state"]
-    assert f"at {(run.steps - 2) * run.env.dt:.2f} s, paused" in text and "| 1 (driven) | 0.00" in text
-    assert "episodes: success 0 of" in text and "| +0.25 |" in text
+    assert f"at {(run.steps - 2) * run.env.dt:.2f} s, paused" in text and ">1 (driven)<" in text and ">0.00<" in text
+    assert "episodes: success 0 of" in text and ">+0.25<" in text
     assert panel.back == 0 and run.moment(1000) is run.moments[0]
     run.drive.command, run.drive.robot = np.zeros(3), None
 
@@ -251,3 +251,40 @@ def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(InputError, match=r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)"):
         open_server("127.0.0.1", free_port(), "test")
     assert stopped == [True]
+
+
+EVIL = "<iframe srcdoc=\"<script>top.ran = 'iframe'</script>\"></iframe><img src=x onerror=\"ran = 'img'\">![](a.png)"
+
+
+def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names of the task, robots, rewards and observations, choices, outcomes, and errors that hold paths."""
+    pytest.importorskip("mjviser")
+    from mqe_jax.view.menu import Choice, Menu
+    from mqe_jax.view.viewer import Viewer
+
+    def fail(choice: object) -> Any:
+        raise InputError(f"runs/{EVIL}: damaged")
+
+    env: Any = Driven()
+    env.name = EVIL
+    env.observation_layout = SimpleNamespace(blocks=[SimpleNamespace(name=EVIL)], slice=lambda name: slice(None))
+    run = session(env)
+    monkeypatch.setattr("mqe_jax.view.viewer.start_frame", lambda *_: run.frame())
+    with open_page(640, 480) as page:
+        viewer = Viewer(port=free_port(), menu=Menu(fail, Choice("go1gate", EVIL), {EVIL: "go1gate"}))
+        viewer.announce(env, 2)
+        page.goto(viewer.url)
+        page.get_by_text("is being compiled").wait_for()
+        run.terms, run.last = (EVIL, run.terms[-1]), [EVIL, EVIL]
+        viewer.show(run)
+        viewer._panel._robots = (EVIL, EVIL)
+        run.advance()
+        viewer._panel.show(np.zeros((2, 3)), 1.0)
+        page.get_by_text("x real time").wait_for()
+        page.get_by_text("Observation of the driven robot").click()
+        assert page.evaluate("window.ran") is None and page.locator("body").inner_text().count(EVIL) >= 6
+        viewer._panel._wanted = Choice("go1gate", EVIL)
+        assert not viewer._exchanged()
+        page.get_by_text("not loaded: runs/<iframe").wait_for()
+        assert page.evaluate("window.ran") is None and page.locator("iframe").count() == 0
+        viewer.server.stop()

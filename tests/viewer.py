@@ -58,7 +58,7 @@ class Panel:
     """The panel as a newly connected client sees it."""
 
     widgets: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Message that created each widget, by label; the first markdown as `state`."""
+    """Message that created each widget, by label; the first HTML as `state`."""
     commands: dict[str, str] = field(default_factory=dict)
     """Uuid of each command, by label."""
     values: dict[str, Any] = field(default_factory=dict)
@@ -127,11 +127,11 @@ class Client:
             if kind == "RegisterCommandMessage":
                 panel.commands[message["props"]["label"]] = message["uuid"]
             elif kind == "GuiUpdateMessage":
-                for name in message["updates"].keys() & {"value", "_markdown"}:
+                for name in message["updates"].keys() & {"value", "content"}:
                     panel.values[labels[uuid]] = message["updates"][name]
             elif kind.startswith("Gui") and "props" in message:
                 label = str(message["props"].get("label"))
-                if kind == "GuiMarkdownMessage":
+                if kind == "GuiHtmlMessage":
                     label = "state" if "state" not in panel.widgets else "further text"
                 panel.widgets.setdefault(label, message)
                 labels[uuid] = label

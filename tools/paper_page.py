@@ -105,7 +105,7 @@ def sections(cells: Cells, reference: Reference, folder: Path) -> dict[str, str]
     cell = {"task": "task", "algorithm": "algorithm", "seeds": "seeds"}
     reward = {"training": "average step reward", "paper": "paper"}
     absolute = {"ours": "ours is", "absolute": "best checkpoint", "success": "success rate"}
-    return {
+    made = {
         **{v: markdown([r for r in rows if r["variant"] == v], cell | reward | absolute) for v in (PAPER, SCRATCH)},
         "aggregates": "\n\n".join(markdown(table) for table in aggregate_tables(of(cells, reference.values)).values()),
         TUNED: markdown(
@@ -115,6 +115,7 @@ def sections(cells: Cells, reference: Reference, folder: Path) -> dict[str, str]
             | {"success": "success rate", "fresh": "success rate, 512 fresh episodes"},
         ),
     }
+    return {name: text.replace("| below", "| **below**") for name, text in made.items()}
 
 
 def verdict(row: Mapping[str, Any], column: str) -> str:
@@ -124,4 +125,4 @@ def verdict(row: Mapping[str, Any], column: str) -> str:
         return ""
     if middle > value:
         return "above" if low > value else "above, within the interval"
-    return "**below**" if high < value else "**below**, within the interval"
+    return "below" if high < value else "below, within the interval"

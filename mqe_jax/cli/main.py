@@ -74,7 +74,7 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
     except (InputError, OSError) as error:
         return 2, one_line(error)
     except NonFiniteError as error:
-        return 1, str(error)
+        return 1, one_line(error)
     return 0, ""
 
 

@@ -15,6 +15,7 @@ import tyro
 from mqe_jax import settings
 from mqe_jax.errors import InputError, shown
 from mqe_jax.files import parse_yaml
+from mqe_jax.literal import line
 from mqe_jax.settings import joined, record
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 
 def echo(text: str) -> None:
     """Prints a line to standard error."""
-    print(text, file=sys.stderr, flush=True)
+    print(line(text), file=sys.stderr, flush=True)
 
 
 def print_table(values: Mapping[str, Any]) -> None:
@@ -131,7 +132,7 @@ def print_table(values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         flat.update({f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value})
     for name, value in flat.items():
-        print(f"{name:<28} {value:.4g}" if isinstance(value, float) else f"{name:<28} {value}")
+        print(f"{line(name):<28} {value:.4g}" if isinstance(value, float) else f"{line(name):<28} {line(value)}")
 
 
 @contextlib.contextmanager

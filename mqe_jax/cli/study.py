@@ -17,6 +17,7 @@ from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions, echo
 from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Candidates, Positive, PositiveInt
+from mqe_jax.literal import line
 from mqe_jax.settings import fail, record
 
 if TYPE_CHECKING:
@@ -183,7 +184,7 @@ class Tournament(TaskOptions):
             for i in order:
                 row = " ".join(f"{100 * share[i, j]:4.0f}" if i != j else "    " for j in order)
                 low, value, high = (x[i] for x in (ratings.low, ratings.value, ratings.high))
-                print(f"{names[i]:<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
+                print(f"{line(names[i]):<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
         rows = [{"policy": names[i], **{k: float(x[i]) for k, x in ratings._asdict().items()}} for i in order]
         return {"task": self.task, "ratings": rows, "policies": names, "results": results.tolist()}
 

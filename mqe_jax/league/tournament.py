@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mqe_jax.envs import VectorEnv
 from mqe_jax.files import replacing, write_atomically
+from mqe_jax.literal import to_label
 from mqe_jax.opponents import OUTCOMES, Versus
 from mqe_jax.settings import checked
 from mqe_jax.train.policy import Policy
@@ -129,7 +130,8 @@ def _draw(names: Sequence[str], results: NDArray[np.int64], path: Path) -> None:
     for (row, column), value in np.ndenumerate(share):
         if row != column:
             axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=9)
-    shown = [name if len(name) <= _LONG else f"...{name[3 - _LONG :]}" for name in names]  # the end names a run
+    ends = (name if len(name) <= _LONG else f"...{name[3 - _LONG :]}" for name in names)  # the end names a run
+    shown = list(map(to_label, ends))
     axes.set_xticks(range(len(names)), shown, rotation=45, ha="right")
     axes.set_yticks(range(len(names)), shown)
     figure.suptitle("points of 100 games, row against column", fontsize=10)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mqe_jax.literal import to_label
 from mqe_jax.study.estimates import Array, Cells, band, estimate, evaluated, names, score_matrices
 from mqe_jax.study.runs import Cell, Reference, Run
 from mqe_jax.study.statistics import performance_profile
@@ -67,7 +68,7 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
             values = reference.values.get(variant, {}).get(task, {})
             _draw_values(axes, {name: x for name, x in values.items() if name in algorithms})
             _style_axes(axes, reference.tasks.get(task, task))
-        block.suptitle(reference.variants.get(variant, variant), color=_INK, fontsize=11)
+        block.suptitle(to_label(reference.variants.get(variant, variant)), color=_INK, fontsize=11)
     colors = {name.upper(): _color(name, algorithms) for name in algorithms}
     _key(figure, colors, reference.label if reference.values else None)
     return _png(figure)
@@ -127,11 +128,11 @@ def _draw_band(axes: Any, runs: Sequence[Run], color: str, label: str) -> None:
 def _draw_interval(axes: Any, x: Array, values: Sequence[Array], color: str, label: str = "") -> None:
     """Draws a line and its interval: `values` are middle, low and high, each of x's shape."""
     axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, lw=0)
-    axes.plot(x, values[0], color=color, lw=1.5, label=label)
+    axes.plot(x, values[0], color=color, lw=1.5, label=to_label(label))
 
 
 def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> None:
-    axes.set_title(title, color=_INK, fontsize=10, style="italic")
+    axes.set_title(to_label(title), color=_INK, fontsize=10, style="italic")
     axes.set_xlabel("environment steps (millions)", fontsize=8)
     axes.set_ylabel(ylabel, fontsize=8)
     axes.set_xlim(left=0)
@@ -144,9 +145,9 @@ def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
     """Adds a legend below the figure: colours by label, and the label of dashed lines."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=color, label=label) for label, color in colors.items()]
+    handles = [Line2D([], [], color=color, label=to_label(label)) for label, color in colors.items()]
     if dashed is not None:
-        handles.append(Line2D([], [], color=_INK, ls=_DASHES, lw=1.0, label=dashed))
+        handles.append(Line2D([], [], color=_INK, ls=_DASHES, lw=1.0, label=to_label(dashed)))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=8)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mqe_jax.files import write_atomically
+from mqe_jax.literal import to_markdown
 from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
 from mqe_jax.study.runs import PLAIN, REWARD, Reference, Run, read_runs, table
@@ -36,7 +37,8 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
         "final.csv": table(finals).encode(),
         "curves.png": draw_curves(cells, reference),
     }
-    text = ["# Results", "", _EXPLANATION, *([f"`reference`: {reference.label}."] if reference.values else []), ""]
+    label = [f"`reference`: {to_markdown(reference.label)}."] if reference.values else []
+    text = ["# Results", "", _EXPLANATION, *label, ""]
     text += [markdown(finals), "", "![Training curves](curves.png)", ""]
     if with_evaluations := evaluated(cells):
         files["evaluations.png"] = draw_evaluations({cell: cells[cell] for cell in with_evaluations}, reference)
@@ -82,7 +84,7 @@ def _shown(row: Mapping[str, Any], name: str) -> str:
     """Returns an entry of a table with its interval; success as percentages, nothing for NaN."""
     value = row[name]
     if isinstance(value, str):
-        return value
+        return to_markdown(value)
     if not math.isfinite(value):
         return ""
     low, high = ("low", "high") if name in ("iqm", "probability") else (f"{name}_low", f"{name}_high")

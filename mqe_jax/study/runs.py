@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import parsing, read_rows
+from mqe_jax.literal import line
 from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
@@ -123,7 +124,7 @@ def table(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: 
     writer = csv.DictWriter(text, list(names or rows[0]), lineterminator="\n")
     writer.writeheader()
     for row in rows:
-        writer.writerow({name: x if isinstance(x, str) else number(x, digits) for name, x in row.items()})
+        writer.writerow({name: line(x) if isinstance(x, str) else number(x, digits) for name, x in row.items()})
     return text.getvalue()
 
 

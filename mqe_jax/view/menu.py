@@ -70,6 +70,7 @@ def find_runs(folders: Sequence[Path]) -> dict[str, str]:
                 task = load_run_config(path.parent).task
             except InputError:
                 continue
-            if task in TASKS and len(str(path.parent)) <= _LONGEST:
-                found[str(path.parent)] = task
+            run = str(path.parent)
+            if task in TASKS and len(run) <= _LONGEST and run.isprintable():
+                found[run] = task
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
+from mqe_jax.view.markup import bars, observation_table, paragraph, table
 from mqe_jax.view.menu import DEFAULT, Choice, Menu
 from mqe_jax.view.session import DRIVEN, Session
 from mqe_jax.viz.geometry import robot_bases, robot_color
@@ -68,7 +68,7 @@ class Panel:
         self._wanted: Choice | None = None
         self.camera, self.env, self.back = FREE, 0, 0
         self.contacts = self.shapes = False
-        self._state = self._gui.add_markdown("")
+        self._state = self._gui.add_html("")
         if menu is not None:
             self._add_menu(menu)
         self._add_run()
@@ -78,7 +78,7 @@ class Panel:
         with self._gui.add_folder("Reward terms in this step"):
             self._bars = self._gui.add_html("")
         with self._gui.add_folder("Observation of the driven robot (default: robot 1)", expand_by_default=False):
-            self._observation = self._gui.add_markdown("")
+            self._observation = self._gui.add_html("")
         self._add_plots()
 
     def take_steps(self) -> int:
@@ -96,9 +96,9 @@ class Panel:
         wanted, self._wanted = self._wanted, None
         return wanted
 
-    def say(self, text: str) -> None:
-        """Shows a text in place of the state."""
-        self._state.content = text
+    def say(self, text: str, strong: str = "") -> None:
+        """Shows a text in place of the state, after the text `strong` in bold."""
+        self._state.content = paragraph(text, strong)
 
     def show(self, positions: np.ndarray, real_time: float) -> None:
         """Shows the robots' positions (A, 3), m, in the selected environment, and the real-time factor."""
@@ -110,22 +110,21 @@ class Panel:
             vx, vy, turn = commands[agent]
             chosen = session.drivable and (session.drive.env, session.drive.robot) == (self.env, agent)
             name = self._robots[agent].removeprefix("robot ") + (" (driven)" if chosen else "")
-            rows.append(f"| {name} | {x:.2f} | {y:.2f} | {z:.2f} | {vx:+.2f} | {vy:+.2f} | {turn:+.2f} |")
-        head = f"**{session.env.name}** at {(session.steps - self.back) * session.env.dt:.2f} s, "
-        head += ("paused" if session.paused else f"{real_time:.2f} x real time") + "\n\n"
+            rows.append((name, *(f"{v:.2f}" for v in (x, y, z)), *(f"{v:+.2f}" for v in (vx, vy, turn))))
+        pace = "paused" if session.paused else f"{real_time:.2f} x real time"
+        head = paragraph(f"at {(session.steps - self.back) * session.env.dt:.2f} s, {pace}", session.env.name)
         head += self._score(float(session.rewards[index][self.env, -1]) if session.rewards else 0.0)
-        head += "| robot | x | y | z | vx | vy | turn |\n|---|---|---|---|---|---|---|\n"
-        self._state.content = head + "\n".join(rows)
+        self._state.content = head + table(("robot", "x", "y", "z", "vx", "vy", "turn"), rows)
         self._read_out(index)
 
     def _score(self, reward: float) -> str:
         """Returns the lines with episode, reward, and the outcomes of the episodes that ended."""
         session = self._session
-        text = f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step\n\n"
+        text = f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step"
         counts = ", ".join(f"{name} {count}" for name, count in zip(session.outcomes, session.counts, strict=True))
         team = f"{self._robots[0]}'s team" if len(session.outcomes) > 1 else "episodes"
         last = f"; last: {session.last[self.env]}" if session.last[self.env] else ""
-        return text + f"{team}: {counts} of {session.episodes.sum()}{last}\n\n"
+        return paragraph(text) + paragraph(f"{team}: {counts} of {session.episodes.sum()}{last}")
 
     def _read_out(self, index: int) -> None:
         """Shows reward terms and observation of a step of the history."""
@@ -253,7 +252,8 @@ class Panel:
         with gui.add_folder("Drive"):
             robot = gui.add_dropdown("Driven", (NONE, *names), initial_value=NONE, hint="Teleoperated robot")
             keys = " ".join(key for _, _, key in DIRECTIONS)
-            gui.add_markdown(f"Hold a button to drive; each press of {keys} changes the command by a quarter, X stops.")
+            hint = f"Hold a button to drive; each press of {keys} changes the command by a quarter, X stops."
+            gui.add_html(paragraph(hint))
             buttons = [gui.add_button(label, hint=f"Hold, or key {key}") for label, _, key in DIRECTIONS]
             stop = gui.add_button("Stop", hint="Key X")
 
@@ -301,29 +301,3 @@ def robot_labels(model: mujoco.MjModel) -> list[str]:
     shown = np.array([robot_color(model, trunk) for trunk in robot_bases(model)])
     apart = np.linalg.norm(shown[:, None] - np.array(ROBOT_COLORS), axis=-1)
     return [f"robot {i + 1} ({ROBOT_COLOR_NAMES[nearest]})" for i, nearest in enumerate(apart.argmin(axis=1))]
-
-
-def bars(names: Sequence[str], values: Sequence[float]) -> str:
-    """Returns HTML with one bar per name, to the right for positive values and to the left for negative ones."""
-    greatest = max([1e-9, *(abs(value) for value in values)])
-    rows = []
-    for name, value in zip(names, values, strict=True):
-        width = 50 * abs(value) / greatest
-        side, colour = ("left", "#3fae49") if value >= 0 else ("right", "#d64545")
-        bar = f'<div style="position:absolute;{side}:50%;width:{width:.1f}%;height:100%;background:{colour}"></div>'
-        rows.append(
-            f'<div style="display:flex;font-size:11px;align-items:center"><span style="width:8.5em">'
-            f'{html.escape(name)}</span><div style="position:relative;flex:1;height:10px;background:#8882">{bar}</div>'
-            f'<span style="width:5em;text-align:right">{value:+.4f}</span></div>'
-        )
-    return f'<div style="padding:0 12px">{"".join(rows)}</div>'
-
-
-def observation_table(layout: Any, obs: np.ndarray) -> str:
-    """Returns Markdown with the values (O,) of an agent's observation by the blocks of its layout, or as one block."""
-    if layout is None:
-        parts = [("observation", obs)]
-    else:
-        parts = [(block.name, obs[layout.slice(block.name)]) for block in layout.blocks]
-    rows = [f"| {name} | {' '.join(f'{x:.2f}' for x in values)} |" for name, values in parts]
-    return "| block | values |\n|---|---|\n" + "\n".join(rows)

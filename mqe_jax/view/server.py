@@ -23,6 +23,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mqe_jax.errors import InputError
+from mqe_jax.literal import line
 from mqe_jax.view.messages import MAX_FRAME, RefusedError, UnparsableError, authorities, check, refusal
 
 _LINES = 10  # logged per second at most
@@ -40,8 +41,7 @@ class _Log:
         self._lines = self._lines + 1 if second == self._second else 1
         self._second = second
         if self._lines <= _LINES:
-            shown = "".join(c if c.isprintable() else "?" for c in text[:_LENGTH])
-            print(f"mqe: view: {shown}", file=sys.stderr, flush=True)
+            print(f"mqe: view: {line(text[:_LENGTH])}", file=sys.stderr, flush=True)
 
 
 class _Connection(ServerConnection):

@@ -11,6 +11,7 @@ import viser
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
+from mqe_jax.view.markup import paragraph
 from mqe_jax.view.menu import Menu
 from mqe_jax.view.overlay import Overlay
 from mqe_jax.view.panel import FREE, Panel, robot_labels
@@ -46,7 +47,7 @@ class Viewer:
     def announce(self, env: QuadrupedEnv, num_envs: int) -> None:
         """Shows a task with its robots at their start, before the session that `run` opens: that compiles."""
         self._build(env.mj_model, start_frame(env, num_envs))
-        self.server.gui.add_markdown(f"**{env.name}** is being compiled")
+        self.server.gui.add_html(paragraph("is being compiled", env.name))
         self._announced = True
 
     def _build(self, model: mujoco.MjModel, frame: Episode) -> None:
@@ -83,7 +84,7 @@ class Viewer:
         """Opens a session, steps and renders it at its speed until an exception; then stops the server."""
         try:
             self.show(open_session())
-            self._panel.say(f"**{self.session.env.name}**: its step is being compiled")
+            self._panel.say("is being compiled", self.session.env.name)
             self.session.advance()
             due = drawn = shown = time.monotonic()
             counted = self.session.steps
@@ -116,7 +117,7 @@ class Viewer:
         choice = self._panel.take_choice()
         if choice is None or self._menu is None:
             return False
-        self._panel.say(f"loading **{choice.task}**, which compiles its step")
+        self._panel.say("is being loaded and compiled", choice.task)
         try:
             session = self._menu.open(choice)
             session.advance()

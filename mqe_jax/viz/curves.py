@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mqe_jax.files import replacing
+from mqe_jax.literal import to_label
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
@@ -41,7 +42,7 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
         axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label="mqe_jax" if table is tables[0] else None)
     last = max(table["env_steps"][-1] for table in tables) / 1e6
     axes.set(xlabel="environment steps (millions)", ylabel="average step reward", xlim=(0, last))
-    axes.set_title(title or task, color=_INK, loc="left")
+    axes.set_title(to_label(title or task), color=_INK, loc="left")
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     if any(math.isfinite(v) for t in tables for v in t.get("success", [])):

@@ -1,0 +1,71 @@
+"""Paths, names and errors of others are shown as they are: nothing in them is markup, or a control character."""
+
+import os
+import signal
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mqe_jax.errors import InputError, one_line
+from mqe_jax.league import tournament
+from mqe_jax.literal import to_html, to_markdown
+from mqe_jax.study import figures
+from mqe_jax.study.report import markdown
+
+EVIL = "<script>x</script> <img src=x onerror=y> ![a](b) [c](d) `e` *f* __g__ ~~h~~ | &lt; $\\bad$ \\ 'i' \"j\""
+
+
+class Seen(HTMLParser):
+    """The elements of a text of HTML, and its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags, self.text = set[str](), ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.tags.add(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_nothing_is_markup_in_html_and_markdown() -> None:
+    """Markdown as markdown-it reads it, as a paragraph and in the table of a report."""
+    markdown_it = pytest.importorskip("markdown_it")
+    read = markdown_it.MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
+    for page, tags in (
+        (to_html(EVIL), set()),
+        (f'<b title="{to_html(EVIL)}"></b>{to_html(EVIL)}', {"b"}),
+        (read.render(to_markdown(EVIL)), {"p"}),
+        (read.render(markdown([{"task": EVIL}])), {"table", "thead", "tbody", "tr", "th", "td"}),
+    ):
+        seen = Seen(page)
+        assert seen.tags == tags and EVIL in seen.text
+
+
+def test_names_are_no_formulas_in_pictures(tmp_path: Path) -> None:
+    """The picture of a tournament has the names of policies, that of a sweep those of its folders."""
+    axes = figures._figure(3.0, 3.0).add_subplot()
+    figures._style_axes(axes, "$\\bad$")
+    figures._png(axes.figure)
+    tournament._draw(["$\\bad$", "$"], np.ones((2, 2, 3), np.int64), tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").is_file()
+
+
+def test_a_terminal_gets_one_printable_line() -> None:
+    said = one_line(InputError("runs/\x1b]0;title\x07\n\u202egnp.\udcff: damaged"))
+    assert said == "runs/\\x1b]0;title\\x07 \\u202egnp.\\udcff: damaged"
+
+
+def test_a_signal_ends_a_program_whose_run_folder_is_no_text() -> None:
+    program = "import os, signal; from mqe_jax import interrupts; interrupts.install()\n"
+    program += "with interrupts.before_exit(lambda: 'run is in runs/\\udcff'):\n"
+    program += "    os.kill(os.getpid(), signal.SIGTERM); signal.pause()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=20, env=os.environ)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "mqe: terminated; run is in runs/\\udcff\n")
