@@ -84,10 +84,10 @@ def append(path: Path, content: bytes) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Creates a folder, where there is none, in one that exists; an OSError names it."""
+    """Creates a folder and those around it, where there is none; an OSError names it."""
     check_locks(path)
     with naming(path):
-        path.mkdir(exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
 
 
 def check_locks(path: Path) -> None:

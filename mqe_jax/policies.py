@@ -93,8 +93,8 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
         source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy (`mqe_jax.zoo`), or a path;
             a folder with one of these names is given as ./NAME.
         env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
-        deterministic: whether a trained policy acts with its mean actions; a shipped one does so too where its card
-            declares it.
+        deterministic: whether a trained policy acts with its mean actions; it does so too where its file or the card
+            of a shipped one declares it.
 
     Returns:
         A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from mqe_jax.robots.index import Proprioception
 from mqe_jax.settings import override
 from mqe_jax.skills import SKILLS, Command, Skill
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 
 MATCHES = [name for name in zoo.names() if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")]
@@ -91,7 +92,14 @@ def test_a_policy_is_shipped_with_its_card(tmp_path: Path) -> None:
     card = override(zoo.card("go1gate"), {"mode": "deterministic"})
     file = zoo.ship(load_policy("go1gate"), card, tmp_path)
     assert file == tmp_path / "go1gate.safetensors"
-    assert load_policy(file).metadata["card"]["mode"] == "deterministic"
+    assert load_policy(file).metadata["card"]["mode"] == "deterministic" and load_policy(file).deterministic
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_a_policy_file_holds_its_mode(deterministic: bool, tmp_path: Path) -> None:
+    policy = dataclasses.replace(load_policy("go1gate"), deterministic=deterministic)
+    file = save_policy(tmp_path / "new" / "folder", policy)
+    assert load_policy(file).deterministic is deterministic and load_policy(file, deterministic=True).deterministic
 
 
 def test_the_command_lists_the_shipped_policies(capfd: pytest.CaptureFixture[str]) -> None:

@@ -40,7 +40,7 @@ SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JO
 
 
 def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
-    """Returns the graph of a policy on its task, which defines control mode, robot and walk policy.
+    """Returns the graph of a policy with its mean actions; its task defines control mode, robot and walk policy.
 
     Raises:
         InputError: for another task than the policy's, or a network with an operation that has no translation.

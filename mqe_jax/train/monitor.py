@@ -21,7 +21,7 @@ from annotated_types import Ge
 from typing_extensions import TypedDict
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_locks, make_folder, read_json, write_atomically
+from mqe_jax.files import check_locks, read_json, write_atomically
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, Result
 from mqe_jax.train.learner import env_dims
@@ -128,7 +128,6 @@ class EvaluationLog:
             self._best = evaluation, policy
             if self._run_dir is not None:
                 path = _best_path(self._run_dir, evaluation)
-                make_folder(path.parent)
                 save_policy(path.parent, policy, path.name)
         self.evaluations.append(evaluation)
         self.absolute = None

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.errors import InputError, NonFiniteError
+from mqe_jax.files import make_folder
 from mqe_jax.settings import PathText, build, check, to_mapping
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
@@ -151,7 +152,9 @@ NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
 
 
 def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
-    """Writes a policy into a run folder atomically; with `half`, its parameters as float16.
+    """Writes a policy into a folder, which it creates, atomically; with `half`, its parameters as float16.
+
+    The file holds whether the policy acts with its mean actions.
 
     Raises:
         NonFiniteError: for weights or statistics that are NaN or infinite.
@@ -162,7 +165,9 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
         params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
     if wrong := nonfinite({"params": params, "normalizer": policy.normalizer}):
         raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
-    metadata = {**policy.metadata, "dims": policy.dims._asdict(), "config": to_mapping(policy.config)}
+    about = {"dims": policy.dims._asdict(), "config": to_mapping(policy.config), "deterministic": policy.deterministic}
+    metadata = {**policy.metadata, **about}
+    make_folder(path.parent)
     save_tree(path, {"params": params, "normalizer": policy.normalizer}, metadata, kind="policy")
     return path
 
@@ -180,6 +185,7 @@ def read_policy(run: str | Path) -> TrainedPolicy:
     try:
         dims = check("dims", EnvDims(**metadata.pop("dims")), EnvDims)
         config = build(TrainConfig, metadata.pop("config"))
+        deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
     network = config.network.build(dims)
@@ -191,4 +197,4 @@ def read_policy(run: str | Path) -> TrainedPolicy:
     tree = load_tree(path, jax.eval_shape(template), kind="policy", half=True).tree
     if wrong := nonfinite(tree):
         raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; it was written by a diverged run")
-    return TrainedPolicy(tree["params"], tree["normalizer"], dims, config, metadata)
+    return TrainedPolicy(tree["params"], tree["normalizer"], dims, config, metadata, deterministic)

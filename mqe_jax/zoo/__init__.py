@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
@@ -72,13 +73,14 @@ def load(task: str) -> TrainedPolicy:
     """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
     about = card(task)
     policy = read_policy(file_of(task))
-    return TrainedPolicy(**{**vars(policy), "deterministic": about.mode == "deterministic"})
+    return dataclasses.replace(policy, deterministic=about.mode == "deterministic")
 
 
 def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
     """Writes a policy with its card, its parameters as float16; returns the file."""
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
-    shipped = TrainedPolicy(**{**vars(policy), "metadata": metadata})
+    deterministic = about.mode == "deterministic"
+    shipped = dataclasses.replace(policy, metadata=metadata, deterministic=deterministic)
     return save_policy(folder, shipped, file_of(policy.task).name, half=True)
 
 
