@@ -23,23 +23,18 @@ These 2100 numbers contain every action twice, constant commands 30 times, and i
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import json
 import os
-import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_locks, linear_layers, read_tensors, write_atomically
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
-from mqe_jax.settings import PathText, check
 from mqe_jax.skills import Command, Skill, register
+from mqe_jax.skills.weights import ASSETS, Networks, Params, layers  # noqa: F401
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
@@ -49,18 +44,12 @@ _COLUMNS = dict(zip(_BLOCKS, np.split(np.arange(OBSERVATION_SIZE), [3, 18, 30, 4
 LATENT_SIZE = 2
 ADAPTATION_SIZES = (HISTORY * OBSERVATION_SIZE, 256, 128, LATENT_SIZE)
 BODY_SIZES = (HISTORY * OBSERVATION_SIZE + LATENT_SIZE, 512, 256, 128, NUM_JOINTS)
-_LAYERS = {
-    f"{part}.{2 * index}": sizes
-    for part, widths in (("adaptation", ADAPTATION_SIZES), ("body", BODY_SIZES))
-    for index, sizes in enumerate(itertools.pairwise(widths))
-}
-"""Inputs and outputs of each linear layer, by name."""
+NETWORKS = Networks("walk", "walk policy", {"adaptation": ADAPTATION_SIZES, "body": BODY_SIZES})
+init_params, load_params, save_params = NETWORKS.init, NETWORKS.load, NETWORKS.save
 STEP = 0.02  # s, one policy step
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
 PRECISION = "tensorfloat32"  # of the networks' matrix products in an environment's step; float32 on a CPU
-
-Params = dict[str, dict[str, dict[str, jax.Array]]]
 
 
 COMMANDS = (
@@ -139,13 +128,6 @@ def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Propr
     ).astype(jnp.float32)
 
 
-def _rest(layers: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str) -> jax.Array:
-    """Applies the layers after the first one (named 2, 4, ...; weight (out, in)) to its output, each after an ELU."""
-    for name in sorted(layers, key=int)[1:]:
-        x = jnp.matmul(jax.nn.elu(x), layers[name]["weight"].T, precision=precision) + layers[name]["bias"]
-    return x
-
-
 def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> tuple[jax.Array, jax.Array]:
     """Computes unclipped actions (..., 12) and latents (..., 2) from flattened histories (..., n).
 
@@ -156,11 +138,11 @@ def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> 
     inner, columns = jnp.split(body["weight"], [history.shape[-1]], axis=1)
     both = jnp.matmul(history, jnp.concatenate([adaptation["weight"], inner]).T, precision=precision)
     estimated, first = jnp.split(both, [len(adaptation["bias"])], axis=-1)
-    latent = _rest(params["adaptation"], estimated + adaptation["bias"], precision)
+    latent = layers(params["adaptation"], estimated + adaptation["bias"], precision, first=1)
     first += body["bias"]
     for i in range(LATENT_SIZE):
         first += jax.lax.stop_gradient(latent[..., i, None]) * columns[:, i]
-    return _rest(params["body"], first, precision), latent
+    return layers(params["body"], first, precision, first=1), latent
 
 
 @register
@@ -247,83 +229,14 @@ class RestrictedWalkPolicy(WalkPolicy):
         In the first layers, the weights of both occurrences of an action are added, those of constant commands,
         times their values, become the weight of the row's one, and those of clocks that are alike become one.
         """
-        params = {part: dict(layers) for part, layers in params.items()}
-        for layers in params.values():
-            weight = np.asarray(layers["0"]["weight"])
+        params = {part: dict(chain) for part, chain in params.items()}
+        for chain in params.values():
+            weight = np.asarray(chain["0"]["weight"])
             window, rest = np.split(weight, [HISTORY * OBSERVATION_SIZE], axis=1)
             window = window.reshape(-1, HISTORY, OBSERVATION_SIZE)
             rows = np.zeros((len(weight), HISTORY + 1, self._width), np.float32)
             rows[:, 1:] = window @ self._observation
             rows[:, :-1, -NUM_JOINTS:] += window[..., _COLUMNS["previous_action"]]
             history = rows.reshape(len(weight), -1)[:, -self._size :]
-            layers["0"] = {**layers["0"], "weight": jax.device_put(np.concatenate([history, rest], axis=1))}
+            chain["0"] = {**chain["0"], "weight": jax.device_put(np.concatenate([history, rest], axis=1))}
         return params
-
-
-def init_params(key: jax.Array) -> Params:
-    """Samples initial weights: uniform as in torch's linear layers, the body's last layer scaled by 0.1."""
-    params: Params = {"adaptation": {}, "body": {}}
-    for name, (n_in, n_out) in _LAYERS.items():
-        part, layer = name.split(".")
-        key, w_key, b_key = jax.random.split(key, 3)
-        bound = n_in**-0.5
-        last = name == list(_LAYERS)[-1]
-        weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (0.1 if last else 1.0)
-        bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (0.0 if last else 1.0)
-        params[part][layer] = {"weight": weight, "bias": bias}
-    return params
-
-
-def nested_params(flat: Mapping[str, np.ndarray], source: str) -> Params:
-    """Returns flat weights as nested float32 arrays.
-
-    Raises:
-        InputError: for missing or unexpected names, or other shapes; the message names `source`.
-    """
-    params: Params = {"adaptation": {}, "body": {}}
-    for name, arrays in linear_layers(f"walk policy {source}", flat, _LAYERS).items():
-        part, layer = name.split(".")
-        params[part][layer] = jax.device_put(arrays)
-    return params
-
-
-ASSETS = pathlib.Path(__file__).parent / "assets"
-
-
-def load_params(robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
-    """Reads weights as float32 from a safetensors file; those shipped for the robot if `path` is None.
-
-    Raises:
-        InputError: if the file is missing, damaged, or holds other names or shapes.
-    """
-    file = pathlib.Path(check("weights", path, PathText)) if path is not None else ASSETS / robot.walk.weights
-    train = f"train it with 'mqe walk train --robot {robot.name}'"
-    if not file.is_file() and path is None:
-        raise InputError(
-            f"walk policy: no weights are shipped for {robot.name} (assets/{file.name}); {train} and give them as "
-            "skill_weights=FILE, or use control 'position' or 'torque'"
-        )
-    if not file.is_file():
-        raise InputError(f"walk policy: no file {file}; {train} or convert official weights with 'mqe walk convert'")
-    return nested_params(read_tensors(file, "walk policy"), str(file))
-
-
-def save_params(
-    params: Params, path: str | os.PathLike[str], metadata: Mapping[str, Any] | None = None, *, half: bool = False
-) -> None:
-    """Writes weights and metadata to a safetensors file, atomically; with `half`, rounded to float16 (3.6 MB)."""
-    from safetensors.numpy import save
-
-    flat = {
-        f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16 if half else np.float32)
-        for part, layers in params.items()
-        for layer, arrays in layers.items()
-        for kind, array in arrays.items()
-    }
-    file = pathlib.Path(path)
-    check_locks(file)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, save(flat, {"about": json.dumps(dict(metadata or {}))}))
-    except OSError as error:
-        raise InputError(f"walk policy: cannot write {file}: {error.strerror}") from None

@@ -139,7 +139,7 @@ def test_walking_is_a_batch_of_one_agent() -> None:
 
 @pytest.mark.soak
 def test_a_run_is_resumed_and_its_weights_walk(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
-    weights = str(walk_policy.ASSETS / GO1.walk.weights)
+    weights = str(walk_policy.ASSETS / "walk_go1.safetensors")
     train = ["walk", "train", "--run-dir", str(tmp_path), "--num-envs", "16", "--impl", "c", "--weights", weights]
     train += ["--optimizer.learning-rate", "1e-5", "--network.log-std-init", "-2", "--total-steps"]
     assert cli.main([*train, str(16 * 24)]) == 0

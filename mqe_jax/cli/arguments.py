@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 from mqe_jax import limits
-from mqe_jax.cli import commands, export, render, study, view, walk
+from mqe_jax.cli import commands, export, render, skill, study, view
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import TEXT, fail, is_text
 
@@ -39,9 +39,9 @@ COMMANDS: dict[str, Any] = {
     "replay": commands.Replay,
     "bench": commands.Bench,
     "demo": commands.Demo,
-    "walk train": "Train the walk policy's weights, from scratch or from other weights (GPU).",
-    "walk eval": walk.WalkEval,
-    "walk convert": walk.WalkConvert,
+    "skill train": "Train a skill's weights, from scratch or from other weights (GPU): mqe skill train agile.",
+    "skill eval": skill.SkillEval,
+    "skill convert": skill.SkillConvert,
     "sweep": study.Sweep,
     "pack": study.Pack,
     "report": study.Report,
@@ -55,6 +55,14 @@ def overview(group: str = "") -> str:
     about = {name: kind if isinstance(kind, str) else kind.__doc__.splitlines()[0] for name, kind in COMMANDS.items()}
     lines = "\n".join(f"  {name:12} {line}" for name, line in about.items() if name.startswith(group))
     return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
+
+
+def unaliased(arguments: Sequence[str]) -> list[str]:
+    """Returns the arguments with `walk COMMAND ...`, where they begin so, as `skill COMMAND walk ...`."""
+    if list(arguments[:1]) != ["walk"]:
+        return list(arguments)
+    command = [word for word in arguments[1:2] if not word.startswith("-")]
+    return ["skill", *command, *["walk" for _ in command], *arguments[1 + len(command) :]]
 
 
 def _check_words(arguments: Sequence[str]) -> None:
@@ -75,17 +83,18 @@ def parse(arguments: Sequence[str]) -> Any:
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
     _check_words(arguments)
+    arguments = unaliased(arguments)
     words = 2 if " ".join(arguments[:2]) in COMMANDS else 1
     name, rest = " ".join(arguments[:words]), list(arguments[words:])
     if {"-h", "--help"}.intersection(arguments[:2]) and name not in COMMANDS:
         print(overview("" if name.startswith("-") else name))
         raise SystemExit(0)
     if name not in COMMANDS:
-        name = " ".join(arguments[:2]) if name == "walk" else name
+        name = " ".join(arguments[:2]) if name == "skill" else name
         raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
     if isinstance(COMMANDS[name], str):
         from mqe_jax.cli import launch, train
 
-        parsers = {"launch": launch.parse_launch, "train": train.parse_train, "walk train": train.parse_walk_train}
+        parsers = {"launch": launch.parse_launch, "train": train.parse_train, "skill train": train.parse_skill_train}
         return parsers[name](rest)
     return tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))

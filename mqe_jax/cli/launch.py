@@ -56,7 +56,7 @@ _NOISE = re.compile(
 class Launch:
     """Train in several processes, one per device, on one host or many: `mqe launch --processes 2 train go1gate`.
 
-    Flags of `launch` come before the command, which is train, walk train or sweep. A sweep's processes train different
+    Flags of `launch` come before the command, which is train, skill train or sweep. A sweep's processes train different
     cells. Started by SLURM's srun or Open MPI's mpirun, it needs no flags and is one process of the training.
     """
 
@@ -163,14 +163,14 @@ def parse_launch(arguments: Sequence[str]) -> Launch:
         InputError: without a command that can be launched, or for its arguments.
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
-    from mqe_jax.cli.arguments import COMMANDS, parse
+    from mqe_jax.cli.arguments import COMMANDS, parse, unaliased
 
-    names = {name.split()[0] for name in COMMANDS}
+    names = {"walk", *(name.split()[0] for name in COMMANDS)}
     start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
     launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
     command = tuple(arguments[start:])
-    if command[:1] not in (("train",), ("sweep",)) and command[:2] != ("walk", "train"):
-        fail("command", " ".join(command[:2]), "train, walk train or sweep: mqe launch --processes 2 train go1gate")
+    if command[:1] not in (("train",), ("sweep",)) and tuple(unaliased(command))[:2] != ("skill", "train"):
+        fail("command", " ".join(command[:2]), "train, skill train or sweep: mqe launch --processes 2 train go1gate")
     parse(command)
     return dataclasses.replace(launch, command=command)
 

@@ -1,4 +1,4 @@
-"""The commands `train` and `walk train`, whose flags are the training settings with the values that they would have."""
+"""The commands `train` and `skill train`, whose flags are the training settings with the values they would have."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pydantic
 import tyro
 
-from mqe_jax import interrupts, robots, walk_policy
+from mqe_jax import interrupts, robots
 from mqe_jax.build import base_config, environments, for_task
 from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
 from mqe_jax.envs import ALIASES, TASKS, QuadrupedEnv
@@ -22,7 +22,7 @@ from mqe_jax.envs.wrappers import WrappedState
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Seeds
 from mqe_jax.opponents import TeamState
-from mqe_jax.settings import is_record, override, record
+from mqe_jax.settings import fail, is_record, override, record
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
@@ -30,8 +30,9 @@ from mqe_jax.train.folder import check_alone, check_run
 from mqe_jax.train.networks import NETWORKS
 from mqe_jax.train.types import Trace
 from mqe_jax.viz import curves
+from mqe_jax.walk.network import HistorySettings
 from mqe_jax.walk.task import WalkTask
-from mqe_jax.walk.training import WALK, train_walk
+from mqe_jax.walk.training import SETTINGS, train_skill
 
 _HINT = "resume with the same command and --resume; the run is in {}"
 _MARKERS = (tyro.conf.AvoidSubcommands,)
@@ -110,15 +111,17 @@ class Train(TaskOptions):
 
 
 @record
-class WalkTrain:
-    """Train the walk policy's weights, from scratch or from other weights (GPU)."""
+class SkillTrain:
+    """Train a skill's weights, from scratch or from other weights (GPU)."""
 
+    skill: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SKILL"), pydantic.SkipValidation()]  # pyright: ignore[reportCallIssue]
+    """Name of the skill: walk or agile."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
     task: WalkTask = WalkTask()
     """Parameters of the walking task."""
-    run_dir: Path = Path("runs/walk")
-    """Run folder: walk.safetensors (rounded to float16), metrics.csv, checkpoints."""
+    run_dir: Path | None = None
+    """Run folder: SKILL.safetensors (rounded to float16), metrics.csv, checkpoints. Default: runs/SKILL."""
     resume: bool = False
     """Continue from the newest checkpoint in the run folder, with environments reset."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -127,15 +130,16 @@ class WalkTrain:
     robot: Robot = "go1"
 
     def run(self) -> None:
-        """Trains the walk policy into the run folder."""
-        robot, config = robots.get(self.robot), self.settings
+        """Trains the skill into the run folder."""
+        robot, config, run_dir = robots.get(self.robot), self.settings, self.run_dir or Path("runs") / self.skill
+        assert isinstance(config.network, HistorySettings)
         if self.weights is not None:
-            walk_policy.load_params(robot, self.weights)
+            config.network.form().networks.load(robot, self.weights)
             config = override(config, {"network.weights": str(self.weights.resolve())})
-        with interrupts.before_exit(lambda: _HINT.format(self.run_dir)):
-            train_walk(robot, self.run_dir, config, self.task, impl=self.impl, resume=self.resume)
+        with interrupts.before_exit(lambda: _HINT.format(run_dir)):
+            train_skill(self.skill, robot, run_dir, config, self.task, impl=self.impl, resume=self.resume)
         if jax.process_index() == 0:
-            echo(f"mqe: {self.run_dir} holds walk.safetensors, metrics.csv and checkpoints")
+            echo(f"mqe: {run_dir} holds {self.skill}.safetensors, metrics.csv and checkpoints")
 
 
 def parse_train(arguments: Sequence[str]) -> Train:
@@ -177,10 +181,19 @@ def _switches(kind: Any) -> Iterator[str]:
             yield name
 
 
-def parse_walk_train(arguments: Sequence[str]) -> WalkTrain:
-    """Parses the arguments of `mqe walk train`; SystemExit as in `parse_train`."""
-    default = WalkTrain(settings=WALK)
-    return tyro.cli(WalkTrain, prog="mqe walk train", args=list(arguments), default=default, config=_MARKERS)
+def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
+    """Parses the arguments of `mqe skill train`, where the skill comes first and decides the flags' defaults.
+
+    Raises:
+        InputError: for a skill that cannot be trained.
+        SystemExit: as in `parse_train`.
+    """
+    name = next(iter(arguments), "")
+    if name not in SETTINGS and not {"-h", "--help"}.intersection(arguments):
+        fail("skill", name, f"{' or '.join(SETTINGS)}, before all flags: mqe skill train agile --robot go2")
+    settings, task = SETTINGS.get(name, SETTINGS["walk"])
+    default = SkillTrain(skill=tyro.MISSING, settings=settings, task=task)
+    return tyro.cli(SkillTrain, prog="mqe skill train", args=list(arguments), default=default, config=_MARKERS)
 
 
 STEPS = 64

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeVar
 
-from mqe_jax import robots, skills, walk_policy  # noqa: F401  (a skill registers itself)
+from mqe_jax import agile, robots, skills, walk_policy  # noqa: F401  (skills register themselves)
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
 from mqe_jax.limits import (

@@ -111,10 +111,6 @@ GO1 = Robot(
     collision=_COLLISION,
     visuals=_VISUALS,
     walk=WalkSettings(
-        weights="walk_go1.safetensors",
-        stance_width=0.25,
-        stance_length=0.428,
-        min_knee_height=0.06,
-        min_trunk_height=0.1,
+        weights="go1", stance_width=0.25, stance_length=0.428, min_knee_height=0.06, min_trunk_height=0.1
     ),
 )

@@ -116,10 +116,6 @@ GO2 = Robot(
     collision=_COLLISION,
     visuals=_VISUALS,
     walk=WalkSettings(
-        weights="walk_go2.safetensors",
-        stance_width=0.28,
-        stance_length=0.438,
-        min_knee_height=0.06,
-        min_trunk_height=0.1,
+        weights="go2", stance_width=0.28, stance_length=0.438, min_knee_height=0.06, min_trunk_height=0.1
     ),
 )

@@ -185,7 +185,7 @@ class WalkSettings:
     """Settings of the walk policy and its training that depend on the robot."""
 
     weights: str
-    """File name of the trained weights in `mqe_jax/assets`."""
+    """Robot whose shipped weights it uses: `mqe_jax/assets/SKILL_ROBOT.safetensors`."""
     stance_width: float
     """Default distance between left and right feet, m."""
     stance_length: float

@@ -1,4 +1,4 @@
-"""Training and evaluation environment of the walk policy: one robot that tracks commands.
+"""Training and evaluation environment of skills that walk: one robot that tracks commands.
 
 Slopes are rotations of gravity: a robot on an infinite slope of angle t behaves, in the frame of the slope, as one on
 flat ground under gravity rotated by t. Each environment thus has its own slope without its own geometry. All positions
@@ -25,6 +25,7 @@ from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
+from mqe_jax.walk import trainees
 from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
 from mqe_jax.walk.task import RANDOMIZATION, EpisodeSpec, WalkState, WalkTask, sample_spec
 from mqe_jax.walk_policy import WalkMemory
@@ -35,20 +36,30 @@ if TYPE_CHECKING:
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
 MOTOR_OFFSET = 0.02  # greatest offset of a joint's target under randomisation, rad
+SHOVED = np.array([0.25, 0.08, 0.06])  # half-lengths of the box in the trunk's frame on which shoves act, m
 
 
 class WalkEnv:
     """One robot that tracks commands on a slope under external forces; batch with `VectorEnv` or `jax.vmap`."""
 
-    name = "walk"
     num_agents = 1
     teams = ((0,),)
-    observation_size = walk_policy.OBSERVATION_SIZE
     action_size = NUM_JOINTS
 
-    def __init__(self, robot: Robot, task: WalkTask | None = None, *, impl: str = "auto", num_envs: int = 4096) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        task: WalkTask | None = None,
+        *,
+        skill: str = "walk",
+        impl: str = "auto",
+        num_envs: int = 4096,
+    ) -> None:
+        self.name = skill
         self.robot = robot
         self.task = task or WalkTask()
+        self.trainee = trainees.make(skill, robot)
+        self.observation_size = self.trainee.observation_size
         scene = Scene(
             Track(blocks=(Plane(4.0),), walled=False, num_robots=1),
             num_robots=1,
@@ -57,7 +68,7 @@ class WalkEnv:
             solver_iterations=self.task.solver_iterations,
         )
         self.compiled = compile_scene(scene)
-        self.skill = walk_policy.WalkPolicy(robot)
+        self.skill = self.trainee.skill
         self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
@@ -70,7 +81,9 @@ class WalkEnv:
         self.index = self.compiled.index
         self.actuators = Actuators(self.physics, self.index)
         self._mass = np.asarray(self.compiled.model.body_mass)
-        randomization = RANDOMIZATION if self.task.randomize else Randomization()
+        randomization = Randomization()
+        if self.task.randomize:
+            randomization = dataclasses.replace(RANDOMIZATION, action_lag=self.task.action_lag)
         self._randomizer = Randomizer(randomization, self.compiled.model, self.index, 1.0)
 
     def __repr__(self) -> str:
@@ -90,7 +103,7 @@ class WalkEnv:
         """Returns an environment whose Warp buffers are sized for `num_envs` environments."""
         if self.physics.holds(num_envs):
             return self
-        return WalkEnv(self.robot, self.task, impl=self.physics.impl, num_envs=num_envs)
+        return WalkEnv(self.robot, self.task, skill=self.skill.name, impl=self.physics.impl, num_envs=num_envs)
 
     # -- reset and step -----------------------------------------------------------------------------------------
 
@@ -99,7 +112,7 @@ class WalkEnv:
         next_key, spec_key, random_key, pose_key, noise_key = jax.random.split(key, 5)
         assistance = jnp.asarray(assistance, jnp.float32)
         if spec is None:
-            spec = sample_spec(spec_key, self.task, self.robot, 1.0 - assistance)
+            spec = sample_spec(spec_key, self.task, self.trainee, assistance)
         offset = jnp.zeros(NUM_JOINTS)
         if self.task.randomize:
             offset = MOTOR_OFFSET * jax.random.uniform(
@@ -135,6 +148,8 @@ class WalkEnv:
             spec=spec,
             slope=spec.slope,
             force=spec.force,
+            shove=jnp.zeros(6),
+            shove_steps=jnp.zeros((), jnp.int32),
             random=self._randomizer.sample(random_key),
             motor_offset=offset,
             memory=memory,
@@ -168,8 +183,11 @@ class WalkEnv:
         push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[index.base_qvel[0, :2]].add(push))
 
-        fields, forces = self._randomizer.fields(state.random), self._forces(data, state.random, slope, force)
-        data, _, _ = self.actuators.step(data, (), target + state.motor_offset, fields, forces)
+        shove, shove_steps = self._shoved(state, jax.random.fold_in(time_key, 1))
+        fields = self._randomizer.fields(state.random)
+        forces = self._forces(data, state.random, slope, force, shove)
+        applied = jnp.where(state.random.action_lag > 0, previous_target, target)
+        data, _, _ = self.actuators.step(data, (), applied + state.motor_offset, fields, forces)
         robot_state = self.read(data)
         commands = state.spec.commands
         velocity, yaw_rate = heading_velocity(robot_state)
@@ -184,12 +202,14 @@ class WalkEnv:
             commands=commands,
             error=error,
             mean_error=mean_error,
-            gait=gait,
+            phases=self.trainee.foot_phases(gait, commands),
             target=target,
             previous_target=previous_target,
             earlier_target=earlier_target,
+            applied=applied,
             foot_force=self.foot_force(data),
             strength=state.random.motor_strength[0],
+            tolerance=task.tolerance,
         )
         terms = reward_terms(inputs)
         reward, weighted = combine(terms, task.rewards)
@@ -208,7 +228,7 @@ class WalkEnv:
         spec = state.spec
         if task.command_period > 0:
             renewed = step % round(task.command_period / DT) == 0
-            fresh = sample_spec(spec_key, task, self.robot, 1.0 - state.assistance)
+            fresh = sample_spec(spec_key, task, self.trainee, state.assistance)
             spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, spec)
             mean_error = jnp.where(renewed, 0.0, mean_error)
         state = dataclasses.replace(
@@ -221,6 +241,8 @@ class WalkEnv:
             spec=spec,
             slope=slope,
             force=force,
+            shove=shove,
+            shove_steps=shove_steps,
             memory=memory,
             mean_error=mean_error,
             step=step,
@@ -239,8 +261,41 @@ class WalkEnv:
         """Returns the strongest contact force on each foot (4,), N."""
         return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
 
-    def _forces(self, data: mjx.Data, random: RandomizedParams, slope: jax.Array, force: jax.Array) -> jax.Array:
-        """Returns external forces on all bodies (nbody, 6), N: the slope's change of gravity, and the trunk force."""
+    @property
+    def weight(self) -> float:
+        """Weight of the robot, N."""
+        return GRAVITY * float(self._mass.sum())
+
+    def power(self, state: WalkState) -> jax.Array:
+        """Returns the mechanical power of the joints (), W, each joint's as a magnitude."""
+        robot = self.robot
+        velocity = self.read(state.data).joint_velocity[0]
+        torque = robot.kp * (robot.joint_targets(state.memory.action) - self.read(state.data).joint_position[0])
+        torque = jnp.clip(torque - robot.kd * velocity, -robot.torque_limit, robot.torque_limit)
+        return jnp.sum(jnp.abs(torque * velocity))
+
+    def _shoved(self, state: WalkState, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns force and torque of the shove in this step (6,), and the steps until it ends ()."""
+        if not self.task.shove:
+            return state.shove, state.shove_steps
+        when_key, angle_key, up_key, size_key, length_key, point_key = jax.random.split(key, 6)
+        begins = (state.shove_steps == 0) & jax.random.bernoulli(when_key, DT / self.task.shove_period)
+        angle = jax.random.uniform(angle_key, (), maxval=2 * jnp.pi)
+        up = jax.random.uniform(up_key, (), minval=-0.3, maxval=0.3)
+        size = state.spec.shove * jax.random.uniform(size_key, ())
+        force = size * jnp.stack([jnp.cos(angle), jnp.sin(angle), up])
+        point = SHOVED * jax.random.uniform(point_key, (3,), minval=-1.0, maxval=1.0)
+        arm = rotate(state.data.qpos[self.index.base_qpos[0, 3:]], point)
+        length = jax.random.uniform(length_key, (), minval=self.task.shove_length[0], maxval=self.task.shove_length[1])
+        current = jnp.where(state.shove_steps > 0, state.shove, 0.0)
+        shove = jnp.where(begins, jnp.concatenate([force, jnp.cross(arm, force)]), current)
+        steps = jnp.where(begins, jnp.round(length / DT).astype(jnp.int32), state.shove_steps)
+        return shove, jnp.maximum(steps - 1, 0)
+
+    def _forces(
+        self, data: mjx.Data, random: RandomizedParams, slope: jax.Array, force: jax.Array, shove: jax.Array
+    ) -> jax.Array:
+        """Returns external forces on all bodies (nbody, 6), N: the slope's change of gravity, trunk force and shove."""
         trunk = int(self.index.trunk_body[0])
         turn = gravity_w(slope) - jnp.array([0.0, 0.0, -GRAVITY])
         mass = jnp.asarray(self._mass, jnp.float32).at[trunk].add(random.payload[0])
@@ -249,23 +304,24 @@ class WalkEnv:
         along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
         left = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)])
         forces = jnp.zeros((len(self._mass), 6)).at[:, :3].set(mass[:, None] * turn)
-        return forces.at[trunk, :2].add(force[0] * along + force[1] * left)
+        forces = forces.at[trunk, :2].add(force[0] * along + force[1] * left)
+        return forces.at[trunk].add(shove) if self.task.shove else forces
 
     def _observed(self, state: WalkState, key: jax.Array) -> WalkState:
         robot_state = self.read(state.data)
         quaternion = robot_state.quaternion[0]
         gravity = rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
         sensed = Proprioception(gravity, robot_state.joint_position[0], robot_state.joint_velocity[0])
-        obs = clean = walk_policy.observe(self.robot, state.memory, state.spec.commands, sensed)
+        obs = clean = self.trainee.observe(state.memory, state.spec.commands, sensed)
         if self.task.randomize:
             parts = zip(sensed, (0.02, 0.005, 0.5), jax.random.split(key, 3), strict=True)
             noisy = Proprioception(*(x + size * jax.random.normal(part_key, x.shape) for x, size, part_key in parts))
-            obs = walk_policy.observe(self.robot, state.memory, state.spec.commands, noisy)
+            obs = self.trainee.observe(state.memory, state.spec.commands, noisy)
         velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
         up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
         feet = foot_positions(self.robot, sensed.joint_position)
         foot_height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
-        phases = walk_policy.foot_phases(state.memory.gait, state.spec.commands)
+        phases = self.trainee.foot_phases(state.memory.gait, state.spec.commands)
         random = state.random
         privileged = jnp.concatenate(
             [
@@ -279,6 +335,8 @@ class WalkEnv:
                 jnp.tanh(self.foot_force(state.data) / 50.0),
                 2.0 * state.mean_error,
                 state.force / 20.0,
+                *([state.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])] if self.task.shove else []),
+                *([random.action_lag[None].astype(jnp.float32)] if self.task.action_lag else []),
                 state.slope * 4.0,
                 random.center_of_mass[0] * 20.0,
                 (random.motor_strength - 1.0) * 5.0,

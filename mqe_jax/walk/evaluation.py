@@ -1,8 +1,10 @@
-"""Evaluation of a walk policy: tracking, falls, pushes, slopes, forces, standing still and gait frequency."""
+"""Evaluation of a skill: tracking, falls, pushes, shoves, slopes, forces, standing, gait frequency, energy."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,8 +17,11 @@ from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.index import Proprioception, foot_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
+from mqe_jax.skills.weights import Params
+from mqe_jax.walk import trainees
 from mqe_jax.walk.env import WalkEnv, heading_velocity
 from mqe_jax.walk.task import EpisodeSpec, WalkTask
+from mqe_jax.walk.training import AGILE_TASK
 
 WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 
@@ -28,7 +33,9 @@ class Scenario:
     duration: float = 20.0
     """Duration of an episode, s."""
     velocity: tuple[float, float, float] | None = None
-    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from +-1, +-0.6, +-1."""
+    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from the skill's `RANGES`."""
+    period: float = 0.0
+    """Interval at which commands are sampled anew, s; 0 keeps them."""
     gait: str = "trot"
     """Name of the gait."""
     frequency: float = 3.0
@@ -39,6 +46,10 @@ class Scenario:
     """Sustained force along and to the left of the heading, N."""
     push: float = 0.0
     """Instantaneous change of velocity every 5 s, m/s."""
+    shove: float = 0.0
+    """Maximum force of shoves, N, of 0.2 to 1 s every 5 s on average."""
+    skills: tuple[str, ...] = ("walk", "agile")
+    """Skills that it fits."""
 
 
 SCENARIOS = {
@@ -50,97 +61,165 @@ SCENARIOS = {
     "force_against": Scenario(velocity=(0.5, 0.0, 0.0), force=(-30.0, 0.0)),
     "force_across": Scenario(velocity=(0.5, 0.0, 0.0), force=(0.0, 30.0)),
     "trot": Scenario(velocity=(0.5, 0.0, 0.0)),
-    "pace": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace"),
-    "trot_slow": Scenario(velocity=(0.5, 0.0, 0.0), frequency=2.0),
-    "pace_fast": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", frequency=4.0),
+    "pace": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", skills=("walk",)),
+    "trot_slow": Scenario(velocity=(0.5, 0.0, 0.0), frequency=2.0, skills=("walk",)),
+    "pace_fast": Scenario(velocity=(0.5, 0.0, 0.0), gait="pace", frequency=4.0, skills=("walk",)),
+    "changes": Scenario(period=4.0),
+    "changes_pushes": Scenario(period=4.0, push=0.5),
+    "changes_shoves": Scenario(period=4.0, shove=100.0),
+    "fast": Scenario(velocity=(2.5, 0.0, 0.0), skills=("agile",)),
+    "backward": Scenario(velocity=(-1.5, 0.0, 0.0), skills=("agile",)),
+    "sideways": Scenario(velocity=(0.0, 1.0, 0.0), skills=("agile",)),
+    "turn": Scenario(velocity=(0.0, 0.0, 2.5), skills=("agile",)),
 }
 
+RANGES = {"walk": ((-1.0, 1.0), (-0.6, 0.6), (-1.0, 1.0)), "agile": (AGILE_TASK.vx, AGILE_TASK.vy, AGILE_TASK.yaw)}
+"""Ranges of the commands vx, vy (m/s) and yaw rate (rad/s) in which a skill is evaluated."""
+TURN = {"walk": math.inf, "agile": 3.0}
+"""Maximum product of forward velocity and yaw rate, m/s^2; commands beyond are sampled again."""
 
-def make_env(robot: Robot, impl: str, episodes: int) -> WalkEnv:
-    """Returns the evaluation environment: no randomisation, commands kept for the whole episode."""
-    task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6)
-    return WalkEnv(robot, task, impl=impl, num_envs=episodes)
+
+def make_env(skill: str, robot: Robot, impl: str, episodes: int) -> WalkEnv:
+    """Returns the evaluation environment: no randomisation; commands and disturbances are those of a scenario."""
+    task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6, shove=1.0)
+    return WalkEnv(robot, task, skill=skill, impl=impl, num_envs=episodes)
 
 
-def sample_specs(robot: Robot, scenario: Scenario, key: jax.Array, episodes: int) -> EpisodeSpec:
-    """Samples the specs of all episodes; leading axis `episodes`."""
-    span = jnp.array([1.0, 0.6, 1.0])
-    velocity = jax.random.uniform(key, (episodes, 3), minval=-span, maxval=span)
+def sample_velocities(skill: str, scenario: Scenario, key: jax.Array, episodes: int) -> jax.Array:
+    """Samples commanded velocities (episodes, 3)."""
     if scenario.velocity is not None:
-        velocity = jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
-    rest = walk_policy.WalkPolicy(robot).default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
+        return jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
+    low, high = jnp.array(RANGES[skill]).T
+    velocity = jax.random.uniform(key, (episodes, 3), minval=low, maxval=high)
+    for _ in range(20 if math.isfinite(TURN[skill]) else 0):
+        key, again = jax.random.split(key)
+        other = jax.random.uniform(again, (episodes, 3), minval=low, maxval=high)
+        beyond = jnp.abs(velocity[:, 0] * velocity[:, 2]) > TURN[skill]
+        velocity = jnp.where(beyond[:, None], other, velocity)
+    return velocity
+
+
+def sample_specs(env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int) -> tuple[EpisodeSpec, jax.Array]:
+    """Samples the specs of all episodes, leading axis `episodes`, and the commands after each change (K, episodes, 15).
+
+    The first of these commands are those of the specs.
+    """
+    count = math.ceil(scenario.duration / scenario.period) if scenario.period else 1
+    keys = [key, *jax.random.split(key, count)[1:]]
+    velocities = jnp.stack([sample_velocities(env.skill.name, scenario, each, episodes) for each in keys])
+    if isinstance(env.trainee, trainees.Agile):
+        commands = jax.vmap(jax.vmap(env.trainee.commands))(velocities)
+    else:
+        rest = env.skill.default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
+        commands = jnp.concatenate([velocities, jnp.broadcast_to(rest, (count, episodes, len(rest)))], axis=-1)
     full = lambda values: jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))  # noqa: E731
-    return EpisodeSpec(
-        commands=jnp.concatenate([velocity, full(rest)], axis=1),
+    spec = EpisodeSpec(
+        commands=commands[0],
         slope=full((scenario.slope, 0.0)),
         force=full(scenario.force),
         push=full(scenario.push),
+        shove=full(scenario.shove),
     )
+    return spec, commands
 
 
-def measure(
-    env: WalkEnv, params: walk_policy.Params, scenario: Scenario, episodes: int, seed: int = 0
-) -> dict[str, float]:
+def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, float]:
     """Runs one scenario and returns its metrics.
 
     Returns:
-        rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors after the first second, until a fall;
+        rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors from 1 s after a change of command until a fall;
+        cycle_vx, cycle_vy, cycle_yaw: those of the errors' means over the gait cycle that follows;
         bias_vx, bias_vy, bias_yaw: mean errors likewise; height_error: mean height above the commanded one, m;
         fall_rate: fraction of episodes with a fall; speed: mean velocity along the heading, m/s; drift and drift_p95:
         mean and 95th percentile of the distance covered in the 10 s after the first, m; step_frequency: median
-        over episodes and feet of the strongest frequency of the foot's height, Hz.
+        over episodes and feet of the strongest frequency of the foot's height, Hz; cost_of_transport: mean mechanical
+        power of the joints over weight x mean horizontal speed.
     """
     steps, warm = round(scenario.duration / walk_policy.STEP), round(WARM_UP / walk_policy.STEP)
+    change = round((scenario.period or scenario.duration) / walk_policy.STEP)
     reset_key, spec_key = jax.random.split(jax.random.PRNGKey(seed))
-
-    def advance(carry: Any, _: None) -> Any:
-        state, memory = carry
-
-        def one(state: Any, memory: Any) -> Any:
-            robot_state = env.read(state.data)
-            commands = state.spec.commands
-            sensed = Proprioception(state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0])
-            _, memory = env.skill.targets(params, memory, commands, sensed)
-            state = env.step(state, memory.action[None])
-            robot_state = env.read(state.data)
-            quaternion = robot_state.quaternion[0]
-            feet = foot_positions(env.robot, robot_state.joint_position[0])
-            height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
-            velocity, yaw_rate = heading_velocity(robot_state)
-            errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]
-            rise = robot_state.position_w[0, 2] - env.robot.stand_height - commands[3]
-            speed = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])[0]
-            return state, memory, (errors, rise, speed, robot_state.position_w[0, :2], height, state.terminated)
-
-        state, memory, record = jax.vmap(one)(state, memory)
-        return (state, memory), record
-
-    @jax.jit
-    def run(keys: jax.Array, spec: EpisodeSpec) -> Any:
-        state = jax.vmap(lambda key, spec: env.reset(key, spec=spec))(keys, spec)
-        memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
-        return jax.lax.scan(advance, (state, memory), None, steps)[1]
-
-    specs = sample_specs(env.robot, scenario, spec_key, episodes)
-    errors, rise, speed, position, height, fallen = jax.device_get(run(jax.random.split(reset_key, episodes), specs))
+    specs, commands = sample_specs(env, scenario, spec_key, episodes)
+    numbers = np.arange(steps) // change
+    record = _run(env, params, jax.random.split(reset_key, episodes), specs, commands, numbers)
+    errors, rise, speed, position, height, fallen, power = jax.device_get(record)
     alive = ~np.logical_or.accumulate(fallen, axis=0)
     counted = alive.copy()
-    counted[:warm] = False
+    counted[np.arange(steps) % change < warm] = False
     mean = lambda x: float((x * counted).sum(dtype=float) / max(counted.sum(), 1))  # noqa: E731
     axes = dict(zip(("vx", "vy", "yaw"), np.moveaxis(errors, -1, 0), strict=True))
     upright = alive[-1]
     figures = {
         **{f"rms_{name}": mean(np.square(error)) ** 0.5 for name, error in axes.items()},
         **{f"bias_{name}": mean(error) for name, error in axes.items()},
+        **{f"cycle_{name}": value for name, value in _cycles(errors, alive, np.asarray(commands), change).items()},
         "height_error": mean(rise),
         "fall_rate": float(1.0 - upright.mean()),
         "speed": mean(speed),
     }
+    pace = np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=-1) / walk_policy.STEP
+    if mean(pace) > 0.05:
+        figures["cost_of_transport"] = mean(power) / (env.weight * mean(pace))
     if upright.any():
         travelled = np.linalg.norm(position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1)[upright]
         figures |= {"drift": float(travelled.mean()), "drift_p95": float(np.percentile(travelled, 95))}
-        figures["step_frequency"] = _frequency(height[warm:][:, upright])
+        if isinstance(env.trainee, trainees.Walk):
+            figures["step_frequency"] = _frequency(height[warm:][:, upright])
     return figures
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _run(
+    env: WalkEnv, params: Params, keys: jax.Array, specs: EpisodeSpec, commands: jax.Array, numbers: jax.Array
+) -> tuple[jax.Array, ...]:
+    """Returns what `measure` needs of each step; `numbers` are those of the commands in each step."""
+    width = len(env.skill.commands)
+
+    def one(state: Any, memory: Any, commands: jax.Array) -> Any:
+        state = dataclasses.replace(state, spec=dataclasses.replace(state.spec, commands=commands))
+        robot_state = env.read(state.data)
+        sensed = Proprioception(state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0])
+        _, memory = env.skill.targets(params, memory, commands[:width], sensed)
+        state = env.step(state, memory.action[None])
+        robot_state = env.read(state.data)
+        quaternion = robot_state.quaternion[0]
+        feet = foot_positions(env.robot, robot_state.joint_position[0])
+        height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
+        velocity, yaw_rate = heading_velocity(robot_state)
+        errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]
+        rise = robot_state.position_w[0, 2] - env.robot.stand_height - commands[3]
+        speed = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])[0]
+        moved = robot_state.position_w[0, :2]
+        return state, memory, (errors, rise, speed, moved, height, state.terminated, env.power(state))
+
+    def advance(carry: Any, number: jax.Array) -> Any:
+        state, memory, record = jax.vmap(one)(*carry, commands[number])
+        return (state, memory), record
+
+    state = jax.vmap(lambda key, spec: env.reset(key, spec=spec))(keys, specs)
+    memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
+    return jax.lax.scan(advance, (state, memory), numbers)[1]
+
+
+def _cycles(errors: np.ndarray, alive: np.ndarray, commands: np.ndarray, change: int) -> dict[str, float]:
+    """Returns the root mean squares of the errors (T, N, 3) averaged over a gait cycle.
+
+    Cycles begin at least `WARM_UP` after a change of the commands (K, N, 15), which is every `change` steps, and end
+    before the next one and before a fall.
+    """
+    steps, episodes, _ = errors.shape
+    sums = np.concatenate([np.zeros((1, episodes, 3)), np.cumsum(errors, axis=0, dtype=float)])
+    start = np.arange(steps)[:, None]
+    number = start // change
+    length = np.rint(1.0 / (walk_policy.STEP * commands[number[:, 0], :, 4])).astype(int)
+    end = start + length  # exclusive
+    warm = round(WARM_UP / walk_policy.STEP)
+    whole = (start % change >= warm) & (end <= np.minimum((number + 1) * change, steps))
+    last = np.minimum(end, steps) - 1
+    columns = np.arange(episodes)
+    whole &= alive[last, columns]
+    means = (sums[last + 1, columns] - sums[:-1]) / length[..., None]
+    rms = np.sqrt((np.square(means) * whole[..., None]).sum((0, 1)) / max(whole.sum(), 1))
+    return dict(zip(("vx", "vy", "yaw"), map(float, rms), strict=True))
 
 
 def _frequency(height: np.ndarray) -> float:
@@ -153,9 +232,10 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
-def evaluate_walk(
+def evaluate_skill(
+    skill: str,
     robot: Robot,
-    params: walk_policy.Params,
+    params: Params,
     *,
     impl: str = "auto",
     episodes: int = 1000,
@@ -163,7 +243,7 @@ def evaluate_walk(
     scenarios: Sequence[str] | None = None,
     report: Callable[[str, dict[str, float]], None] | None = None,
 ) -> dict[str, Any]:
-    """Evaluates a robot's walk policy in the named scenarios (all of `SCENARIOS` if None).
+    """Evaluates a robot's skill in the named scenarios (all of `SCENARIOS` that fit it if None).
 
     Returns:
         rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under `scenarios`.
@@ -173,13 +253,12 @@ def evaluate_walk(
     """
     if episodes < 1:
         raise InputError(f"episodes: {episodes} must be at least 1")
-    names = list(SCENARIOS) if scenarios is None else list(scenarios)
+    known = [name for name, scenario in SCENARIOS.items() if skill in scenario.skills]
+    names = known if scenarios is None else list(scenarios)
     for name in names:
-        if name not in SCENARIOS:
-            raise InputError(
-                f"scenario: unknown name {name!r}{nearest(name, SCENARIOS)}; allowed: {', '.join(SCENARIOS)}"
-            )
-    env = make_env(robot, impl, episodes)
+        if name not in known:
+            raise InputError(f"scenario: unknown name {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
+    env = make_env(skill, robot, impl, episodes)
     results = {}
     for name in names:
         results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
@@ -188,6 +267,7 @@ def evaluate_walk(
     top = results.get("flat", {})
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
+        "skill": skill,
         "robot": robot.name,
         "impl": env.physics.impl,
         "episodes": episodes,

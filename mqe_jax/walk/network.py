@@ -1,8 +1,11 @@
-"""The walk policy as a network of the trainer: a window of 30 observations, an adaptation network and a body.
+"""The walking skills as networks of the trainer: a history of observations, and a critic of the privileged one.
 
-The memory is the last 29 observations (29 x 70 numbers). The trainer stores it at the first step of each chunk only,
-and `evaluate` builds the windows of the chunk's steps. The body receives the adaptation network's output without
-gradient; that network is trained by regression on `LATENT_TARGET`.
+The memory is the newest rows of the history but the last one. The trainer stores it at the first step of each chunk
+only, and `evaluate` builds the histories of the chunk's steps.
+
+The walk policy's history is 30 observations; its body receives the adaptation network's output without gradient, and
+that network is trained by regression on `LATENT_TARGET`. The agile skill's is 9 frames, of which its network sees five,
+beside the newest commands and clock.
 
 The left-right symmetry of a quadruped is a loss: a mirrored observation deserves the mirrored action. Mirroring
 exchanges left and right legs and reverses y, roll, yaw and the hip joints. The parameters of the four gaits stay:
@@ -13,14 +16,19 @@ Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import agile, robots, walk_policy
 from mqe_jax.limits import Horizon, NonNegative
-from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
-from mqe_jax.settings import FileName, fail
+from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
+from mqe_jax.settings import FileName, fail, record
+from mqe_jax.skills.weights import Networks
 from mqe_jax.train import devices, nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
@@ -31,69 +39,146 @@ from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 _CRITIC = (512, 256, 128)
 _PRECISION = "tensorfloat32"  # full float32 products over 2100 numbers would take most of an update on a GPU
 
-
-@register_network("walk")
-class WalkNetwork(GaussianSettings):
-    """Settings of the walk policy and its critic, which sees the privileged observation."""
-
-    weights: FileName | None = None
-    """File of walk weights to start from, of any robot; none samples them."""
-    chunk_length: Horizon = 24
-    """Steps of a chunk, at whose first one the history is stored."""
-    adaptation_coef: NonNegative = 1.0
-    """Weight of the adaptation network's regression loss."""
-    symmetry_coef: NonNegative = 0.5
-    """Weight of the loss of left-right symmetry."""
-
-    def build(self, dims: EnvDims) -> Network:
-        """Returns the network; see `Network`."""
-        sizes = (dims.agents, dims.observation, dims.action)
-        if sizes != (1, OBSERVATION_SIZE, walk_policy.BODY_SIZES[-1]):
-            fail("network.name", "walk", "another network, except in the walking environment")
-        return _build(self, dims)
+Mirror = tuple[np.ndarray, np.ndarray]
+"""Source and sign of each number of a mirrored vector."""
 
 
-def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array) -> jax.Array:
-    """Returns the flattened windows (L, C, 2100) of a chunk's steps; observations before an episode's start are zero.
-
-    Args:
-        memory: the 29 observations before the chunk (C, 29, 70).
-        is_first: whether a step is the first of an episode (L, C) bool.
-        obs: observations (L, C, 70).
-    """
-    steps, count = is_first.shape
-    before = jnp.moveaxis(memory, 1, 0)
-    rows = jnp.arange(steps)[:, None] + jnp.arange(HISTORY)
-    episode = jnp.cumsum(is_first, axis=0)
-    of_row = jnp.concatenate([jnp.zeros((len(before), count), episode.dtype), episode])
-    alive = of_row[rows] == episode[:, None]
-    window = jnp.concatenate([before, obs])[rows] * alive[..., None]
-    return jnp.swapaxes(window, 1, 2).reshape(steps, count, -1)
-
-
-_FEET = np.array([1, 0, 3, 2])
-
-
-def _observation() -> tuple[np.ndarray, np.ndarray]:
-    """Returns source (70,) and sign (70,) of each number of a mirrored observation."""
-    signs = np.array([command.mirror for command in walk_policy.COMMANDS], np.float32)
-    blocks: list[tuple[np.ndarray, np.ndarray]] = [
-        (np.arange(3), np.array([1.0, -1.0, 1.0], np.float32)),  # gravity
-        (np.arange(len(signs)), signs),
-        *[(MIRRORED_JOINTS, MIRRORED_SIGNS)] * 4,  # position, velocity, last action, the one before
-        (_FEET, np.ones(4, np.float32)),  # clock
-    ]
+def _mirror(*blocks: Mirror) -> Mirror:
+    """Joins the mirrors of consecutive blocks."""
     starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
     source = np.concatenate([source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)])
     return source, np.concatenate([sign for _, sign in blocks])
 
 
-_SOURCE, _SIGN = _observation()
+def _signs(*signs: float) -> Mirror:
+    return np.arange(len(signs)), np.array(signs, np.float32)
 
 
-def mirror_history(flat: jax.Array) -> jax.Array:
-    """Mirrors flattened histories (..., T x 70)."""
-    return (flat.reshape(*flat.shape[:-1], -1, OBSERVATION_SIZE)[..., _SOURCE] * _SIGN).reshape(flat.shape)
+_GRAVITY, _JOINTS = _signs(1.0, -1.0, 1.0), (MIRRORED_JOINTS, MIRRORED_SIGNS)
+_FEET = np.array([1, 0, 3, 2]), np.ones(4, np.float32)
+_COMMANDS = _signs(*(command.mirror for command in walk_policy.COMMANDS))
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """What the network of a skill has of its own."""
+
+    networks: Networks
+    """Its networks and their files."""
+    rows: np.ndarray
+    """Rows of the history that it sees, from the oldest on; the last one is the newest."""
+    row_size: int
+    """Numbers of an observation that a row has; the others are of the newest observation alone."""
+    infer: Callable[..., tuple[jax.Array, Any]]
+    """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an adaptation network."""
+    mirror: Mirror
+    """Of an input."""
+
+    @property
+    def past(self) -> int:
+        """Rows of the memory."""
+        return int(self.rows[-1])
+
+    def inputs(self, history: jax.Array, obs: jax.Array) -> jax.Array:
+        """Returns inputs (..., n) of rows (..., H, row_size) that the network sees and observations (..., O)."""
+        flat = history.reshape(*history.shape[:-2], -1)
+        return flat if self.row_size == obs.shape[-1] else jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
+
+    def mirrored(self, inputs: jax.Array) -> jax.Array:
+        """Mirrors inputs (..., n)."""
+        return inputs[..., self.mirror[0]] * self.mirror[1]
+
+    def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
+        """Returns the mean square difference () between actions of mirrored inputs and mirrored actions.
+
+        `inputs` are (B, n) and `mean` their actions (B, 12).
+        """
+        other, _ = self.infer(params, self.mirrored(inputs), precision=_PRECISION)
+        return jnp.mean(jnp.square(other - mirror_action(mean)))
+
+
+WALK_FORM = Form(
+    walk_policy.NETWORKS,
+    np.arange(HISTORY),
+    OBSERVATION_SIZE,
+    walk_policy.infer,
+    _mirror(*[_mirror(_GRAVITY, _COMMANDS, _JOINTS, _JOINTS, _JOINTS, _JOINTS, _FEET)] * HISTORY),
+)
+AGILE_FORM = Form(
+    agile.NETWORKS,
+    agile.LENGTH - 1 - np.array(agile.OFFSETS),
+    agile.FRAME_SIZE,
+    lambda params, inputs, precision: (agile.infer(params, inputs, precision=precision), None),
+    _mirror(
+        *[_mirror(_GRAVITY, _JOINTS, _JOINTS, _JOINTS)] * len(agile.OFFSETS),
+        _signs(*(command.mirror for command in agile.COMMANDS)),
+        _signs(-1.0, -1.0),  # the clock: the other pair of feet
+    ),
+)
+
+
+@record
+class HistorySettings(GaussianSettings):
+    """Settings of a walking skill and its critic, which sees the privileged observation."""
+
+    weights: FileName | None = None
+    """File of the skill's weights to start from, of any robot; none samples them."""
+    chunk_length: Horizon = 24
+    """Steps of a chunk, at whose first one the history is stored."""
+    symmetry_coef: NonNegative = 0.5
+    """Weight of the loss of left-right symmetry."""
+
+    def form(self) -> Form:
+        """Returns what the network has of its own."""
+        raise NotImplementedError
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network; see `Network`."""
+        form = self.form()
+        inputs = next(iter(form.networks.widths.values()))[0]
+        expected = inputs - (len(form.rows) - 1) * form.row_size
+        if (dims.agents, dims.observation, dims.action) != (1, expected, NUM_JOINTS):
+            fail("network.name", self.name, "another network, except in the walking environment of that skill")
+        return _build(self, form, dims)
+
+
+@register_network("walk")
+class WalkNetwork(HistorySettings):
+    """Settings of the walk policy and its critic."""
+
+    adaptation_coef: NonNegative = 1.0
+    """Weight of the adaptation network's regression loss."""
+
+    def form(self) -> Form:
+        """Returns what the network has of its own."""
+        return WALK_FORM
+
+
+@register_network("agile")
+class AgileNetwork(HistorySettings):
+    """Settings of the agile skill and its critic."""
+
+    def form(self) -> Form:
+        """Returns what the network has of its own."""
+        return AGILE_FORM
+
+
+def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.ndarray) -> jax.Array:
+    """Returns rows of the histories of a chunk's steps (L, C, H, O); rows before an episode's start are zero.
+
+    Args:
+        memory: the rows before the chunk (C, T, O).
+        is_first: whether a step is the first of an episode (L, C) bool.
+        obs: rows of the chunk (L, C, O).
+        kept: the H rows to return, of the T + 1 of a history.
+    """
+    steps, count = is_first.shape
+    before = jnp.moveaxis(memory, 1, 0)
+    rows = jnp.arange(steps)[:, None] + kept
+    episode = jnp.cumsum(is_first, axis=0)
+    of_row = jnp.concatenate([jnp.zeros((len(before), count), episode.dtype), episode])
+    alive = of_row[rows] == episode[:, None]
+    return jnp.swapaxes(jnp.concatenate([before, obs])[rows] * alive[..., None], 1, 2)
 
 
 def mirror_action(action: jax.Array) -> jax.Array:
@@ -101,22 +186,13 @@ def mirror_action(action: jax.Array) -> jax.Array:
     return action[..., MIRRORED_JOINTS] * MIRRORED_SIGNS
 
 
-def symmetry_loss(params: walk_policy.Params, flat: jax.Array, mean: jax.Array) -> jax.Array:
-    """Returns the mean square difference () between actions of mirrored histories and mirrored actions.
-
-    `flat` are histories (B, 2100) and `mean` their actions (B, 12).
-    """
-    other, _ = walk_policy.infer(params, mirror_history(flat), precision=_PRECISION)
-    return jnp.mean(jnp.square(other - mirror_action(mean)))
-
-
-def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
+def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
     def init(key: jax.Array) -> Params:
         policy_key, critic_key = jax.random.split(key)
         if settings.weights is None:
-            policy = walk_policy.init_params(policy_key)
+            policy = form.networks.init(policy_key)
         else:
-            policy = walk_policy.load_params(robots.get("go1"), settings.weights)
+            policy = form.networks.load(robots.get("go1"), settings.weights)
         return {
             "policy": jax.tree.map(jnp.asarray, policy),
             "log_std": jnp.full(dims.action, settings.log_std_init, jnp.float32),
@@ -127,17 +203,17 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         return {name: params[name] for name in ("policy", "log_std")}
 
     def initial_memory(num_envs: int) -> NetworkMemory:
-        return NetworkMemory(jnp.zeros((num_envs, HISTORY - 1, OBSERVATION_SIZE)), ())
+        return NetworkMemory(jnp.zeros((num_envs, form.past, form.row_size)), ())
 
     def act(
         params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, Memory]:
-        window = jnp.concatenate([memory, obs], axis=-2)
-        flat = window.reshape(*window.shape[:-2], -1)
-        mean, _ = walk_policy.infer(params["policy"], flat, precision=_PRECISION)
+        history = jnp.concatenate([memory, obs[..., : form.row_size]], axis=-2)
+        inputs = form.inputs(history[..., form.rows, :], obs[..., 0, :])
+        mean, _ = form.infer(params["policy"], inputs, precision=_PRECISION)
         log_std = settings.bounded_log_std(params["log_std"])
         action = mean if key is None else mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
-        return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], window[..., 1:, :]
+        return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], history[..., 1:, :]
 
     def value(
         params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
@@ -152,13 +228,16 @@ def _build(settings: WalkNetwork, dims: EnvDims) -> Network:
         privileged: jax.Array,
         action: jax.Array,
     ) -> Evaluation:
-        flat = windows(memory.actor, is_first, obs[..., 0, :])
-        mean, latent = walk_policy.infer(params["policy"], flat, precision=_PRECISION)
+        obs = obs[..., 0, :]
+        inputs = form.inputs(windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs)
+        mean, latent = form.infer(params["policy"], inputs, precision=_PRECISION)
         log_std = jnp.broadcast_to(settings.bounded_log_std(params["log_std"]), mean.shape)
-        error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
-        losses = {"adaptation": settings.adaptation_coef * error}
+        losses = {}
+        if isinstance(settings, WalkNetwork):
+            error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
+            losses["adaptation"] = settings.adaptation_coef * error
         if settings.symmetry_coef > 0:
-            losses["symmetry"] = settings.symmetry_coef * symmetry_loss(params["policy"], flat, mean)
+            losses["symmetry"] = settings.symmetry_coef * form.symmetry_loss(params["policy"], inputs, mean)
         return Evaluation(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),
             entropy(log_std)[..., None],

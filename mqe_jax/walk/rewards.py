@@ -1,4 +1,4 @@
-"""Reward terms for training the walk policy.
+"""Reward terms for training skills that walk.
 
 They follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238): positive terms times the exponential of the sum
 of the negative ones.
@@ -52,7 +52,8 @@ class WalkRewards:
 class RewardInputs:
     """Inputs of the reward terms; shapes and units as in `WalkState`.
 
-    Joint targets: `target`, `previous_target` one step before it, `earlier_target` two steps before it.
+    `phases` are those of the feet (4,). Joint targets: `target`, `previous_target` one step before it, `earlier_target`
+    two steps before it, `applied` the one that the motors had. `tolerance` is that of `WalkTask`.
     """
 
     robot: Robot
@@ -60,12 +61,14 @@ class RewardInputs:
     commands: jax.Array
     error: jax.Array
     mean_error: jax.Array
-    gait: jax.Array
+    phases: jax.Array
     target: jax.Array
     previous_target: jax.Array
     earlier_target: jax.Array
+    applied: jax.Array
     foot_force: jax.Array
     strength: jax.Array
+    tolerance: float
 
 
 _BLUR = 0.07  # of a gait period: standard deviation of the smoothing of desired contacts
@@ -87,7 +90,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     robot, robot_state, commands = inputs.robot, inputs.robot_state, inputs.commands
     quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
     joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
-    phases = walk_policy.foot_phases(inputs.gait, commands)
+    phases, tolerance = inputs.phases, inputs.tolerance
     contact = desired_contact(phases)
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
@@ -115,7 +118,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
     tilt = euler_to_quaternion(jnp.stack([commands[11], commands[10], jnp.zeros(())]))
     wanted_up = rotate_inverse(tilt, jnp.array([0.0, 0.0, 1.0]))
-    torque = inputs.strength * (robot.kp * (inputs.target - joint_position) - robot.kd * joint_velocity)
+    torque = inputs.strength * (robot.kp * (inputs.applied - joint_position) - robot.kd * joint_velocity)
     torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
     margin = 0.05 * (robot.joint_upper - robot.joint_lower)
     beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
@@ -124,10 +127,10 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     on_ground = inputs.foot_force > 1.0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {
-        "track_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.error[:2])) / 0.25),
-        "track_mean_velocity": _closeness(inputs.mean_error[:2], 0.055),
-        "track_yaw": _closeness(inputs.error[2:], 0.14),
-        "track_mean_yaw": _closeness(inputs.mean_error[2:], 0.055),
+        "track_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.error[:2] / (0.5 * tolerance)))),
+        "track_mean_velocity": _closeness(inputs.mean_error[:2], 0.055 * tolerance),
+        "track_yaw": _closeness(inputs.error[2:], 0.14 * tolerance),
+        "track_mean_yaw": _closeness(inputs.mean_error[2:], 0.055 * tolerance),
         "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
         "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
         "body_height": jnp.square(height - robot.stand_height - commands[3]),

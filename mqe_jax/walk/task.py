@@ -1,4 +1,4 @@
-"""Parameters of the walking task, and their sampling."""
+"""Parameters of the walking task of all skills, and their sampling."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from annotated_types import Ge, Le
 
-from mqe_jax import walk_policy
 from mqe_jax.envs.randomization import Randomization, RandomizedParams
 from mqe_jax.envs.state import EnvironmentState
-from mqe_jax.limits import Fraction, Iterations, NonNegative, Time, TimeLimit
-from mqe_jax.robots.robot import Robot
-from mqe_jax.settings import record
+from mqe_jax.limits import Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
+from mqe_jax.settings import Range, record
 from mqe_jax.walk.rewards import WalkRewards
+from mqe_jax.walk.trainees import Trainee
 from mqe_jax.walk_policy import WalkMemory
 
 if TYPE_CHECKING:
@@ -38,12 +36,18 @@ class WalkTask:
     """Time limit, s."""
     command_period: Time = 8.0
     """Interval at which commands, slope and force are resampled, s; 0 never resamples."""
-    max_vx: NonNegative = 1.2
-    """Maximum commanded forward velocity, m/s."""
-    max_vy: NonNegative = 0.7
-    """Maximum commanded lateral velocity, m/s."""
-    max_yaw: NonNegative = 1.2
-    """Maximum commanded yaw rate, rad/s."""
+    vx: Range = (-1.2, 1.2)
+    """Range of the commanded forward velocity, m/s."""
+    vy: Range = (-0.7, 0.7)
+    """Range of the commanded lateral velocity, m/s."""
+    yaw: Range = (-1.2, 1.2)
+    """Range of the commanded yaw rate, rad/s."""
+    turn: Positive | None = None
+    """Maximum product of forward velocity and yaw rate, m/s^2; none sets no bound."""
+    start: Fraction = 1.0
+    """Share of these ranges from which commands are drawn at assistance 1."""
+    tolerance: Positive = 1.0
+    """Factor on the errors at which the tracking terms have half of their value."""
     slope: Annotated[float, Ge(0), Le(1.5)] = 0.32
     """Maximum slope, rad."""
     slope_share: Fraction = 0.5
@@ -54,6 +58,14 @@ class WalkTask:
     """Maximum instantaneous change of the trunk's velocity, m/s."""
     push_period: TimeLimit = 4.0
     """Mean time between pushes, s."""
+    shove: NonNegative = 0.0
+    """Maximum force of a shove at a random point of the trunk, as by a robot or a box, N."""
+    shove_length: Range = (0.2, 1.0)
+    """Duration of a shove, s."""
+    shove_period: TimeLimit = 5.0
+    """Mean time between shoves, s."""
+    action_lag: Annotated[int, Ge(0), Le(1)] = 0
+    """Maximum delay of the joint targets, steps; one sample per episode."""
     randomize: bool = True
     """Whether friction, payload, centre of mass, motors and observations are randomised."""
     solver_iterations: Iterations = 4
@@ -66,22 +78,24 @@ class EpisodeSpec:
     """Commands and disturbances sampled for one episode."""
 
     commands: jax.Array
-    """Commands of the walk policy (15,)."""
+    """Commands of the walk policy (15,); those after the velocity describe the gait that the rewards ask for."""
     slope: jax.Array
     """Inclination of the ground along x and y (2,), rad; positive in x where the ground rises towards +x."""
     force: jax.Array
     """Sustained force on the trunk (2,), N, along its heading and to its left, horizontal."""
     push: jax.Array
     """Instantaneous change of the trunk's velocity at each push (), m/s."""
+    shove: jax.Array
+    """Maximum force of a shove (), N."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WalkState(EnvironmentState):
-    """State of one environment: the walk policy's observation (1, 70), noisy if randomised, and the critic's (P,).
+    """State of one environment: the skill's observation (1, O), noisy if randomised, and the critic's (P,).
 
-    `LATENT_TARGET` of the latter is the regression target of the adaptation network. Slopes, forces and pushes are
-    scaled by 1 - `assistance`.
+    `LATENT_TARGET` of the latter is the regression target of the adaptation network. Slopes, forces, pushes and shoves
+    are scaled by 1 - `assistance`.
     """
 
     data: mjx.Data
@@ -92,54 +106,44 @@ class WalkState(EnvironmentState):
     """Current slope, rate-limited towards the spec's (2,), rad."""
     force: jax.Array
     """Current force, rate-limited towards the spec's (2,), N."""
+    shove: jax.Array
+    """Force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)."""
+    shove_steps: jax.Array
+    """Steps until the current shove ends () int32."""
     random: RandomizedParams
     """Randomised physics parameters."""
     motor_offset: jax.Array
     """Offset added to the joint targets (12,), rad."""
     memory: WalkMemory
-    """Recurrent state of the walk policy: gait phase and last actions; the history is empty."""
+    """Gait phase and last actions; the history is empty."""
     mean_error: jax.Array
     """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
     episode_steps: jax.Array
     """Steps since the reset () int32."""
 
 
-def sample_spec(key: jax.Array, task: WalkTask, robot: Robot, difficulty: jax.Array | float) -> EpisodeSpec:
-    """Samples commands and disturbances; `difficulty` in [0, 1] scales slopes, forces and pushes."""
+def sample_spec(key: jax.Array, task: WalkTask, trainee: Trainee, assistance: jax.Array | float) -> EpisodeSpec:
+    """Samples commands and disturbances."""
     keys = iter(jax.random.split(key, 24))
     uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
     chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
-    velocity = jnp.stack(
-        [uniform(-task.max_vx, task.max_vx), uniform(-task.max_vy, task.max_vy), uniform(-task.max_yaw, task.max_yaw)]
-    )
+    difficulty = 1.0 - assistance
+    share = task.start + (1.0 - task.start) * difficulty
+    velocity = share * jnp.stack([uniform(*task.vx), uniform(*task.vy), uniform(*task.yaw)])
     velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
-    names = ("trot", "pace", "bound", "pronk")
-    gaits = np.array([list(walk_policy.GAITS[name].values()) for name in names], np.float32)
-    gait = jnp.asarray(gaits)[jax.random.categorical(next(keys), jnp.log(jnp.array([0.6, 0.32, 0.04, 0.04])))]
-    varied = chance(0.5)
-    vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
-    default = walk_policy.WalkPolicy(robot).default_commands()
-    width, length = robot.walk.stance_width, robot.walk.stance_length
-    rest = [
-        vary(-0.12, 0.06, default[3]),
-        vary(1.8, 4.2, default[4]),
-        *gait,
-        default[8],
-        vary(0.03, 0.16, default[9]),
-        vary(-0.25, 0.25, default[10]),
-        vary(-0.1, 0.1, default[11]),
-        vary(width - 0.05, width + 0.1, default[12]),
-        vary(length - 0.068, length + 0.012, default[13]),
-        default[14],
-    ]
+    if task.turn is not None:
+        excess = jnp.maximum(jnp.abs(velocity[0] * velocity[2]) / task.turn, 1.0)
+        velocity *= jnp.stack([excess**-0.5, jnp.ones(()), excess**-0.5])
+    commands = trainee.sample(velocity, uniform, chance)
     angle = uniform(-jnp.pi, jnp.pi)
     slope = jnp.where(chance(task.slope_share), uniform(0.0, task.slope), 0.0) * difficulty
     direction = uniform(-jnp.pi, jnp.pi)
     force = jnp.where(chance(0.5), uniform(0.0, task.force), 0.0) * difficulty
     return EpisodeSpec(
-        commands=jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])]),
+        commands=commands,
         slope=slope * jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
         force=force * jnp.stack([jnp.cos(direction), jnp.sin(direction)]),
         push=jnp.asarray(task.push * difficulty),
+        shove=jnp.asarray(task.shove * difficulty),
     )

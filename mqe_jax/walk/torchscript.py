@@ -21,7 +21,7 @@ import numpy as np
 from mqe_jax import limits
 from mqe_jax.files import archive
 from mqe_jax.settings import PathText, checked
-from mqe_jax.walk_policy import Params, nested_params
+from mqe_jax.walk_policy import NETWORKS, Params
 
 _DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}
 _MANGLED = re.compile(r"\.___torch_mangle_\d+")
@@ -134,4 +134,4 @@ def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) ->
     """Reads the official pair of TorchScript checkpoints into this package's weights."""
     flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
     flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}
-    return nested_params(flat, f"{adaptation}, {body}")
+    return NETWORKS.nested(flat, f"{adaptation}, {body}")

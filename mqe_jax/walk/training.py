@@ -1,4 +1,4 @@
-"""Training of the walk policy by `mqe_jax.train`; settings as in walk-these-ways (arXiv 2212.03238) where known."""
+"""Training of skills by `mqe_jax.train`; settings as in walk-these-ways (arXiv 2212.03238) where known."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from pathlib import Path
 
 import jax
 
-from mqe_jax import walk_policy
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.robots.robot import Robot
 from mqe_jax.settings import fail, override, to_mapping
@@ -14,7 +13,7 @@ from mqe_jax.train.config import PPO, Checkpointing, Curriculum, Normalization, 
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.runner import train
 from mqe_jax.walk.env import WalkEnv
-from mqe_jax.walk.network import WalkNetwork
+from mqe_jax.walk.network import HistorySettings, WalkNetwork
 from mqe_jax.walk.task import WalkTask
 
 WALK = TrainConfig(
@@ -36,19 +35,48 @@ WALK = TrainConfig(
 )
 """Settings for training walk weights from nothing; the assistance is the curriculum of slopes, forces and pushes."""
 
+AGILE = override(WALK, {"task": "agile", "total_steps": 160_000_000, "network": {"name": "agile"}})
+"""Settings for training the agile skill from nothing; the assistance is the curriculum of commands and disturbances."""
 
-def train_walk(
-    robot: Robot, run_dir: Path, config: TrainConfig, task: WalkTask | None = None, *, impl: str, resume: bool
+AGILE_TASK = WalkTask(
+    vx=(-1.5, 2.5),
+    vy=(-1.0, 1.0),
+    yaw=(-2.5, 2.5),
+    turn=3.0,
+    start=0.35,
+    tolerance=2.0,
+    command_period=4.0,
+    slope=0.15,
+    shove=100.0,
+    action_lag=1,
+)
+"""The walking task of the agile skill: fast commands, shoves as in contact with robots and boxes, gentle slopes."""
+
+SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {"walk": (WALK, WalkTask()), "agile": (AGILE, AGILE_TASK)}
+"""Settings and task of each skill that can be trained."""
+
+
+def train_skill(
+    skill: str,
+    robot: Robot,
+    run_dir: Path,
+    config: TrainConfig,
+    task: WalkTask | None = None,
+    *,
+    impl: str,
+    resume: bool,
 ) -> TrainState:
-    """Trains walk weights and writes them to walk.safetensors (float16) in the run folder, at every checkpoint.
+    """Trains a skill's weights and writes them to SKILL.safetensors (float16) in the run folder, at every checkpoint.
 
-    `config` are settings such as `WALK`; run folder, resuming and errors are those of `mqe_jax.train.runner.train`.
+    `config` and `task` are like those of `SETTINGS`; run folder, resuming and errors are those of
+    `mqe_jax.train.runner.train`.
     """
     if config.opponents:
         fail("opponents", list(config.opponents), "empty: walking is not a match")
-    task = task or WalkTask()
+    network, task = config.network, task or SETTINGS[skill][1]
+    assert isinstance(network, HistorySettings)
     config = override(config, {"env": {"robot": robot.name, **to_mapping(task)}})
-    env = WalkEnv(robot, task, impl=impl, num_envs=config.num_envs)
+    env = WalkEnv(robot, task, skill=skill, impl=impl, num_envs=config.num_envs)
 
     def save(state: TrainState, row: dict[str, float]) -> None:
         updates = int(row["updates"])
@@ -56,7 +84,8 @@ def train_walk(
             return
         if updates % config.checkpoint.every == 0 or updates == config.num_updates:
             about = {"robot": robot.name, "env_steps": int(row["env_steps"])}
-            walk_policy.save_params(state.params["policy"], run_dir / "walk.safetensors", about, half=True)
+            weights = run_dir / f"{skill}.safetensors"
+            network.form().networks.save(state.params["policy"], weights, about, half=True)
 
     batch = VectorEnv(env, config.num_envs)  # pyright: ignore[reportArgumentType]: no task, but all that a batch uses
     return train(batch, config, run_dir, resume, on_update=save)

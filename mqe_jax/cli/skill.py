@@ -1,11 +1,11 @@
-"""The commands `walk eval` and `walk convert`."""
+"""The commands `skill eval` and `skill convert`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -16,9 +16,11 @@ from mqe_jax.settings import record
 
 
 @record
-class WalkEval:
-    """Evaluate the walk policy: command tracking and falls."""
+class SkillEval:
+    """Evaluate a skill: command tracking, disturbances, falls, energy."""
 
+    skill: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SKILL")]
+    """Name of the skill: walk or agile."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Weights to evaluate. Default: the shipped ones."""
     json: Json = False
@@ -31,18 +33,20 @@ class WalkEval:
     seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
-        """Evaluates the walk policy; prints a table, or returns the object for `--json`."""
+        """Evaluates the skill; prints a table, or returns the object for `--json`."""
 
-        from mqe_jax import robots, walk_policy
-        from mqe_jax.walk.evaluation import evaluate_walk
+        from mqe_jax import robots
+        from mqe_jax.walk import trainees
+        from mqe_jax.walk.evaluation import evaluate_skill
 
         def report(name: str, figures: Mapping[str, float]) -> None:
-            echo(f"walk: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
+            echo(f"{self.skill}: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
 
         robot = robots.get(self.robot)
-        result = evaluate_walk(
+        result = evaluate_skill(
+            self.skill,
             robot,
-            walk_policy.load_params(robot, self.weights),
+            trainees.make(self.skill, robot).skill.load_params(self.weights),
             impl=self.impl,
             episodes=self.episodes,
             seed=self.seed,
@@ -55,9 +59,11 @@ class WalkEval:
 
 
 @record
-class WalkConvert:
-    """Convert official TorchScript checkpoints of walk-these-ways to this package's weights."""
+class SkillConvert:
+    """Convert official TorchScript checkpoints of walk-these-ways to weights of the walk policy."""
 
+    skill: Annotated[tyro.conf.Positional[Literal["walk"]], tyro.conf.arg(metavar="SKILL")]
+    """Name of the skill: walk."""
     adaptation: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ADAPTATION.jit")]
     """Adaptation module, such as adaptation_module_latest.jit."""
     body: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY.jit")]

@@ -1,0 +1,120 @@
+"""Networks of skills: named parts, each a chain of linear layers with an ELU between them, and their weight files.
+
+A layer is named `part.index` with even indices, as in torch's `Sequential`; its weight is (outputs, inputs).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.errors import InputError
+from mqe_jax.files import check_locks, linear_layers, read_tensors, write_atomically
+from mqe_jax.robots.robot import Robot
+from mqe_jax.settings import PathText, check
+
+ASSETS = pathlib.Path(__file__).parents[1] / "assets"
+Params = dict[str, dict[str, dict[str, jax.Array]]]
+
+
+def layers(params: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str, first: int = 0) -> jax.Array:
+    """Applies the layers from number `first` on to x (..., n), with an ELU before each but number 0."""
+    for name in sorted(params, key=int)[first:]:
+        x = x if name == "0" else jax.nn.elu(x)
+        x = jnp.matmul(x, params[name]["weight"].T, precision=precision) + params[name]["bias"]
+    return x
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """The networks of a skill."""
+
+    skill: str
+    """Name of the skill."""
+    title: str
+    """What messages call it."""
+    widths: Mapping[str, tuple[int, ...]]
+    """Widths of each part from input to output, by name; the last part outputs the action."""
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Inputs and outputs of each layer, by `part.index`."""
+        chains = ((part, itertools.pairwise(widths)) for part, widths in self.widths.items())
+        return {f"{part}.{2 * i}": sizes for part, chain in chains for i, sizes in enumerate(chain)}
+
+    def init(self, key: jax.Array) -> Params:
+        """Samples initial weights: uniform as in torch's linear layers, those of the action layer scaled by 0.1."""
+        params: Params = {part: {} for part in self.widths}
+        for name, (n_in, n_out) in self.sizes.items():
+            part, layer = name.split(".")
+            key, w_key, b_key = jax.random.split(key, 3)
+            bound = n_in**-0.5
+            last = name == list(self.sizes)[-1]
+            weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (0.1 if last else 1.0)
+            bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (0.0 if last else 1.0)
+            params[part][layer] = {"weight": weight, "bias": bias}
+        return params
+
+    def nested(self, flat: Mapping[str, np.ndarray], source: str) -> Params:
+        """Returns flat weights as nested float32 arrays.
+
+        Raises:
+            InputError: for missing or unexpected names, or other shapes; the message names `source`.
+        """
+        params: Params = {part: {} for part in self.widths}
+        for name, arrays in linear_layers(f"{self.title} {source}", flat, self.sizes).items():
+            part, layer = name.split(".")
+            params[part][layer] = jax.device_put(arrays)
+        return params
+
+    def load(self, robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
+        """Reads weights as float32 from a safetensors file; those shipped for the robot if `path` is None.
+
+        Raises:
+            InputError: if the file is missing, damaged, or holds other names or shapes.
+        """
+        shipped = ASSETS / f"{self.skill}_{robot.walk.weights}.safetensors"
+        file = pathlib.Path(check("weights", path, PathText)) if path is not None else shipped
+        train = f"train it with 'mqe skill train {self.skill} --robot {robot.name}'"
+        if not file.is_file() and path is None:
+            raise InputError(
+                f"{self.title}: no weights are shipped for {robot.name} (assets/{file.name}); {train} and give them as "
+                "skill_weights=FILE, or use control 'position' or 'torque'"
+            )
+        if not file.is_file():
+            raise InputError(f"{self.title}: no file {file}; {train}")
+        return self.nested(read_tensors(file, self.title), str(file))
+
+    def save(
+        self,
+        params: Params,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        half: bool = False,
+    ) -> None:
+        """Writes weights and metadata to a safetensors file, atomically; with `half`, rounded to float16."""
+        from safetensors.numpy import save
+
+        flat = {
+            f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16 if half else np.float32)
+            for part, layers in params.items()
+            for layer, arrays in layers.items()
+            for kind, array in arrays.items()
+        }
+        file = pathlib.Path(path)
+        check_locks(file)
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(file, save(flat, {"about": json.dumps(dict(metadata or {}))}))
+        except OSError as error:
+            raise InputError(f"{self.title}: cannot write {file}: {error.strerror}") from None

@@ -1,0 +1,120 @@
+"""The skills that the walking task trains: their observations, their gaits, and what they shall be good at."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax import agile, walk_policy
+from mqe_jax.errors import InputError, nearest
+from mqe_jax.robots.index import Proprioception
+from mqe_jax.robots.robot import Robot
+from mqe_jax.skills import Skill
+from mqe_jax.walk_policy import WalkMemory, WalkPolicy
+
+Draw = Callable[[float, float], jax.Array]
+Chance = Callable[[float], jax.Array]
+
+
+class Trainee(abc.ABC):
+    """A skill of a robot, as the walking environment trains it.
+
+    Commands are those of the walk policy (15,): the velocity, which every skill is given, and the gait that the rewards
+    ask for.
+    """
+
+    skill: Skill
+    observation_size: int
+    """Length of the skill's own observation of one step, from which its network gathers its history."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    @abc.abstractmethod
+    def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
+        """Returns commands (15,) with a velocity (3,); `uniform(low, high)` and `chance(p)` draw random numbers."""
+
+    @abc.abstractmethod
+    def observe(self, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
+        """Builds the observation of one step."""
+
+    @abc.abstractmethod
+    def foot_phases(self, gait: jax.Array, commands: jax.Array) -> jax.Array:
+        """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above."""
+
+
+class Walk(Trainee):
+    """The walk policy, with gaits drawn at random."""
+
+    observation_size = walk_policy.OBSERVATION_SIZE
+
+    def __init__(self, robot: Robot) -> None:
+        super().__init__(robot)
+        self.skill = WalkPolicy(robot)
+
+    def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
+        names, odds = ("trot", "pace", "bound", "pronk"), (0.6, 0.92, 0.96)
+        gaits = np.array([list(walk_policy.GAITS[name].values()) for name in names], np.float32)
+        gait = jnp.asarray(gaits)[jnp.sum(uniform(0.0, 1.0) >= jnp.array(odds))]
+        varied = chance(0.5)
+        vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
+        default = self.skill.default_commands()
+        width, length = self.robot.walk.stance_width, self.robot.walk.stance_length
+        rest = [
+            vary(-0.12, 0.06, default[3]),
+            vary(1.8, 4.2, default[4]),
+            *gait,
+            default[8],
+            vary(0.03, 0.16, default[9]),
+            vary(-0.25, 0.25, default[10]),
+            vary(-0.1, 0.1, default[11]),
+            vary(width - 0.05, width + 0.1, default[12]),
+            vary(length - 0.068, length + 0.012, default[13]),
+            default[14],
+        ]
+        return jnp.concatenate([velocity, jnp.stack([jnp.asarray(x, jnp.float32) for x in rest])])
+
+    def observe(self, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
+        return walk_policy.observe(self.robot, memory, commands, sensed)
+
+    def foot_phases(self, gait: jax.Array, commands: jax.Array) -> jax.Array:
+        return walk_policy.foot_phases(gait, commands)
+
+
+class Agile(Trainee):
+    """The agile skill, which trots at a frequency that its velocity command decides."""
+
+    observation_size = agile.FRAME_SIZE + agile.NOW_SIZE
+
+    def __init__(self, robot: Robot) -> None:
+        super().__init__(robot)
+        self.skill = agile.AgileSkill(robot)
+
+    def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
+        return self.commands(velocity)
+
+    def commands(self, velocity: jax.Array) -> jax.Array:
+        """Returns the commands (15,) of the trot with a velocity (3,)."""
+        default = jnp.asarray(WalkPolicy(self.robot).default_commands("trot"))
+        return default.at[:3].set(velocity).at[4].set(agile.frequency(velocity))
+
+    def observe(self, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
+        frame = agile.frame(self.robot, sensed, memory.action)
+        return jnp.concatenate([frame, agile.now(memory.gait, commands[:3])])
+
+    def foot_phases(self, gait: jax.Array, commands: jax.Array) -> jax.Array:
+        return agile.foot_phases(gait, commands[:3])
+
+
+TRAINEES: dict[str, type[Trainee]] = {"walk": Walk, "agile": Agile}
+
+
+def make(name: str, robot: Robot) -> Trainee:
+    """Returns a skill of a robot to train; InputError for the name of another one."""
+    if name not in TRAINEES:
+        raise InputError(f"skill: {name!r} cannot be trained{nearest(name, TRAINEES)}; allowed: {', '.join(TRAINEES)}")
+    return TRAINEES[name](robot)
