@@ -35,7 +35,10 @@ WALK = TrainConfig(
 )
 """Settings for training walk weights from nothing; the assistance is the curriculum of slopes, forces and pushes."""
 
-AGILE = override(WALK, {"task": "agile", "total_steps": 160_000_000, "network": {"name": "agile"}})
+AGILE = override(
+    WALK,
+    {"task": "agile", "total_steps": 160_000_000, "network": {"name": "agile"}, "curriculum.assistance_until": 0.5},
+)
 """Settings for training the agile skill from nothing; the assistance is the curriculum of commands and disturbances."""
 
 AGILE_TASK = WalkTask(
@@ -43,7 +46,7 @@ AGILE_TASK = WalkTask(
     vy=(-1.0, 1.0),
     yaw=(-2.5, 2.5),
     turn=3.0,
-    start=0.35,
+    start=0.5,
     tolerance=2.0,
     command_period=4.0,
     slope=0.15,
