@@ -18,7 +18,7 @@ import mqe_jax
 from mqe_jax import build, cli
 from mqe_jax.cli import arguments, profile
 from mqe_jax.cli.profile import Operation
-from mqe_jax.cli.train import parse_train, parse_walk_train
+from mqe_jax.cli.train import parse_skill_train, parse_train
 from mqe_jax.envs import QuadrupedEnv, make
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
@@ -27,7 +27,7 @@ from mqe_jax.settings import override
 from mqe_jax.train import checkpoint
 from mqe_jax.train.mat import Mat
 from mqe_jax.viz import recording, render
-from mqe_jax.walk.training import WALK
+from mqe_jax.walk.training import SETTINGS
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 
@@ -245,10 +245,17 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
     parsed = parse_train(["--network.name", "mat", "--network.heads", "2", "go1gate", "--checkpoint.no-environments"])
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
     assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
-    walk = parse_walk_train(
-        ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--num-envs", "16"]
-    ).settings
-    assert walk == override(WALK, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0, "num_envs": 16})
+    flags = ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--task.vx", "-1", "2"]
+    for skill, (settings, task) in SETTINGS.items():
+        parsed = parse_skill_train([skill, *flags])
+        assert parsed.settings == override(settings, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0})
+        assert parsed.task == override(task, {"vx": (-1.0, 2.0)})
+
+
+def test_walk_commands_are_those_of_the_skill_walk() -> None:
+    assert arguments.unaliased(["walk", "eval", "--json"]) == ["skill", "eval", "walk", "--json"]
+    assert arguments.unaliased(["walk", "--help"]) == ["skill", "--help"]
+    assert arguments.parse(["walk", "eval", "--seed", "3"]) == arguments.parse(["skill", "eval", "walk", "--seed", "3"])
 
 
 @pytest.mark.parametrize(

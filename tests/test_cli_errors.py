@@ -117,6 +117,7 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd:
         (["train", "fake", "--network.hidden-sizes", "8", "0"], ["network: hidden_sizes.1: 0"]),
         (["train", "fake", "--network.heads", "2"], ["--network.heads"]),
         (["walk", "train", "--ppo.clp", "1"], ["--ppo.clp", "Perhaps you meant: --ppo.clip"]),
+        (["skill", "train", "agil"], ["skill: 'agil' is not allowed", "walk or agile"]),
         (["train", "fake", "--seed", "99999999999999999999"], ["seed: 99999999999999999999", "4294967296"]),
     ],
     ids=str,

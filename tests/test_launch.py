@@ -66,7 +66,7 @@ def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.Captur
 @pytest.mark.parametrize("command", [[], ["eval", "go1gate"], ["walk", "eval"]])
 def test_a_command_that_cannot_be_launched(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["launch", "--processes", "2", *command]) == 2
-    said = f"command: {' '.join(command)!r} is not allowed; it must be train, walk train or sweep"
+    said = f"command: {' '.join(command)!r} is not allowed; it must be train, skill train or sweep"
     assert said in capfd.readouterr().err
 
 

@@ -22,11 +22,12 @@ from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.types import NetworkMemory
 from mqe_jax.walk.env import WalkEnv
-from mqe_jax.walk.network import WalkNetwork, mirror_action, mirror_history, symmetry_loss, windows
+from mqe_jax.walk.network import WALK_FORM, WalkNetwork, mirror_action, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
 from tests.training import Probe, random_params
 
+ALL = np.arange(walk_policy.HISTORY)
 DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
 
 
@@ -45,8 +46,8 @@ def test_windows_are_the_histories_kept_step_by_step() -> None:
         starts.append(before)
     for start in (0, 20):
         chunk = slice(start, start + 20)
-        found = windows(jnp.asarray(starts[start]), jnp.asarray(is_first[chunk]), jnp.asarray(obs[chunk]))
-        np.testing.assert_array_equal(found, np.stack(kept[chunk]))
+        found = windows(jnp.asarray(starts[start]), jnp.asarray(is_first[chunk]), jnp.asarray(obs[chunk]), ALL)
+        np.testing.assert_array_equal(found.reshape(20, envs, -1), np.stack(kept[chunk]))
 
 
 def waves(hidden: jax.Array, step: jax.Array) -> jax.Array:
@@ -114,7 +115,9 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
         gradient, loss = jax.grad(log_prob, has_aux=True)(params)
         return loss, gradient["policy"]["adaptation"]
 
-    _, latent = walk_policy.infer(params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0]))
+    _, latent = walk_policy.infer(
+        params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0], ALL).reshape(3, 2, -1)
+    )
     error = np.square(latent - privileged[..., -2:]).mean()
     loss, policy_gradient = evaluated(params)
     assert float(loss) == pytest.approx(float(error), rel=1e-5)
@@ -176,13 +179,13 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
         other[Y_AND_ROTATIONS] *= -1.0
         left = observation(joints, gravity, commands, 0.15)
         right = observation(mirrored, gravity * [1, -1, 1], other, 0.65)
-        np.testing.assert_allclose(mirror_history(jnp.asarray(left)), right, atol=1e-5)
+        np.testing.assert_allclose(WALK_FORM.mirrored(jnp.tile(left, 30))[:70], right, atol=1e-5)
 
 
 def test_mirroring_twice_changes_nothing() -> None:
     history = jax.random.normal(jax.random.PRNGKey(0), (3, 2100))
     action = jax.random.normal(jax.random.PRNGKey(1), (3, 12))
-    np.testing.assert_array_equal(mirror_history(mirror_history(history)), history)
+    np.testing.assert_array_equal(WALK_FORM.mirrored(WALK_FORM.mirrored(history)), history)
     np.testing.assert_array_equal(mirror_action(mirror_action(action)), action)
 
 
@@ -192,7 +195,7 @@ def test_descending_the_loss_makes_a_policy_symmetric() -> None:
 
     @jax.jit
     def loss(params: walk_policy.Params) -> jax.Array:
-        return symmetry_loss(params, flat, walk_policy.infer(params, flat)[0])
+        return WALK_FORM.symmetry_loss(params, flat, walk_policy.infer(params, flat)[0])
 
     before = float(loss(params))
     for _ in range(30):

@@ -37,7 +37,13 @@ WALK = TrainConfig(
 
 AGILE = override(
     WALK,
-    {"task": "agile", "total_steps": 160_000_000, "network": {"name": "agile"}, "curriculum.assistance_until": 0.5},
+    {
+        "task": "agile",
+        "num_envs": 4096,
+        "total_steps": 160_000_000,
+        "network": {"name": "agile"},
+        "curriculum.assistance_until": 0.5,
+    },
 )
 """Settings for training the agile skill from nothing; the assistance is the curriculum of commands and disturbances."""
 
