@@ -48,7 +48,7 @@ def test_the_network_sees_frames_of_five_steps_the_commands_and_the_clock() -> N
         )  # fmt: skip
         action = np.asarray(agile.infer(PARAMS, jnp.asarray(x, jnp.float32)))
         target, memory = act(PARAMS, memory, command, now)
-        np.testing.assert_allclose(target, GO1.joint_targets(action), atol=1e-5)
+        np.testing.assert_allclose(target, GO1.joint_targets(jnp.asarray(action)), atol=1e-5)
         gait = (gait + 0.02 * float(agile.frequency(command))) % 1.0
         assert float(memory.gait) == pytest.approx(gait, abs=1e-5)
 

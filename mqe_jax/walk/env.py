@@ -284,7 +284,7 @@ class WalkEnv:
         up = jax.random.uniform(up_key, (), minval=-0.3, maxval=0.3)
         size = state.spec.shove * jax.random.uniform(size_key, ())
         force = size * jnp.stack([jnp.cos(angle), jnp.sin(angle), up])
-        point = SHOVED * jax.random.uniform(point_key, (3,), minval=-1.0, maxval=1.0)
+        point = jnp.asarray(SHOVED) * jax.random.uniform(point_key, (3,), jnp.float32, -1.0, 1.0)
         arm = rotate(state.data.qpos[self.index.base_qpos[0, 3:]], point)
         length = jax.random.uniform(length_key, (), minval=self.task.shove_length[0], maxval=self.task.shove_length[1])
         current = jnp.where(state.shove_steps > 0, state.shove, 0.0)

@@ -192,7 +192,8 @@ def _run(
         return state, memory, (errors, rise, speed, moved, height, state.terminated, env.power(state))
 
     def advance(carry: Any, number: jax.Array) -> Any:
-        state, memory, record = jax.vmap(one)(*carry, commands[number])
+        state, memory = carry
+        state, memory, record = jax.vmap(one)(state, memory, commands[number])
         return (state, memory), record
 
     state = jax.vmap(lambda key, spec: env.reset(key, spec=spec))(keys, specs)
