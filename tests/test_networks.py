@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.agile import FRAME_SIZE, NOW_SIZE
 from mqe_jax.build import base_config, preset
 from mqe_jax.cli.train import parse_train
 from mqe_jax.errors import InputError
@@ -216,6 +217,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     ],
     "mat": [{"width": 8, "heads": 2, "blocks": 1}],
     "walk": [{"chunk_length": 2}],
+    "agile": [{"chunk_length": 2}],
 }
 """Settings of every registered network."""
 CASES = [
@@ -227,7 +229,7 @@ CASES = [
     for name in VARIANTS
     for number, settings in enumerate(VARIANTS[name])
 ]
-"""The first settings of the feed-forward network; the others, MAT and the walk policy, in the soak."""
+"""The first settings of the feed-forward network; the others, MAT and the skills, in the soak."""
 
 
 def pay_each(hidden: jax.Array, action: jax.Array) -> jax.Array:
@@ -243,8 +245,9 @@ def show_widely(width: int, hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 def probe(network: str) -> Any:
     """Environments of the sizes that a network needs, with the attributes that the viewer and the export read."""
-    agents = 1 if network == "walk" else 2
-    width = OBSERVATION_SIZE - agents if network == "walk" else 5
+    skilled = {"walk": OBSERVATION_SIZE, "agile": FRAME_SIZE + NOW_SIZE}
+    agents = 1 if network in skilled else 2
+    width = skilled[network] - agents if network in skilled else 5
     show = functools.partial(show_widely, width)
     teams = (tuple(range(agents)),)
     env = Probe(show, pay_each, 4, agents, action_size=12, features=width, max_episode_steps=3, teams=teams)
