@@ -11,6 +11,7 @@ import contextlib
 import os
 import select
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -42,10 +43,10 @@ def install() -> None:
     if threading.current_thread() is not threading.main_thread():
         return
     wanted = [number for number in _WORDS if signal.getsignal(number) is not signal.SIG_IGN]
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
+    reader, writer = socket.socketpair()  # Windows has pipes that block only
+    writer.setblocking(False)
     threading.Thread(target=_watch, args=(reader, wanted), name="interrupts", daemon=True).start()
-    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
     for number in wanted:
         signal.signal(number, lambda number, frame: None)
 
@@ -86,16 +87,16 @@ def settle() -> None:
 def end() -> NoReturn:
     """Ends the process as SIGTERM does, and its main thread here."""
     if not _ending.is_set():
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)  # `os.kill` of Windows runs no handler
     while True:
         threading.Event().wait()
 
 
-def _watch(reader: int, wanted: Sequence[int]) -> None:
-    """Waits for signals; the wake-up file has the number of each as a byte."""
+def _watch(reader: socket.socket, wanted: Sequence[int]) -> None:
+    """Waits for signals; the wake-up socket has the number of each as a byte."""
     began = 0.0
     while True:
-        for number in os.read(reader, 64):
+        for number in reader.recv(64):
             if number not in wanted:
                 continue
             if not _ending.is_set():
@@ -121,7 +122,8 @@ def _end(number: int) -> None:
 def _exit(number: int, *said: str) -> None:
     text = line("; ".join([f"mqe: {_WORDS[signal.Signals(number)]}", *said]))
     with contextlib.suppress(OSError):
-        if select.select([], [2], [], 1.0)[1]:  # a reader that has stopped would block for ever
+        # A reader that has stopped would block for ever; Windows selects sockets only.
+        if os.name != "posix" or select.select([], [2], [], 1.0)[1]:
             os.write(2, f"{text}\n".encode())
     for path in tuple(temporaries):
         with contextlib.suppress(OSError):

@@ -17,12 +17,15 @@ as a number) are accepted, bytes are not; "none" means None for an optional fiel
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
 import math
 import os
 import re
+import textwrap
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -74,6 +77,9 @@ def record(cls: type[T]) -> type[T]:
     Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
     of nested records are prefixed with their path. A subclass of a record must be decorated too.
     """
+    if cls.__doc__ is None:  # `python -OO`; tyro reads the fields' docstrings from the source too
+        with contextlib.suppress(OSError):  # no source
+            cls.__doc__ = ast.get_docstring(ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0])  # type: ignore
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)

@@ -52,7 +52,10 @@ COMMANDS: dict[str, Any] = {
 
 def overview(group: str = "") -> str:
     """Returns the text of `mqe --help`, or of a group of commands."""
-    about = {name: kind if isinstance(kind, str) else kind.__doc__.splitlines()[0] for name, kind in COMMANDS.items()}
+    about = {
+        name: kind if isinstance(kind, str) else (kind.__doc__ or name).splitlines()[0]
+        for name, kind in COMMANDS.items()
+    }
     lines = "\n".join(f"  {name:12} {line}" for name, line in about.items() if name.startswith(group))
     return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 

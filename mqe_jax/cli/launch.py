@@ -78,6 +78,8 @@ class Launch:
             InputError: for flags that do not fit together.
             SystemExit: with the exit code of the first process that failed.
         """
+        if os.name != "posix":
+            raise InputError(f"launch: {sys.platform} is not supported; it needs Linux or macOS")
         code = _supervise(self.command, self._members(), together=not self._sweeps)
         if code:
             raise SystemExit(code)

@@ -1,0 +1,66 @@
+"""Machines that lack what a Linux workstation has: POSIX, a home folder, a GL library, docstrings."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_env import SMALL
+
+TESTS = Path(__file__).parent
+NO_POSIX = """
+import os, signal, sys
+for name in ("fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tty"):
+    sys.modules[name] = None
+import asyncio, matplotlib.pyplot, multiprocessing, platform, shutil, subprocess, tempfile, tyro
+import jax.numpy, mujoco, PIL.Image
+platform.uname()
+GONE = {
+    os: "chown fork getuid geteuid killpg mkfifo register_at_fork sched_getaffinity set_blocking setsid statvfs "
+        "sysconf uname O_CLOEXEC O_DIRECTORY O_NOFOLLOW O_NONBLOCK",
+    signal: "SIGALRM SIGCHLD SIGHUP SIGKILL SIGPIPE SIGQUIT SIGUSR1",
+}
+for module, names in GONE.items():
+    for name in names.split():
+        delattr(module, name)
+"""
+"""Takes from a Python what Windows lacks, once libraries that look at the platform are imported."""
+MQE = """
+sys.path.insert(0, {tests!r})
+import fake_env
+fake_env.build.make_env = fake_env.make_env
+from mqe_jax.cli import main
+for line in {lines!r}:
+    sys.argv = ["mqe", *line]
+    assert main() == 0, line
+"""
+
+
+def run(code: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, **options)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done
+
+
+def test_nothing_needs_posix(tmp_path: Path) -> None:
+    """Training in one process, evaluation and rendering."""
+    lines = [
+        ["train", "fake", "--run-dir", "run", *SMALL],
+        ["eval", "fake", "--policy", "run", "--episodes", "4"],
+        ["render", "fake", "--policy", "run", "-o", "clip.gif", "--seconds", "0.1"],
+    ]
+    run(NO_POSIX + MQE.format(tests=str(TESTS), lines=lines), tmp_path)
+    assert (tmp_path / "clip.gif").stat().st_size and len(
+        (tmp_path / "run" / "metrics.csv").read_text().splitlines()
+    ) == 3
+
+
+@pytest.mark.parametrize("words", [["--help"], ["walk", "--help"], ["render", "--help"], ["walk", "train", "--help"]])
+def test_help_is_the_same_without_docstrings(words: list[str], tmp_path: Path) -> None:
+    code = f"import sys; from mqe_jax.cli import main; sys.argv = ['mqe', *{words!r}]; sys.exit(main())"
+    plain, optimized = (run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": level}).stdout for level in ("", "2"))
+    assert optimized == plain
