@@ -8,7 +8,7 @@ import json
 import os
 import platform
 import re
-import shutil
+import secrets
 import stat
 import tempfile
 import time
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
-_TEMPORARY = re.compile(r"\..+?(?:\.([0-9a-f]{8}))?\.(\d+)\.tmp(?:\.\w+)?")  # host, process
+_TEMPORARY = re.compile(r"\.mqe-([0-9a-f]{8})-(\d+)-[0-9a-f]{16}\.tmp(\.\w+)?")  # host, process
 _ABANDONED = 3600.0  # s after its last change another host's temporary file counts as left
 _TAGS = {f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")}
-LOCK = ".lock"
+LOCK = ".mqe.lock"
 """Name of the file that a process locks in a run folder."""
 _locks: dict[Path, os.stat_result] = {}  # folders that this process has locked, with the lock file of each
 
@@ -41,15 +41,17 @@ _locks: dict[Path, os.stat_result] = {}  # folders that this process has locked,
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary name in the same folder, with the same suffix, which is renamed to `path` at the end.
+    """Yields a new file of the same folder and suffix, with a name that nobody can know, renamed to `path` at the end.
 
-    The temporary file is removed if this fails, or a signal ends the process. An OSError names `path`.
+    The file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
-    temporary = temporary_name(path)
+    unique = f"{_HOST}-{os.getpid()}-{secrets.token_hex(8)}"
+    temporary = path.with_name(f".mqe-{unique}.tmp{path.suffix}")
     check_locks(path)
     interrupts.temporaries.add(temporary)
     try:
         with naming(path):
+            os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
             yield temporary
             check_locks(path)
             os.replace(temporary, path)
@@ -77,10 +79,14 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Appends to a file, which it creates where there is none; an OSError names it."""
+    """Appends to a file, which it creates where there is none; an OSError names it, also where it is a link."""
     check_locks(path)
-    with naming(path), path.open("ab") as file:
+    with naming(path), open(path, "ab", opener=_without_links) as file:
         file.write(content)
+
+
+def _without_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def make_folder(path: Path) -> None:
@@ -100,22 +106,17 @@ def check_locks(path: Path) -> None:
             raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
 
 
-def temporary_name(path: Path) -> Path:
-    """Returns the name under which this process writes a file or folder, as `remove_temporaries` knows it."""
-    return path.with_name(f".{path.stem}.{_HOST}.{os.getpid()}.tmp{path.suffix}")
-
-
 def remove_temporaries(folder: Path) -> None:
-    """Removes the temporary files and folders that processes which have ended left in a folder.
+    """Removes the files of `replacing` that processes which have ended left in a folder; links are not followed.
 
     Whether one of another host has ended is not known here: what it left goes an hour after its last change.
     """
-    for path in folder.glob(".*.tmp*"):
+    for path in () if folder.is_symlink() else folder.glob(".mqe-*.tmp*"):
         match = _TEMPORARY.fullmatch(path.name)
         if match and path not in interrupts.temporaries and not _alive(int(match[2])):
             with contextlib.suppress(OSError):
-                if match[1] == _HOST or time.time() - path.stat().st_mtime > _ABANDONED:
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+                if match[1] == _HOST or time.time() - path.lstat().st_mtime > _ABANDONED:
+                    path.unlink()
 
 
 def _alive(process: int) -> bool:

@@ -9,7 +9,6 @@ import math
 import os
 import resource
 import struct
-import tarfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,13 +18,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from mqe_jax import cli, limits
+from mqe_jax import limits
 from mqe_jax.cli.options import parse_overrides
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.files import parse_json, parse_yaml, read_rows, read_tensors
 from mqe_jax.settings import build
-from mqe_jax.study import pack as packing
 from mqe_jax.study.runs import read_curve
 from mqe_jax.train import checkpoint
 from mqe_jax.train.config import TrainConfig, load_config
@@ -261,47 +259,3 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
 
 
 # -- what is packed for another machine --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("words", "content", "message"),
-    [
-        ([], b"", "folders"),
-        (["none"], b"", "none has no run"),
-        (["study"], b"\xff\xfe", "metrics.csv: damaged, or not a CSV file"),
-        (["study", "--megabytes", "1e-6"], b"a\n1\n", "files of 1e-06 MiB have no room for study/"),
-        (["study"], None, "not a regular file"),
-    ],
-)
-def test_what_cannot_be_packed_leaves_the_folder_as_it_was(
-    words: list[str],
-    content: bytes | None,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    run = Path("study/runs/go1gate/mappo/seed0")
-    run.mkdir(parents=True)
-    (run / "config.yaml").write_text("task: go1gate\n")
-    (run / "metrics.csv").write_bytes(content or b"")
-    if content is None:
-        (run / "policy.safetensors").symlink_to("/dev/zero")
-        copy = lambda a, b: b.write_bytes(a.read_bytes() if a.is_file() else b"a copy that would not end")  # noqa: E731
-        monkeypatch.setattr("shutil.copyfile", copy)
-    Path("out").mkdir()
-    Path("out/part0.tar.gz").write_text("earlier")
-    assert cli.main(["pack", *words, "-o", "out"]) == 2
-    assert message in capfd.readouterr().err
-    assert [(path.name, path.read_text()) for path in Path("out").iterdir()] == [("part0.tar.gz", "earlier")]
-    assert cli.main(["pack", "none", "-o", "new"]) == 2 and not Path("new").exists()
-
-
-def test_a_run_without_rows_is_packed(tmp_path: Path) -> None:
-    run = tmp_path / "study/runs/go1gate/mappo/seed0"
-    run.mkdir(parents=True)
-    for name in ("config.yaml", "metrics.csv"):
-        (run / name).touch()
-    (file,) = packing.pack([tmp_path / "study"], tmp_path / "out", 1, 1.0)
-    assert "study/runs/go1gate/mappo/seed0/config.yaml" in tarfile.open(file).getnames()

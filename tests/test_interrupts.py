@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mqe_jax import build, cli, files
+from mqe_jax import build, cli
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
 from tests.training import assert_same_run, rows
@@ -117,27 +117,6 @@ def test_a_long_computation_in_c_delays_nothing(number: signal.Signals, tmp_path
     """Python's own handlers would wait for its end; it stands for a compilation or an update."""
     body = "(folder / 'ready').touch(); hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"
     assert end(run(body, tmp_path, tmp_path / "ready"), number, seconds=5) == [ENDS[number][1]]
-
-
-def test_an_interrupted_pack_leaves_nothing(tmp_path: Path) -> None:
-    """Neither its own folder, nor that of an earlier one that was killed."""
-    body = """
-from mqe_jax.study import pack
-def copy(source, target):
-    target.write_text("half")
-    (folder / "ready").touch()
-    time.sleep(1000)
-pack._copy = copy
-pack.pack([folder / "study"], folder / "out", 1, 1.0)
-"""
-    seed, out = tmp_path / "study/runs/go1gate/mappo/seed0", tmp_path / "out"
-    (out / f".pack.{files._HOST}.{2**22 + 1}.tmp" / "sweeps").mkdir(parents=True)  # above the largest process number
-    seed.mkdir(parents=True)
-    (seed / "config.yaml").touch()
-    process = run(body, tmp_path, tmp_path / "ready")
-    assert len(list(out.iterdir())) == 1
-    end(process, signal.SIGTERM)
-    assert list(out.iterdir()) == []
 
 
 def test_children_and_unfinished_files_go(tmp_path: Path) -> None:

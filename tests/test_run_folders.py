@@ -25,7 +25,7 @@ from mqe_jax.settings import override
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.monitor import Monitor
+from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
@@ -110,19 +110,69 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
 
 
 def test_files_of_dead_processes_go_when_a_run_starts(tmp_path: Path) -> None:
-    """Those of processes that run, such as a clip that is being written, stay, and another host's for an hour."""
-    dead = 2**22 + 1  # above the largest process number
-    (tmp_path / "checkpoints").mkdir()
-    gone = [f".policy.{files._HOST}.{n}.tmp.safetensors" for n in (dead, os.getpid())]
-    gone += [f"checkpoints/.step_000000000016.{files._HOST}.{dead}.tmp.safetensors", f".old.{dead}.tmp"]
-    kept = [f".clip.{files._HOST}.{os.getppid()}.tmp.mp4", ".hidden", ".notes.tmp"]
-    kept += [f".policy.{host}{n}.tmp.safetensors" for n in (dead, os.getpid()) for host in ("", "00000000.")]
+    """Those of processes that run, such as a clip that is being written, stay, and another host's for an hour.
+
+    Nothing else goes: no folder, no file of another name, nothing behind a link.
+    """
+    dead, end = 2**22 + 1, f"-{16 * 'a'}.tmp"  # above the largest process number
+    run, other = tmp_path / "run", tmp_path / "other"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / f".mqe-{files._HOST}-{dead + 1}{end}").mkdir()
+    other.mkdir()
+    (run / "link").symlink_to(other)
+    own = f".mqe-{files._HOST}-{dead}{end}"
+    gone = [own, f".mqe-{files._HOST}-{os.getpid()}{end}.mp4", f"checkpoints/{own}.safetensors"]
+    gone += [f".mqe-00000001-{dead}{end}"]
+    kept = [f".mqe-{files._HOST}-{os.getppid()}{end}.mp4", f".mqe-00000000-{dead}{end}", f"link/{own}"]
+    kept += [".hidden", ".notes.tmp", f".keep.{dead}.tmp", f".keep.{files._HOST}.{dead}.tmp.tar.gz", f"{own}~"]
     for name in (*gone, *kept):
-        (tmp_path / name).write_text("half")
+        (run / name).write_text("half")
     then = time.time() - 3700
-    os.utime(tmp_path / gone[-1], (then, then))
-    train(PROBE, SETTINGS, tmp_path)
-    assert [name for name in (*gone, *kept) if (tmp_path / name).exists()] == kept
+    os.utime(run / gone[-1], (then, then))
+    train(PROBE, SETTINGS, run)
+    assert [name for name in (*gone, *kept) if (run / name).exists()] == kept
+    assert (run / f".mqe-{files._HOST}-{dead + 1}{end}").is_dir()
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "best", "metrics.csv"])
+def test_a_training_writes_and_removes_nothing_through_links(name: str, tmp_path: Path) -> None:
+    """A run folder itself may be a link."""
+    run, other = tmp_path / "run", tmp_path / "other"
+    run.mkdir()
+    other.mkdir()
+    (other / "step_000000000001.safetensors").touch()
+    (run / name).symlink_to(other)
+    with pytest.raises(InputError, match=f"{name} is a symbolic link"):
+        train(PROBE, SETTINGS, run, resume=True)
+    assert [path.name for path in other.iterdir()] == ["step_000000000001.safetensors"]
+    (tmp_path / "metrics.csv").symlink_to(tmp_path / "foreign.csv")
+    with pytest.raises(OSError, match=r"metrics\.csv"):
+        files.append(tmp_path / "metrics.csv", b"row")
+    (tmp_path / "named").symlink_to(tmp_path / "folder")
+    (tmp_path / "folder").mkdir()
+    train(PROBE, SETTINGS, tmp_path / "named")
+    assert (tmp_path / "folder" / "policy.safetensors").is_file()
+
+
+def test_policies_of_others_beside_the_best_one_stay(tmp_path: Path) -> None:
+    (tmp_path / "best").mkdir()
+    for name in ("mine.safetensors", "step_000000000016.safetensors"):
+        (tmp_path / "best" / name).touch()
+    EvaluationLog(tmp_path, 0).prune()
+    assert [path.name for path in (tmp_path / "best").iterdir()] == ["mine.safetensors"]
+
+
+def test_temporary_files_are_new_and_unpredictable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name that exists, such as a link that somebody has put there, is not written to."""
+    with replacing(tmp_path / "a") as first, replacing(tmp_path / "a") as second:
+        assert first != second and first.stat().st_mode & 0o777 == 0o666 & ~os.umask(os.umask(0o22))
+    monkeypatch.setattr("secrets.token_hex", lambda size: 16 * "a")
+    with replacing(tmp_path / "a") as name:
+        pass
+    name.symlink_to(tmp_path / "foreign")
+    with pytest.raises(FileExistsError):
+        files.write_atomically(tmp_path / "a", b"new")
+    assert not (tmp_path / "foreign").exists()
 
 
 def test_a_file_that_is_being_written_is_not_removed(tmp_path: Path) -> None:
@@ -287,7 +337,7 @@ def test_parts_of_programs_that_a_killed_process_left_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    (tmp_path / f".jit_step-1-cache.{files._HOST}.999999999.tmp").write_bytes(b"half")
+    (tmp_path / f".mqe-{files._HOST}-999999999-{16 * 'a'}.tmp").write_bytes(b"half")
     (tmp_path / "jit_step-2-cache").write_bytes(b"whole")
     programs.write_whole()
     assert [path.name for path in tmp_path.iterdir()] == ["jit_step-2-cache"]

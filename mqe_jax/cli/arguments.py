@@ -43,7 +43,6 @@ COMMANDS: dict[str, Any] = {
     "skill eval": skill.SkillEval,
     "skill convert": skill.SkillConvert,
     "sweep": study.Sweep,
-    "pack": study.Pack,
     "report": study.Report,
     "tournament": study.Tournament,
 }

@@ -1,4 +1,4 @@
-"""The commands `sweep`, `pack`, `report` and `tournament`."""
+"""The commands `sweep`, `report` and `tournament`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions, echo
 from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
 from mqe_jax.files import check_folder
-from mqe_jax.limits import Candidates, Positive, PositiveInt
+from mqe_jax.limits import Candidates, Positive
 from mqe_jax.literal import line
 from mqe_jax.settings import fail, record
 
@@ -95,29 +95,6 @@ class Sweep:
             names = ", ".join(job.cell.path.as_posix() for job, _ in failed)
             raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {names}")
         return {"left": _estimate(sweeps.estimate(folder, left), left), "report": [str(file) for file in files]}
-
-
-@record
-class Pack:
-    """Pack sweeps into a few files of limited size, from which another machine resumes them."""
-
-    folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of sweeps; runs may be in training meanwhile."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
-    """Folder of the files part0.tar.gz, part1.tar.gz, ...; `tar xzf FILE -C FOLDER` unpacks one."""
-    parts: PositiveInt = 8
-    """Number of files, at most."""
-    megabytes: Positive = 16.0
-    """Size of a file, MiB, at most."""
-    json: Json = False
-
-    def run(self) -> dict[str, Any]:
-        """Packs the runs; returns the files for `--json`."""
-        from mqe_jax.study.pack import pack
-
-        files = pack(self.folders, self.output, self.parts, self.megabytes)
-        echo(f"mqe: wrote {', '.join(f'{file} ({file.stat().st_size / 2**20:.1f} MiB)' for file in files)}")
-        return {"files": [str(file) for file in files]}
 
 
 @record

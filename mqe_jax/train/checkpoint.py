@@ -146,7 +146,11 @@ def checkpoint_folder(run_dir: str | Path) -> Path:
 
 def list_checkpoints(run_dir: str | Path) -> list[Path]:
     """Returns a run's checkpoints, oldest first."""
-    folder = checkpoint_folder(run_dir)
+    return files_by_step(checkpoint_folder(run_dir))
+
+
+def files_by_step(folder: Path) -> list[Path]:
+    """Returns the files of a folder that are named by environment steps, as checkpoints are, oldest first."""
     return sorted(p for p in folder.glob("step_*.safetensors") if _NAME.fullmatch(p.name))
 
 
@@ -176,15 +180,3 @@ def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping
     for old in list_checkpoints(run_dir)[:-keep]:
         old.unlink(missing_ok=True)
     return path
-
-
-def copy_without(path: Path, target: Path, name: str) -> None:
-    """Copies a checkpoint without a field of the learner state, `rollout`, as `checkpoint.environments: false` does.
-
-    Raises:
-        InputError: as `load_tree`.
-    """
-    arrays, metadata = _read(path, "checkpoint")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    kept = {key: array for key, array in arrays.items() if not key.startswith(f"{name}/")}
-    save_tree(target, kept, {**metadata, "environments": False}, kind="checkpoint")

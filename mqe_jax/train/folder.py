@@ -28,6 +28,7 @@ CONFIG_FILE = "config.yaml"
 RUN_FILES = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
 """Names of a run's files beside its checkpoints."""
 
+_FOLDERS = ("checkpoints", "best", "tensorboard", "wandb")
 _OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of their run
 
 
@@ -36,6 +37,7 @@ def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
     """Creates and locks run folders; raises an InputError for one that holds a run, or what `resume` cannot resume."""
     with contextlib.ExitStack() as locks:
         for folder in folders:
+            check_links(folder)
             check_alone(folder)
         if resume:
             common_checkpoints(folders)
@@ -79,6 +81,13 @@ def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
     raise InputError(
         f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds ({newest}); resume them separately"
     )
+
+
+def check_links(run_dir: Path) -> None:
+    """Raises an InputError for a folder in which something that a training replaces or removes is a link."""
+    for name in (*RUN_FILES, *_FOLDERS):
+        if (run_dir / name).is_symlink():
+            raise InputError(f"run_dir: {run_dir / name} is a symbolic link; it must be in the run folder itself")
 
 
 def check_alone(run_dir: Path) -> None:

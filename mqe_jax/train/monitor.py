@@ -22,6 +22,7 @@ from typing_extensions import TypedDict
 
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_locks, read_json, write_atomically
+from mqe_jax.train.checkpoint import files_by_step
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, Result
 from mqe_jax.train.learner import env_dims
@@ -163,7 +164,7 @@ class EvaluationLog:
         assert self._run_dir is not None
         check_locks(self._run_dir / EVALUATIONS_FILE)
         best = self.best()
-        for path in (self._run_dir / "best").glob("*.safetensors"):
+        for path in files_by_step(self._run_dir / "best"):
             if best is None or path != _best_path(self._run_dir, best):
                 path.unlink(missing_ok=True)
 

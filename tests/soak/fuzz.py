@@ -138,7 +138,6 @@ RUN = "sweep/runs/fake/mappo/seed0"
 EVALUATED = [*SMALL, "--checkpoint.every", "1", "--evaluation.every", "1", "--evaluation.episodes", "2"]
 RUN_READERS = (
     ["report", "sweep"],
-    ["pack", "sweep", "-o", "packed"],
     ["eval", RUN, "--episodes", "2"],
     ["train", "fake", *EVALUATED, "--resume", "--run-dir", RUN],
 )
