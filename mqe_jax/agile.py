@@ -39,7 +39,7 @@ STEP = 0.02  # s
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
 PRECISION = "tensorfloat32"  # as in the walk policy
-FREQUENCY = (3.0, 3.6)  # of the trot, Hz: at rest, and from the velocity `FAST` on
+FREQUENCY = (3.0, 4.2)  # of the trot, Hz: at rest, and from the velocity `FAST` on
 FAST = np.array([2.5, 1.0, 2.5], np.float32)  # m/s forward, m/s to the left, rad/s
 STAND = 0.02  # share of `FAST` below which the robot shall stand
 
