@@ -292,6 +292,15 @@ def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
         yield opened
 
 
+def user_cache() -> Path:
+    """Returns this package's folder in the user's cache; an InputError where there is no home folder."""
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        raise InputError("XDG_CACHE_HOME: is missing, and there is no home folder; it must be a folder") from None
+    return Path(home) / "mqe_jax"
+
+
 def check_folder(folder: Path, field: str = "run_dir") -> None:
     """Creates a folder, and raises an InputError that names the field if it cannot be written."""
     try:

@@ -30,14 +30,22 @@ for module, names in GONE.items():
 """
 """Takes from a Python what Windows lacks, once libraries that look at the platform are imported."""
 MQE = """
+import sys
+from mqe_jax.cli import main
+assert main({bad!r}) == 2  # imports MuJoCo, as every command
 sys.path.insert(0, {tests!r})
 import fake_env
 fake_env.build.make_env = fake_env.make_env
-from mqe_jax.cli import main
 for line in {lines!r}:
     sys.argv = ["mqe", *line]
     assert main() == 0, line
 """
+BAD = ["train", "go1gate", "--seed", "x"]
+
+
+def mqe(*lines: list[str], bad: list[str] = BAD) -> str:
+    """Returns code that runs `mqe` with the task `fake`."""
+    return MQE.format(tests=str(TESTS), lines=lines, bad=bad)
 
 
 def run(code: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -46,14 +54,15 @@ def run(code: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[
     return done
 
 
-def test_nothing_needs_posix(tmp_path: Path) -> None:
-    """Training in one process, evaluation and rendering."""
-    lines = [
+def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
+    """Training in one process, evaluation and rendering. A home folder is missing without HOME and `pwd`."""
+    code = mqe(
         ["train", "fake", "--run-dir", "run", *SMALL],
         ["eval", "fake", "--policy", "run", "--episodes", "4"],
         ["render", "fake", "--policy", "run", "-o", "clip.gif", "--seconds", "0.1"],
-    ]
-    run(NO_POSIX + MQE.format(tests=str(TESTS), lines=lines), tmp_path)
+    )
+    homes = "HOME", "JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"
+    run(NO_POSIX + code, tmp_path, env={name: value for name, value in os.environ.items() if name not in homes})
     assert (tmp_path / "clip.gif").stat().st_size and len(
         (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     ) == 3
@@ -64,3 +73,13 @@ def test_help_is_the_same_without_docstrings(words: list[str], tmp_path: Path) -
     code = f"import sys; from mqe_jax.cli import main; sys.argv = ['mqe', *{words!r}]; sys.exit(main())"
     plain, optimized = (run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": level}).stdout for level in ("", "2"))
     assert optimized == plain
+
+
+@pytest.mark.parametrize(("gl", "bad"), [("osmesa", BAD), ("wrong", ["eval", "go1gate", "--policy", "nobody"])])
+def test_only_drawing_needs_a_gl_library(gl: str, bad: list[str], tmp_path: Path) -> None:
+    """Another library draws, or matplotlib from above, with one line."""
+    code = mqe(["tasks"], ["eval", "fake", "--policy", "idle", "--episodes", "2"], bad=bad)
+    code += "print('drawn', file=sys.stderr)" + mqe(["render", "fake", "-o", "clip.png", "--seconds", "0.1"])
+    before, after = run(code, tmp_path, env={**os.environ, "MUJOCO_GL": gl}).stderr.split("drawn\n")
+    assert "GL" not in before and len([line for line in after.splitlines() if "GL" in line]) == 1
+    assert (tmp_path / "clip.png").stat().st_size

@@ -203,8 +203,10 @@ def test_no_policy_of_a_page_replaces_another(tmp_path: Path) -> None:
 
 
 def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
-    monkeypatch.setattr(libraries, "CACHE", tmp_path)
-    (tmp_path / "mujoco-mujoco-3.14.0.tgz").write_bytes(b"something else")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = tmp_path / "mqe_jax" / "play"
+    folder.mkdir(parents=True)
+    (folder / "mujoco-mujoco-3.14.0.tgz").write_bytes(b"something else")
     with pytest.raises(InputError, match=r"@mujoco/mujoco@3.14.0.*SHA-256"):
         libraries.add_libraries(tmp_path / "lib")
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -195,7 +195,8 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
 
 
 @pytest.mark.parametrize(
-    ("chosen", "tried"), [("", ["egl", "osmesa"]), ("glfw", ["egl", "osmesa"]), ("osmesa", ["osmesa"]), ("disable", [])]
+    ("chosen", "tried"),
+    [("", ["egl", "osmesa"]), ("glfw", ["egl", "osmesa"]), ("osmesa", ["osmesa", "egl"]), ("disable", []), ("off", [])],
 )
 def test_only_libraries_that_draw_without_a_window_are_tried(
     chosen: str, tried: list[str], monkeypatch: pytest.MonkeyPatch

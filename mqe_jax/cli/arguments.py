@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 from mqe_jax import limits
-from mqe_jax.cli import commands, export, render, skill, study, view
+from mqe_jax.cli import commands, export, programs, render, skill, study, view
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import TEXT, fail, is_text
 
@@ -95,6 +95,7 @@ def parse(arguments: Sequence[str]) -> Any:
         name = " ".join(arguments[:2]) if name == "skill" else name
         raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
     if isinstance(COMMANDS[name], str):
+        programs.import_mujoco()  # which `train` imports
         from mqe_jax.cli import launch, train
 
         parsers = {"launch": launch.parse_launch, "train": train.parse_train, "skill train": train.parse_skill_train}

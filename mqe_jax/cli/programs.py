@@ -11,6 +11,8 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+from mqe_jax.errors import InputError
+
 
 def hasten() -> None:
     """Makes the start of a command faster: fewer searches for garbage, and none for plug-ins of pydantic."""
@@ -19,27 +21,32 @@ def hasten() -> None:
 
 
 def import_mujoco() -> None:
-    """Imports MuJoCo without a search for GLFW, which draws into windows; MuJoCo starts a process for it."""
-    if "MUJOCO_GL" in os.environ:
-        return
+    """Imports MuJoCo without a GL library, whatever MUJOCO_GL is: `viz.render` loads one where something is drawn.
+
+    A missing library fails while MuJoCo is imported, and its search for GLFW starts a process.
+    """
+    chosen = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
     try:
         importlib.import_module("mujoco")
     finally:
         del os.environ["MUJOCO_GL"]
+        if chosen is not None:
+            os.environ["MUJOCO_GL"] = chosen
 
 
 def keep() -> None:
     """Has JAX store compiled programs in the user's cache folder, one for each kind of processor, unless told where."""
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    with contextlib.suppress(OSError, RuntimeError):  # without a home, or one that cannot be written, nothing is stored
+    from mqe_jax.files import user_cache
+
+    with contextlib.suppress(OSError, InputError):  # without a home, or one that cannot be written, nothing is stored
         lines = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
         flags = next(
             (line for line in lines.splitlines() if line.startswith(("flags", "Features"))), platform.machine()
         )
-        folder = home / "mqe_jax" / f"programs-{zlib.crc32(flags.encode()):08x}"
+        folder = user_cache() / f"programs-{zlib.crc32(flags.encode()):08x}"
         folder.mkdir(parents=True, exist_ok=True)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")

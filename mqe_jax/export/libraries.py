@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 import subprocess
 import tarfile
@@ -12,10 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
-
-CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mqe_jax" / "play"
-"""Folder of the fetched archives."""
+from mqe_jax.files import user_cache, write_atomically
 
 
 class Package(NamedTuple):
@@ -75,7 +71,7 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
 def _archive(package: Package) -> Path:
     """Returns the archive of a package, fetched where the cache lacks it."""
     title = f"{package.name}@{package.version}"
-    archive = CACHE / f"{package.name.lstrip('@').replace('/', '-')}-{package.version}.tgz"
+    archive = user_cache() / "play" / f"{package.name.lstrip('@').replace('/', '-')}-{package.version}.tgz"
     if not archive.is_file():
         _fetch(title, archive)
     if hashlib.sha256(archive.read_bytes()).hexdigest() != package.sha256:

@@ -50,20 +50,21 @@ def gl_backend() -> str | None:
 
 @cache
 def _working_backend() -> str | None:
-    """Tries the GL libraries.
+    """Tries the GL libraries, that of `MUJOCO_GL` first; none where it is `disable` or the like.
 
     Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
-    `MUJOCO_GL`, where set, is the only candidate, but for `glfw`, which draws into windows.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
-    for name in ["egl", "osmesa"] if chosen in ("", "glfw") else [chosen]:
-        if name not in ("egl", "osmesa"):
-            return None
+    if chosen in ("disable", "disabled", "off", "false", "0"):
+        return None
+    for name in sorted(("egl", "osmesa"), key=lambda name: name != chosen):
         environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": name}
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             with child([sys.executable, "-c", _PROBE], env=environment, **quiet) as process:
                 if process.wait(60) == 0:
+                    if chosen not in ("", name):
+                        print(f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead", file=sys.stderr)
                     return name
     return None
 
