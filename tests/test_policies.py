@@ -18,6 +18,7 @@ from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
+from mqe_jax.envs.state import ENDINGS
 from mqe_jax.errors import InputError
 from mqe_jax.opponents import versus
 from mqe_jax.planners import planner_of
@@ -50,7 +51,9 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
     assert card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml ")) and task in card.command
     wins = {"win/scripted", "loss/scripted", "win/idle", "win/random"}
     assert set(card.results) == (wins if task in MATCHES else {"success"})
-    assert all(0.0 <= rate <= 1.0 for rate in card.results.values())
+    assert all(0.0 <= rate <= 1.0 for rate in (*card.results.values(), *card.endings.values()))
+    assert {f"ending/{name}" for name in card.endings} == {*ENDINGS}
+    assert sum(card.endings.values()) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_shipped_policy_does_what_its_card_says() -> None:

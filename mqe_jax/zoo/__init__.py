@@ -40,6 +40,8 @@ class Card:
     """Episodes behind each result."""
     results: Mapping[str, float]
     """Rates in fresh episodes, such as success, or win/scripted and loss/scripted."""
+    endings: Mapping[str, float]
+    """Shares of episodes by how they end (`mqe_jax.envs.state.ENDINGS`); in a match against the scripted team."""
 
 
 def names() -> list[str]:
