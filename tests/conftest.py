@@ -71,8 +71,10 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import fake_env
 
     from mqe_jax import build
+    from mqe_jax.envs import TASKS
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(TASKS, "fake", fake_env.FakeEnv)  # pyright: ignore[reportArgumentType]
     real = build.make_env
 
     def make_env(task: str, *arguments: Any, **named: Any) -> Any:

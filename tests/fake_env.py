@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 
 from mqe_jax import build
 from mqe_jax.cli import launch, main
-from mqe_jax.envs import EnvironmentState
+from mqe_jax.envs import TASKS, EnvironmentState
 from mqe_jax.train import devices
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
@@ -147,7 +148,13 @@ def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
     return env, FakeVectorEnv(env, num_envs)
 
 
+def install(patch: pytest.MonkeyPatch) -> None:
+    """Lets `mqe` know this task, in place of all others."""
+    patch.setattr(build, "make_env", make_env)
+    patch.setitem(TASKS, "fake", FakeEnv)  # pyright: ignore[reportArgumentType]
+
+
 if __name__ == "__main__":
-    setattr(build, "make_env", make_env)  # noqa: B010
+    install(pytest.MonkeyPatch())
     setattr(launch, "PROGRAM", [sys.executable, __file__])  # noqa: B010
     sys.exit(main())

@@ -37,7 +37,7 @@ def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) 
     """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "make_env", fake_env.make_env)
+        fake_env.install(patch)
         assert cli.main(["train", "fake", "--run-dir", str(folder), *SMALL]) == 0
     return folder
 
@@ -293,32 +293,29 @@ class Missing:
         if name.split(".")[0] == "warp":
             raise ModuleNotFoundError("No module named 'warp'")
 sys.meta_path.insert(0, Missing())
-import mqe_jax
 from mqe_jax.cli import main
-assert main(["tasks"]) == 0 and mqe_jax.tasks()
-print("mujoco.mjx" in sys.modules)
+assert main(["tasks"]) == 0 and main(["tasks", "--json"]) == 0
+for command in ("eval gogate", "view gogate", "render gogate -o a.gif", "bench gogate", "train gogate", "evl go1gate"):
+    assert main(command.split()) == 2
+print({"jax", "mujoco"} & {*sys.modules})
+import mqe_jax
+assert mqe_jax.tasks()
 from mqe_jax.engines.private import load_mjx
 print(load_mjx().__name__)
 """
 
 
-def test_tasks_are_listed_without_mjx_and_nothing_prints_a_warning() -> None:
-    """Importing MJX takes a second; its note that Warp is missing is not printed. Python's warnings are errors."""
+def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
+    """Importing them takes seconds. MJX's note that Warp is missing is not printed; Python's warnings are errors."""
     done = subprocess.run([sys.executable, "-W", "error", "-c", START], capture_output=True, text=True, check=True)
     first, *lines, last, late, name = done.stdout.splitlines()
-    assert done.stderr == "" and "Failed" not in done.stdout and (late, name) == ("False", "mujoco.mjx")
-    assert first.startswith("The tasks with their default parameters") and last.startswith("actions per agent")
+    assert "Failed" not in done.stdout and (late, name) == ("set()", "mujoco.mjx")
+    assert first.startswith("The tasks with default parameters") and json.loads(last)["tasks"][0]["task"] == "go1plane"
     rows = {line.split()[0]: line.split() for line in lines if line.startswith("go1")}
     assert rows["go1gate"][-1] == "shipped" and rows["go1plane"][-1] == "none"
-    assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"]
-
-
-def test_tasks_have_the_sizes_of_their_environments(capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["tasks", "--json"]) == 0
-    rows = {row["task"]: row for row in json.loads(capfd.readouterr().out)["tasks"]}
-    env = make("go1gate", impl="c")
-    sizes = env.observation_size, env.privileged_observation_size
-    assert (rows["go1gate"]["observation"], rows["go1gate"]["privileged"]) == sizes
+    assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"] and max(map(len, lines)) <= 80
+    errors = done.stderr.splitlines()
+    assert len(errors) == 6 and all("did you mean" in line for line in errors)
 
 
 def test_a_command_starts_without_what_it_does_not_need() -> None:

@@ -90,6 +90,9 @@ def accepted(words: list[str]) -> bool:
         return True
     standing = {
         "COMMAND": "train",
+        "TASK": "go1gate",
+        "TASK_ID": "go1gate",
+        "RUN": "runs/a",
         "HOST:PORT": "host:1",
         "...": "go1gate",
         **dict.fromkeys(("N", "I", "GPU", "SEED"), "1"),

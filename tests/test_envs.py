@@ -18,6 +18,7 @@ from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.plane import Go1Plane
+from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.errors import InputError
 from tests import engines
 from tests.states import ending, initial, made, stepper
@@ -38,6 +39,13 @@ def fresh(gate: QuadrupedEnv) -> State:
 @pytest.fixture(scope="module")
 def gate_step(gate: QuadrupedEnv) -> Any:
     return stepper(gate.name)
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_the_registry_lists_what_the_environment_has(task: str) -> None:
+    env = make(task, impl="c", num_envs=1)
+    sizes = env.observation_size, env.privileged_observation_size, env.params.episode_length
+    assert (env.title, tuple(map(len, env.teams)), *sizes) == SHIPPED[task][2:]
 
 
 @pytest.mark.parametrize(("count", "steps"), [(8, 200), pytest.param(32, 1000, marks=pytest.mark.soak)])

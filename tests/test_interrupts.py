@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mqe_jax import build, cli
+from mqe_jax import cli
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
 from tests.training import assert_same_run, rows
@@ -84,7 +84,7 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
 @pytest.mark.usefixtures("shared_programs")
 def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped between its regular checkpoints, it equals an uninterrupted one bit for bit."""
-    monkeypatch.setattr(build, "make_env", fake_env.make_env)
+    fake_env.install(monkeypatch)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])
     wait_for(lambda: updates(stopped) >= 3, process)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +51,29 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
     assert card.episodes >= 512
     assert card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml ")) and task in card.command
     wins = {"win/scripted", "loss/scripted", "win/idle", "win/random"}
-    assert set(card.results) == (wins if task in MATCHES else {"success"})
+    sides = {f"win/scripted as team {side}" for side in (0, 1)} if task == "go1revolvingdoor" else set()
+    assert set(card.results) == (wins | sides if task in MATCHES else {"success"})
     assert all(0.0 <= rate <= 1.0 for rate in (*card.results.values(), *card.endings.values()))
     assert {f"ending/{name}" for name in card.endings} == {*ENDINGS}
     assert sum(card.endings.values()) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_cards_have_the_rates_of_the_readme(capfd: pytest.CaptureFixture[str]) -> None:
+    """`mqe zoo` lists them in a row for each task, which fits on a terminal of 80 columns."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\|.* `(go1[\w-]+)`:[^|]*\| ([\d.]+) \| ([\d.]+) \|", readme, re.MULTILINE)
+    assert {row[0] for row in rows} == {*zoo.names()}
+    assert cli.main(["zoo"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    listed = {line.split()[0]: line.split()[1:3] for line in lines if line.startswith("go1")}
+    for task, *rates in rows:
+        shown = rates[: 2 if task in MATCHES else 1]
+        assert [float(x) for x in listed[task][: len(shown)]] == [float(x) for x in shown], task
+    assert cli.main(["zoo", "go1gate"]) == 0
+    assert "published-gate" in capfd.readouterr().out
+    assert cli.main(["zoo", "--json"]) == 0
+    assert set(json.loads(capfd.readouterr().out)["policies"]) == {*zoo.names()}
 
 
 def test_a_shipped_policy_does_what_its_card_says() -> None:
@@ -103,14 +123,6 @@ def test_a_policy_file_holds_its_mode(deterministic: bool, tmp_path: Path) -> No
     policy = dataclasses.replace(load_policy("go1gate"), deterministic=deterministic)
     file = save_policy(tmp_path / "new" / "folder", policy)
     assert load_policy(file).deterministic is deterministic and load_policy(file, deterministic=True).deterministic
-
-
-def test_the_command_lists_the_shipped_policies(capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["zoo"]) == 0
-    said = capfd.readouterr().out
-    assert all(name in said for name in zoo.names()) and "99.6%" in said
-    assert cli.main(["zoo", "--json"]) == 0
-    assert set(json.loads(capfd.readouterr().out)["policies"]) == set(zoo.names())
 
 
 # -- scripted policies: the registry of them, and actions on observations made by hand ---------------------------------

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
 
 from mqe_jax import limits
 from mqe_jax.cli import commands, export, programs, render, skill, study, view
+from mqe_jax.envs.registry import task_id
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.settings import TEXT, fail, is_text
 
@@ -81,7 +84,7 @@ def parse(arguments: Sequence[str]) -> Any:
     """Returns the record of the command that the first word or two name; its `run` returns the object of `--json`.
 
     Raises:
-        InputError: for an unknown command.
+        InputError: for an unknown command or task.
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
     _check_words(arguments)
@@ -95,9 +98,15 @@ def parse(arguments: Sequence[str]) -> Any:
         name = " ".join(arguments[:2]) if name == "skill" else name
         raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
     if isinstance(COMMANDS[name], str):
+        if name == "train" and rest and not rest[0].startswith("-"):
+            task_id(rest[0])
         programs.import_mujoco()  # which `train` imports
         from mqe_jax.cli import launch, train
 
         parsers = {"launch": launch.parse_launch, "train": train.parse_train, "skill train": train.parse_skill_train}
         return parsers[name](rest)
-    return tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
+    command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
+    target = getattr(command, "target", None) or getattr(command, "task", None)
+    if isinstance(target, str) and os.sep not in target and not Path(target).exists():
+        task_id(target)  # before JAX and MuJoCo are imported, which take seconds
+    return command

@@ -5,9 +5,10 @@ Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
@@ -16,67 +17,91 @@ from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Episodes, Horizon
 from mqe_jax.settings import record
 
+_ZOO = Path(__file__).parent.parent / "zoo"
+_RATES = {
+    "Success, % of the episodes": {"success": "success"},
+    "Wins on both sides against three teams, and losses to the scripted one, %": {
+        **{f"win/{name}": name for name in ("scripted", "idle", "random")},
+        "loss/scripted": "losses",
+    },
+}
+"""Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name in the cards."""
+
 
 @record
 class Tasks:
     """List the tasks with their agents, sizes, time limits, and whether a trained policy is shipped."""
 
     json: Json = False
+    light: ClassVar[bool] = True
 
     def run(self) -> dict[str, Any]:
-        """Lists the tasks with their default parameters."""
-        from mqe_jax import zoo
-        from mqe_jax.envs import PLANNERS, TASKS
+        """Lists the tasks with their default parameters, without importing JAX or MuJoCo."""
+        from mqe_jax.envs.registry import SHIPPED
 
-        rows, shipped = [], zoo.names()
-        for name, task in TASKS.items():
-            env = task(num_envs=1)
+        rows = []
+        for name, task in SHIPPED.items():
+            shipped = (_ZOO / f"{name}.safetensors").is_file()
             rows.append(
                 {
                     "task": name,
                     "title": task.title,
-                    "agents": env.num_agents,
-                    "teams": len(env.teams),
-                    "observation": env.observation_size,
-                    "privileged": env.privileged_observation_size,
-                    "time_limit_s": env.params.episode_length,
-                    "shipped_policy": name in shipped,
+                    "agents": sum(task.teams),
+                    "teams": len(task.teams),
+                    "observation": task.observation,
+                    "privileged": task.privileged,
+                    "time_limit_s": task.time_limit,
+                    "shipped_policy": shipped,
                 }
             )
+            policy = "shipped" if shipped else "scripted" if task.planner else "none"
+            agents, size = " vs ".join(map(str, task.teams)), task.observation
+            if not self.json:
+                if len(rows) == 1:
+                    print("The tasks with default parameters; `mqe render TASK -o clip.gif` shows one.\n")
+                    print(f"{'task':<20} {'title':<18} {'agents':<6}  observation  time limit  policy")
+                print(f"{name:<20} {task.title:<18} {agents:<6}  {size:>11}  {task.time_limit:>8g} s  {policy}")
         if not self.json:
-            print("The tasks with their default parameters; `mqe render TASK -o clip.mp4` shows one.\n")
-            print(f"{'task':<22} {'title':<18} {'agents':<7} observation  time limit  policy")
-            for row in rows:
-                team = row["agents"] // row["teams"]
-                agents = f"{team}" if row["teams"] == 1 else f"{team} vs {team}"
-                policy = "shipped" if row["shipped_policy"] else "scripted" if row["task"] in PLANNERS else "none"
-                print(
-                    f"{row['task']:<22} {row['title']:<18} {agents:<7} {row['observation']:>11}"
-                    f"  {row['time_limit_s']:>8g} s  {policy}"
-                )
-            print("\nobservation: numbers per agent; policy: a trained one is shipped (`mqe zoo`), or scripted only")
-            print("actions per agent: command 3 (velocities for the walk policy), position 12, torque 12")
+            print("\nobservation: numbers per agent; policy: a trained one is shipped (`mqe zoo`), or")
+            print("scripted only; actions per agent: command 3 (velocities for the walk policy),")
+            print("position 12, torque 12")
         return {"tasks": rows}
 
 
 @record
 class Zoo:
-    """List the shipped policies, with what they reach and how they were trained."""
+    """List the shipped policies with what they reach; of one task, how it was trained too."""
 
+    task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
+    """Id of a task, whose policy's whole card is printed."""
     json: Json = False
 
     def run(self) -> dict[str, Any]:
-        """Lists the cards of all shipped policies."""
+        """Lists the cards of all shipped policies, or prints that of a task."""
         from mqe_jax import zoo
         from mqe_jax.settings import to_mapping
 
-        cards = {task: to_mapping(zoo.card(task)) for task in zoo.names()}
-        if not self.json:
+        cards = {task: zoo.card(task) for task in (zoo.names() if self.task is None else [self.task])}
+        plain = {task: to_mapping(card) for task, card in cards.items()}
+        if self.json:
+            return {"policies": plain}
+        if self.task is not None:
+            card = plain[self.task]
+            shares = card.pop("results") | {f"ends by {name}": share for name, share in card.pop("endings").items()}
+            rates = {name: f"{100 * share:.1f}%" for name, share in shares.items()}
+            for name, value in {"task": self.task, **rates, **card}.items():
+                print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23))
+            return {}
+        for title, columns in _RATES.items():
+            print(f"{title}\n\n{'task':<21}{''.join(f'{name:>9}' for name in columns.values())}   actions  episodes")
             for task, card in cards.items():
-                rates = ", ".join(f"{name} {100 * value:.1f}%" for name, value in card["results"].items())
-                print(f"{task:<22} {rates} ({card['mode']}, {card['episodes']} episodes)")
-                print(f"{'':<22} {card['command']} ({card['date']}; {card['note']})")
-        return {"policies": cards}
+                if columns.keys() <= card.results.keys():
+                    rates = "".join(f"{100 * card.results[name]:>9.1f}" for name in columns)
+                    actions = "mean" if card.mode == "deterministic" else "sampled"
+                    print(f"{task:<21}{rates}   {actions:<7}  {card.episodes:>8}")
+            print()
+        print("How one was trained: mqe zoo TASK")
+        return {"policies": plain}
 
 
 @record

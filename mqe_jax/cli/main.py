@@ -82,8 +82,9 @@ def _run(command: Any) -> None:
     from mqe_jax.cli import programs
     from mqe_jax.cli.options import standard_output
 
-    programs.import_mujoco()
-    programs.write_whole()
+    if not getattr(command, "light", False):
+        programs.import_mujoco()
+        programs.write_whole()
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:
         result = command.run()

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from mqe_jax.envs.autoreset import VectorEnv
-from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.params import TaskParams
-from mqe_jax.envs.randomization import Randomization
-from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task
-from mqe_jax.envs.state import EnvironmentState, Moment, State
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task, task_id
 from mqe_jax.limits import Environments
 from mqe_jax.settings import checked, override
+
+if TYPE_CHECKING:
+    from mqe_jax.envs.autoreset import VectorEnv
+    from mqe_jax.envs.base import QuadrupedEnv
+    from mqe_jax.envs.params import TaskParams
+    from mqe_jax.envs.randomization import Randomization
+    from mqe_jax.envs.state import EnvironmentState, Moment, State
+
+_HOMES = {
+    "VectorEnv": "autoreset",
+    "QuadrupedEnv": "base",
+    "TaskParams": "params",
+    "Randomization": "randomization",
+    **dict.fromkeys(("EnvironmentState", "Moment", "State"), "state"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    # Listing tasks and naming an unknown one import neither JAX nor MuJoCo.
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mqe_jax.envs' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"mqe_jax.envs.{_HOMES[name]}"), name)
 
 
 def tasks() -> tuple[str, ...]:
@@ -37,10 +54,7 @@ def make(
     Raises:
         InputError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
     """
-    task = ALIASES.get(task, task)
-    if task not in TASKS:
-        raise InputError(f"task: unknown id {task!r}{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}")
-    cls = TASKS[task]
+    cls = TASKS[task_id(task)]
     return cls(override(cls.Params(), overrides), impl=impl, control=control, num_envs=num_envs)
 
 

@@ -1,38 +1,72 @@
-"""Registry of tasks and their scripted policies; a new task is one line in `_SHIPPED`.
+"""Registry of tasks and their scripted policies; a new task is one line in `SHIPPED`.
 
-A task's module is imported when its class is asked for: those of all tasks take 0.2 s.
+A task's module is imported when its class is asked for, so that listing tasks imports neither JAX nor MuJoCo.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterator, MutableMapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-import jax
+from mqe_jax.errors import InputError, nearest
 
-from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.errors import InputError
+if TYPE_CHECKING:
+    import jax
 
-Planner = Callable[[dict[str, jax.Array]], jax.Array]
+    from mqe_jax.envs.base import QuadrupedEnv
+
+Planner: TypeAlias = "Callable[[dict[str, jax.Array]], jax.Array]"
 """Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the `command` mode."""
 
-# By id: MODULE:CLASS of mqe_jax.envs, and the scripted policy, as MODULE:FUNCTION of mqe_jax.planners or none.
-_SHIPPED: dict[str, tuple[str, str | None]] = {
-    "go1plane": ("plane:Go1Plane", None),
-    "go1gate": ("gate:Go1Gate", "cooperative:plan_gate"),
-    "go1seesaw": ("seesaw:Go1Seesaw", "cooperative:plan_seesaw"),
-    "go1sheep-easy": ("sheep:Go1SheepEasy", "cooperative:plan_sheep_easy"),
-    "go1sheep-hard": ("sheep:Go1SheepHard", "cooperative:plan_sheep_hard"),
-    "go1pushbox": ("pushbox:Go1PushBox", "cooperative:plan_pushbox"),
-    "go1football-defender": ("football_defender:Go1FootballDefender", "football:plan_defender"),
-    "go1tug": ("tug:Go1Tug", "matches:plan_tug"),
-    "go1revolvingdoor": ("door:Go1RevolvingDoor", "matches:plan_revolving_door"),
-    "go1wrestling": ("wrestling:Go1Wrestling", "matches:plan_wrestling"),
-    "go1bridge": ("bridge:Go1Bridge", "matches:plan_bridge"),
-    "go1football-1vs1": ("football:Go1Football1vs1", "football:plan_match"),
-    "go1football-2vs2": ("football:Go1Football2vs2", "football:plan_match"),
+
+class Shipped(NamedTuple):
+    """A task of the package, with what `mqe tasks` lists of it."""
+
+    task: str
+    """MODULE:CLASS of mqe_jax.envs."""
+    planner: str | None
+    """Scripted policy, MODULE:FUNCTION of mqe_jax.planners."""
+    title: str
+    """Its class's `title`."""
+    teams: tuple[int, ...]
+    """Number of agents of each team."""
+    observation: int
+    """Length of an agent's observation."""
+    privileged: int
+    """Length of the privileged observation."""
+    time_limit: float
+    """Time limit, s."""
+
+
+SHIPPED = {
+    "go1plane": Shipped("plane:Go1Plane", None, "Plane", (2,), 14, 91, 10.0),
+    "go1gate": Shipped("gate:Go1Gate", "cooperative:plan_gate", "Narrow Gate", (2,), 16, 93, 10.0),
+    "go1seesaw": Shipped("seesaw:Go1Seesaw", "cooperative:plan_seesaw", "Climb on Seesaw", (2,), 14, 93, 10.0),
+    "go1sheep-easy": Shipped(
+        "sheep:Go1SheepEasy", "cooperative:plan_sheep_easy", "Sheep Dog (Easy)", (2,), 18, 97, 15.0
+    ),
+    "go1sheep-hard": Shipped(
+        "sheep:Go1SheepHard", "cooperative:plan_sheep_hard", "Sheep Dog (Hard)", (2,), 34, 129, 15.0
+    ),
+    "go1pushbox": Shipped("pushbox:Go1PushBox", "cooperative:plan_pushbox", "Push Box", (2,), 22, 106, 15.0),
+    "go1football-defender": Shipped(
+        "football_defender:Go1FootballDefender", "football:plan_defender", "Football (2 vs 1)", (2,), 20, 153, 20.0
+    ),
+    "go1tug": Shipped("tug:Go1Tug", "matches:plan_tug", "Push Cylinder", (1, 1), 10, 93, 15.0),
+    "go1revolvingdoor": Shipped(
+        "door:Go1RevolvingDoor", "matches:plan_revolving_door", "Revolving Door", (1, 1), 12, 95, 5.0
+    ),
+    "go1wrestling": Shipped("wrestling:Go1Wrestling", "matches:plan_wrestling", "Sumo Wrestling", (1, 1), 12, 91, 15.0),
+    "go1bridge": Shipped("bridge:Go1Bridge", "matches:plan_bridge", "Traverse Bridge", (1, 1), 12, 91, 20.0),
+    "go1football-1vs1": Shipped(
+        "football:Go1Football1vs1", "football:plan_match", "Football (1 vs 1)", (1, 1), 19, 108, 20.0
+    ),
+    "go1football-2vs2": Shipped(
+        "football:Go1Football2vs2", "football:plan_match", "Football (2 vs 2)", (2, 2), 32, 198, 20.0
+    ),
 }
+"""The package's tasks by id, with default parameters."""
 
 # Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.planners.
 _NAMED: list[tuple[str, str, str]] = []
@@ -41,16 +75,16 @@ _NAMED: list[tuple[str, str, str]] = []
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
 
-class _Tasks(MutableMapping[str, type[QuadrupedEnv]]):
+class _Tasks(MutableMapping[str, "type[QuadrupedEnv]"]):
     """Task classes by id, of which the shipped ones are imported on demand."""
 
     def __init__(self) -> None:
-        self._tasks: dict[str, type[QuadrupedEnv] | None] = dict.fromkeys(_SHIPPED)
+        self._tasks: dict[str, type[QuadrupedEnv] | None] = dict.fromkeys(SHIPPED)
 
     def __getitem__(self, name: str) -> type[QuadrupedEnv]:
         task = self._tasks[name]
         if task is None:
-            task = self._tasks[name] = load("mqe_jax.envs", _SHIPPED[name][0])
+            task = self._tasks[name] = load("mqe_jax.envs", SHIPPED[name].task)
             assert task.name == name, f"{task.__name__} has the id {task.name!r}, the registry {name!r}"
         return task
 
@@ -73,7 +107,7 @@ class _Tasks(MutableMapping[str, type[QuadrupedEnv]]):
 TASKS = _Tasks()
 """Task classes by id."""
 
-PLANNERS: dict[str, Planner | str] = {name: planner for name, (_, planner) in _SHIPPED.items() if planner is not None}
+PLANNERS: dict[str, Planner | str] = {name: task.planner for name, task in SHIPPED.items() if task.planner is not None}
 """Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
 
 
@@ -99,6 +133,8 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None
     Usable as a class decorator for a task without a scripted policy. InputError if it is no class of tasks, has no
     name, or another class is registered under it.
     """
+    from mqe_jax.envs.base import QuadrupedEnv
+
     if not (isinstance(task, type) and issubclass(task, QuadrupedEnv)):
         raise InputError(f"task: {task!r} is not allowed; it must be a class derived from QuadrupedEnv")
     if not task.name:
@@ -110,6 +146,14 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None
     if planner is not None:
         PLANNERS[task.name] = planner
     return task
+
+
+def task_id(name: str) -> str:
+    """Returns the id of a task from it or an alias; raises an InputError that names the nearest for an unknown one."""
+    name = ALIASES.get(name, name)
+    if name not in TASKS:
+        raise InputError(f"task: unknown id {name!r}{nearest(name, TASKS)}; allowed: {', '.join(TASKS)}")
+    return name
 
 
 def load(package: str, path: str) -> Any:
