@@ -55,11 +55,35 @@ def differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dic
         (["--coordinator", "host:1"], "coordinator and index are given together"),
         (["--coordinator", "host:1", "--index", "2", "--processes", "2"], "index: 2 is not allowed"),
         (["--coordinator", "host", "--index", "0", "--processes", "2"], "coordinator: 'host' is not allowed"),
+        (
+            ["--coordinator", "host:99999", "--index", "0", "--processes", "2"],
+            "coordinator: 'host:99999' is not allowed",
+        ),
+        (["--coordinator", "host:0", "--index", "0", "--processes", "2"], "coordinator: 'host:0' is not allowed"),
         (["--coordinator", "h:1", "--index", "0", "--processes", "2", "--devices", "0", "1"], "devices: '0, 1' is not"),
     ],
 )
 def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["launch", *flags, *TRAIN]) == 2
+    assert said in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        ({"SLURM_PROCID": "0", "SLURM_LOCALID": "y"}, "SLURM_LOCALID: 'y' is not allowed; it must be a number"),
+        ({"OMPI_COMM_WORLD_RANK": "-1"}, "OMPI_COMM_WORLD_RANK: '-1' is not allowed; it must be a number"),
+        ({launch.MEMBER: "0/2"}, f"{launch.MEMBER}: '0/2' is not allowed; it must be left out"),
+    ],
+)
+def test_variables_that_srun_and_mpirun_do_not_set(
+    variables: dict[str, str], said: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("SLURM_PROCID", raising=False)
+    monkeypatch.setattr(os, "_exit", lambda code: None)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert cli.main(TRAIN if launch.MEMBER in variables else ["launch", "sweep", "sweep.yaml"]) == 2
     assert said in capfd.readouterr().err
 
 

@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import tyro
 
 from mqe_jax import interrupts
+from mqe_jax.cli.meeting import LIMIT, meet
 from mqe_jax.cli.options import echo
 from mqe_jax.errors import InputError
 from mqe_jax.limits import PositiveInt
@@ -41,7 +42,8 @@ _DEVICES = "CUDA_VISIBLE_DEVICES"
 _NO_DEVICES = ("", "-1")  # of `_DEVICES`: JAX computes on the CPU
 _RANKS = {"SLURM_PROCID": "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK": "OMPI_COMM_WORLD_LOCAL_RANK"}
 """Variables of srun and mpirun: a process's index among all, and among those of its host."""
-_ADDRESS = re.compile(r"[^@\s]+:\d{1,5}")
+_ADDRESS = re.compile(r"[^@\s]+:(\d{1,5})")
+_MEMBER = re.compile(rf"(\d+)/(\d+)@({_ADDRESS.pattern})")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _RESUME = "the same command with --resume goes on"
 _REPEAT = "the same command goes on"  # a sweep
@@ -108,22 +110,26 @@ class Launch:
         """Returns the variables of the only process here of a training on several hosts."""
         if self._sweeps:
             fail("coordinator", coordinator, "left out for a sweep: give --processes alone, on every host")
-        if not _ADDRESS.fullmatch(coordinator):
-            fail("coordinator", coordinator, "HOST:PORT")
+        match = _ADDRESS.fullmatch(coordinator)
+        if match is None or not 1 <= int(match[1]) <= 65535:
+            fail("coordinator", coordinator, "HOST:PORT, a port from 1 to 65535")
         if self.processes is None or not 0 <= index < self.processes:
             fail("index", index, f"from 0 to --processes - 1; --processes is {self.processes}")
         return {**(self._own_devices(1)[0] if self.devices else {}), MEMBER: f"{index}/{self.processes}@{coordinator}"}
 
     def _member_of_job(self) -> dict[str, str]:
         """Returns the variables of a process that srun or mpirun has started."""
-        local = next((local for rank, local in _RANKS.items() if rank in os.environ), None)
-        if local is None:
+        names = next((names for names in _RANKS.items() if names[0] in os.environ), None)
+        if names is None:
             raise InputError("processes: missing; give --processes N, or start with srun or mpirun")
+        for name in names:
+            if not os.environ.get(name, "0").isdecimal():
+                fail(name, os.environ[name], "a number, which srun or mpirun sets")
         if self.devices:
             fail("devices", ", ".join(map(str, self.devices)), "left out where srun or mpirun starts the processes")
         if not self._sweeps:
             return {MEMBER: AUTO}
-        index, visible = int(os.environ.get(local, "0")), os.environ.get(_DEVICES)
+        index, visible = int(os.environ.get(names[1], "0")), os.environ.get(_DEVICES)
         if visible in _NO_DEVICES:
             return {MEMBER: ALONE}
         devices = _listed(visible) or [str(index)]
@@ -185,25 +191,41 @@ def join() -> None:
     """
     if MEMBER not in os.environ:
         return
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     member = os.environ[MEMBER]
+    match = _MEMBER.fullmatch(member)
+    if match is None and member not in (AUTO, ALONE):
+        fail(MEMBER, member, "left out: `mqe launch` sets it")
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if member == ALONE:
         return
-    import jax
+    import jax  # before the processes meet: it takes seconds
+
+    if match is not None:
+        meet(match[3], int(match[1]), int(match[2]))
+    alone = threading.Timer(LIMIT, _end_alone)
+    alone.daemon = True
+    alone.start()
 
     jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
     timeouts: Any = {"heartbeat_timeout_seconds": HEARTBEAT, "shutdown_timeout_seconds": HEARTBEAT}
     try:
-        if member == AUTO:
+        if match is None:
             jax.distributed.initialize(**timeouts)
         else:
-            place, address = member.split("@")
-            index, count = map(int, place.split("/"))
             # JAX binds the coordinator's port to all addresses of the machine unless told otherwise.
-            bind = address if address.startswith("127.0.0.1:") else None
-            jax.distributed.initialize(address, count, index, coordinator_bind_address=bind, **timeouts)
-    except (RuntimeError, ValueError) as error:
+            bind = match[3] if match[3].startswith("127.0.0.1:") else None
+            place = int(match[2]), int(match[1])
+            jax.distributed.initialize(match[3], *place, coordinator_bind_address=bind, **timeouts)
+    except Exception as error:  # of JAX's readers of SLURM's and MPI's variables too
         raise InputError(f"coordinator: the other processes cannot be reached ({error})") from None
+    finally:
+        alone.cancel()
+
+
+def _end_alone() -> None:
+    """Ends this process, which JAX keeps waiting for others."""
+    print(f"mqe: coordinator: the other processes did not come within {LIMIT:g} s", file=sys.stderr, flush=True)
+    os._exit(2)
 
 
 def _end_with_parent() -> None:
