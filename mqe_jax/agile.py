@@ -44,9 +44,9 @@ FAST = np.array([2.5, 1.0, 2.5], np.float32)  # m/s forward, m/s to the left, ra
 STAND = 0.02  # share of `FAST` below which the robot shall stand
 
 COMMANDS = (
-    Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0),
-    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0),
-    Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, mirror=-1.0),
+    Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.5, 2.5)),
+    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-1.0, 1.0)),
+    Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, mirror=-1.0, trained=(-2.5, 2.5)),
 )
 _SCALE = np.array([command.scale for command in COMMANDS], np.float32)
 
@@ -117,6 +117,7 @@ class AgileSkill(Skill):
     name = "agile"
     commands = COMMANDS
     period = STEP
+    turn = 3.0
 
     def init_memory(self) -> AgileMemory:
         return AgileMemory(jnp.zeros((LENGTH, FRAME_SIZE)), jnp.zeros(NUM_JOINTS), jnp.zeros(()))

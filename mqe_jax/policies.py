@@ -185,4 +185,4 @@ def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array], jax.Array]:
         )
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")
-    return jax.vmap(plan)
+    return lambda obs: env.controller.rescaled(jax.vmap(plan)(obs))

@@ -267,6 +267,8 @@ def _lenient(hint: Any) -> Any:
         return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
+    if origin is Mapping:
+        return Mapping[parts[0], _lenient(parts[1])]  # type: ignore[valid-type]
     if hint in (int, float):
         return _bounded(Annotated[hint, None])
     before = {bool: _boolean, str: _text, Path: _text}.get(hint)

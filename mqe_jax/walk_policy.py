@@ -53,9 +53,9 @@ PRECISION = "tensorfloat32"  # of the networks' matrix products in an environmen
 
 
 COMMANDS = (
-    Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0),
-    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0),
-    Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, scale=0.25, mirror=-1.0),
+    Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.2, 1.2)),
+    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-0.7, 0.7)),
+    Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, scale=0.25, mirror=-1.0, trained=(-1.2, 1.2)),
     Command("body_height", "m above the robot's standing height", gain=0.12, limit=0.12, scale=2.0),
     Command("gait_frequency", "Hz", 3.0, gain=1.0, limit=1.0),
     Command("phase", "of FL and RR", 0.5),

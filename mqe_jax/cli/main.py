@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         programs.hasten()
         programs.keep()
+        warnings.formatwarning = lambda message, *_, **__: f"mqe: warning: {message}\n"
     try:
         code, message = _attempt(sys.argv[1:] if arguments is None else arguments)
     finally:

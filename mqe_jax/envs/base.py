@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from typing import TYPE_CHECKING
 
 import jax
@@ -90,11 +91,19 @@ class QuadrupedEnv(Task[S, P]):
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         skill = skills.make(self.params.skill, self.robot)
-        if not (npcs := scene.num_robots > self.num_agents) or self.npc_varied:
-            skill = skill.restricted((*self.params.commands, *self.npc_varied), self.params.gait)
+        npc, npcs = None, scene.num_robots > self.num_agents
+        if npcs and self.npc_skill != skill.name:
+            other, npcs = skills.make(self.npc_skill, self.robot), False
+            other = other.restricted(self.npc_varied, None) if self.npc_varied else other
+            other.check_period(scene.timestep, self.physics.num_substeps)
+            npc = other, other.load_params()
+        if not npcs or self.npc_varied:
+            skill = skill.restricted((*self.params.commands, *(self.npc_varied if npcs else ())), self.params.gait)
         uses_skill = control == "command" or npcs
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
+        if uses_skill and (beyond := skill.untrained(self.params.command_ranges)):
+            warnings.warn(f"command_ranges: the skill {skill.name!r} was not trained for {', '.join(beyond)}", stacklevel=1)
         self.controller = Controller(
             mode=control,
             robot=self.robot,
@@ -104,6 +113,8 @@ class QuadrupedEnv(Task[S, P]):
             skill_params=skill.load_params(self.params.skill_weights) if uses_skill else None,
             commands=self.params.commands,
             default_commands=skill.default_commands(self.params.gait),
+            ranges=self.params.command_ranges,
+            npc=npc,
             lag=self.params.randomization.action_lag,
             position_scale=self.params.position_scale,
         )

@@ -81,12 +81,12 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
 
     def npc_commands(self, state: State[DefenderState], robot_state: RobotState) -> jax.Array:
         """Walk commands of the defender (1, C)."""
-        commands = jnp.asarray(self.controller.default_commands)
+        commands = jnp.asarray(self.controller.npc_default_commands)
         if not self.params.defender_idle:
             move = defend(
                 robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
             )
-            commands = commands.at[self.controller.skill.index(self.npc_varied)].set(move)
+            commands = commands.at[self.controller.npc_skill.index(self.npc_varied)].set(move)
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:

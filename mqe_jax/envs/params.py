@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from typing import Literal, TypeVar
 
 from mqe_jax import agile, robots, skills, walk_policy  # noqa: F401  (skills register themselves)
@@ -57,13 +59,17 @@ class TaskParams:
     collision_force: Positive = 1.0
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
     skill: str = "walk"
-    """Skill of the agents with control `command`, and of NPC robots (`mqe_jax.skills`)."""
+    """Skill of the agents with control `command` (`mqe_jax.skills`)."""
     skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
     """Named default commands of the skill; of the walk policy trot, pronk, bound or pace, trot if None."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
     """Commands of the skill that the action sets, in order."""
+    command_ranges: Mapping[str, Range] = dataclasses.field(default_factory=dict)
+    """Lowest and highest value of these commands, by name; the skill's default ranges for those that are not named.
+    Scripted policies keep the default ranges.
+    """
     position_scale: Positive = 1.0
     """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
     joint angles, hips within 0.125 rad.
@@ -101,7 +107,9 @@ class TaskParams:
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""
 
     def __post_init__(self) -> None:
-        skills.make(self.skill, robots.get(self.robot)).check_commands(self.commands)
+        skill = skills.make(self.skill, robots.get(self.robot))
+        skill.check_commands(self.commands)
+        skill.changes(self.commands, self.command_ranges, skill.default_commands(self.gait))
         if self.min_height >= self.max_height:
             fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
 

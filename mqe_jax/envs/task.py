@@ -40,7 +40,9 @@ class Task(Generic[S, P]):
     metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
     """Non-zero values of metrics in a step in which the physics diverged."""
     npc_varied: ClassVar[tuple[str, ...]] = ()
-    """The commands of the skill that `npc_commands` changes; without names it may change all."""
+    """The commands that `npc_commands` changes; without names it may change all."""
+    npc_skill: ClassVar[str] = "walk"
+    """Skill of the NPC robots."""
     variable_num_agents: ClassVar[bool] = False
     """Whether `num_agents` may differ from the task's default."""
 
@@ -92,7 +94,7 @@ class Task(Generic[S, P]):
         return none
 
     def npc_commands(self, state: State[S], robot_state: RobotState) -> jax.Array | None:
-        """Returns the skill's commands (R - A, C) for the NPC robots, or None if there are none."""
+        """Returns commands (R - A, C) of `npc_skill` for the NPC robots, or None if there are none."""
         return None
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:

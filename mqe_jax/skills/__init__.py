@@ -35,6 +35,8 @@ class Command(NamedTuple):
     """Factor in the skill's own observation."""
     mirror: float = 1.0
     """Sign under reflection of left and right."""
+    trained: tuple[float, float] | None = None
+    """Lowest and highest value for which the skill was trained; None for the default +-limit."""
 
 
 class Skill(abc.ABC):
@@ -48,6 +50,8 @@ class Skill(abc.ABC):
     """Named sets of default commands; the first is the default."""
     period: ClassVar[float] = 0.02
     """Environment step, s."""
+    turn: ClassVar[float | None] = None
+    """Maximum |vx x yaw_rate| for which the skill was trained, m/s^2; None sets no bound."""
     robot: Robot
     """Robot type."""
 
@@ -109,6 +113,51 @@ class Skill(abc.ABC):
         for name, value in {**self.gaits.get(gait or next(iter(self.gaits), ""), {}), **values}.items():
             default[self.index([name])] = value
         return default
+
+    def changes(
+        self, names: Sequence[str], ranges: Mapping[str, tuple[float, float]], default: np.ndarray
+    ) -> np.ndarray:
+        """Returns the lowest and the highest change of the named commands by an action (n, 2).
+
+        Args:
+            names: commands that the action sets.
+            ranges: lowest and highest value by command, for some of them; the others change by +-limit.
+            default: default commands (C,).
+
+        Raises:
+            InputError: naming a command that the action does not set, or a range that excludes the default.
+        """
+        limit, default = self.column("limit", names), default[self.index(names)]
+        changes = np.stack([-limit, limit], axis=-1)
+        for name, (low, high) in ranges.items():
+            if name not in names:
+                hint = nearest(name, names)
+                raise InputError(f"command_ranges: unknown command {name!r}{hint}; allowed: {', '.join(names)}")
+            i = list(names).index(name)
+            if not low <= default[i] <= high or low == high:
+                allowed = f"lowest < highest, with the default {default[i]:g} between"
+                raise InputError(f"command_ranges.{name}: {(low, high)} is not allowed; it must be {allowed}")
+            changes[i] = np.array([low, high], np.float32) - default[i]
+        return changes
+
+    def untrained(self, ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+        """Returns the commands whose range exceeds that for which the skill was trained, each with both ranges."""
+        found = []
+        for name, (low, high) in ranges.items():
+            command = self.commands[int(self.index([name])[0])]
+            default = float(self.default_commands()[self.index([name])[0]])
+            least, most = command.trained or (default - command.limit, default + command.limit)
+            if low < least or high > most:
+                found.append(f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]")
+        return found
+
+    def bounded(self, commands: jax.Array) -> jax.Array:
+        """Returns commands (..., C) with the yaw rate reduced to the bound `turn`."""
+        if self.turn is None:
+            return commands
+        vx, yaw = self.index(("vx", "yaw_rate"))
+        most = self.turn / jnp.maximum(jnp.abs(commands[..., vx]), 1e-3)
+        return commands.at[..., yaw].set(jnp.clip(commands[..., yaw], -most, most))
 
     def check_commands(self, names: Sequence[str]) -> None:
         """Checks the commands that the action sets; the InputError names the allowed ones."""
