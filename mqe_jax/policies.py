@@ -125,10 +125,13 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
 def load_as(field: str, source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
     """Returns `load_policy` for a setting or argument, which errors name."""
     try:
-        return load_policy(source, env, deterministic=deterministic)
+        policy = load_policy(source, env, deterministic=deterministic)
     except InputError as error:
         optional = "" if field == "opponent" else ", or none"
         raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
+    if isinstance(policy, TrainedPolicy) and (other := _other_commands(policy, env)):
+        raise InputError(f"{field}: {source} was trained with {other}; its actions mean other commands there")
+    return policy
 
 
 def check_policy(policy: TrainedPolicy, env: QuadrupedEnv, name: str = "policy") -> None:
@@ -145,6 +148,16 @@ def check_policy(policy: TrainedPolicy, env: QuadrupedEnv, name: str = "policy")
         raise InputError(
             f"policy: {name} was trained with (agents, observation, action) {trained}, but {env.name} has {sizes} here"
         )
+
+
+def _other_commands(policy: TrainedPolicy, env: QuadrupedEnv) -> str:
+    """Returns how skill or command ranges of a policy's training differ from those of a task; empty if they do not."""
+    given, ours = policy.config.training_env, env.params
+    ranges = {name: tuple(map(float, pair)) for name, pair in given.get("command_ranges", {}).items()}
+    for field, theirs in (("skill", given.get("skill", TaskParams.skill)), ("command_ranges", ranges)):
+        if env.control == "command" and theirs != getattr(ours, field):
+            return f"{field} {theirs}, not {getattr(ours, field)}"
+    return ""
 
 
 def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:

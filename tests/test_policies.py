@@ -259,6 +259,8 @@ def test_npc_robots_follow_the_skill_in_every_action_mode() -> None:
     """The agents stand at their default angles; the NPC robot leans to the right."""
 
     class Watched(type(make("go1football-defender", impl="c"))):
+        npc_skill = "lean"
+
         def npc_commands(self, state: Any, robot_state: Any) -> jax.Array:
             return jnp.array([[0.3, 0.0]])
 

@@ -34,7 +34,7 @@ def test_a_driven_robot_obeys_the_hand_and_the_others_their_policy() -> None:
 
 def test_a_held_button_counts_until_its_messages_stop() -> None:
     now = [0.0]
-    drive = Drive(LIMIT, clock=lambda: now[0])
+    drive = Drive(-LIMIT, LIMIT, clock=lambda: now[0])
     drive.hold((1.0, 0.0, 0.0))
     drive.hold((0.0, 0.0, 1.0))
     np.testing.assert_allclose(drive.now(), [1.0, 0.0, 0.5])
@@ -47,7 +47,7 @@ def test_a_held_button_counts_until_its_messages_stop() -> None:
 
 
 def test_keys_step_the_command_within_its_limits_and_stop_it() -> None:
-    drive = Drive(LIMIT)
+    drive = Drive(-LIMIT, LIMIT)
     for _ in range(6):
         drive.change((0.25, 0.0, -0.25))
     np.testing.assert_allclose(drive.now(), [1.0, 0.0, -0.5])

@@ -9,7 +9,7 @@ Team 0 has the first half of the agents, team 1 the second half.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
+from mqe_jax.settings import fail
 
 
 class Match(QuadrupedEnv[S, P]):
@@ -51,6 +52,16 @@ class Match(QuadrupedEnv[S, P]):
     def team_of(self) -> np.ndarray:
         """Team of each agent (A,)."""
         return np.repeat([0, 1], self.num_agents // 2)
+
+    def __init__(self, params: P | None = None, **options: Any) -> None:
+        super().__init__(params, **options)
+        mirrors = self.controller.skill.column("mirror", self.params.commands)
+        if self.symmetry == "turn" or self.control != "command":
+            return
+        for name, mirror, (low, high) in zip(self.params.commands, mirrors, self.controller.changes, strict=True):
+            if mirror < 0 and low != -high:
+                given = self.params.command_ranges[name]
+                fail(f"command_ranges.{name}", given, f"symmetric in {self.name}, which mirrors team 1")
 
     # -- task interface (override) ------------------------------------------------------------------------------
 

@@ -42,8 +42,10 @@ class Moment:
 class Drive:
     """Teleoperation of one robot: a command set by keys, plus the commands of held buttons."""
 
-    limit: np.ndarray
-    """Greatest command (3,), m/s and rad/s."""
+    low: np.ndarray
+    """Lowest command (3,), m/s and rad/s."""
+    high: np.ndarray
+    """Highest command (3,), m/s and rad/s."""
     env: int = 0
     """Index of its environment."""
     robot: int | None = None
@@ -59,8 +61,8 @@ class Drive:
     def change(self, step: tuple[float, float, float]) -> None:
         """Adds fractions of the maximum command to the command; zeros stop the robot."""
         self._held.clear()
-        moved = self.command + np.asarray(step) * self.limit
-        self.command = np.clip(moved, -self.limit, self.limit) if any(step) else np.zeros(3)
+        moved = self.command + self._scaled(step)
+        self.command = np.clip(moved, self.low, self.high) if any(step) else np.zeros(3)
 
     def hold(self, direction: tuple[float, float, float]) -> None:
         """Adds fractions of the maximum command until `HOLD_TIME` after the last call."""
@@ -69,8 +71,12 @@ class Drive:
     def now(self) -> np.ndarray:
         """Returns the current command (3,), within its limits."""
         held = [direction for direction, until in list(self._held.items()) if until > self.clock()]
-        total = self.command + np.sum([np.zeros(3), *(np.asarray(d) * self.limit for d in held)], axis=0)
-        return np.clip(total, -self.limit, self.limit)
+        total = self.command + np.sum([np.zeros(3), *map(self._scaled, held)], axis=0)
+        return np.clip(total, self.low, self.high)
+
+    def _scaled(self, direction: tuple[float, float, float]) -> np.ndarray:
+        """Returns fractions of the maximum command as a command (3,)."""
+        return np.abs(direction) * np.where(np.asarray(direction) < 0, self.low, self.high)
 
 
 class Session:
@@ -104,7 +110,7 @@ class Session:
     ) -> None:
         """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
-        self.paused, self.speed, self.drive = False, 1.0, Drive(np.zeros(3))
+        self.paused, self.speed, self.drive = False, 1.0, Drive(np.zeros(3), np.zeros(3))
         self._vector_env, self._policy = vector_env, policy
         self._first_memory = policy.initial_memory(self.num_envs)
         self._key = jax.random.PRNGKey(seed)
@@ -113,8 +119,7 @@ class Session:
         self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(env.params.commands)
         if self.drivable:
             self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
-            skill = env.controller.skill
-            self._gain, self.drive.limit = (skill.column(field, DRIVEN) for field in ("gain", "limit"))
+            self.drive.low, self.drive.high = env.controller.changes[self._columns].T
         self.steps = 0
         self.episodes = np.zeros(self.num_envs, int)
         self.outcomes, self.last = ("success",), [""] * self.num_envs
@@ -140,10 +145,10 @@ class Session:
         """Advances all environments by one step, with automatic reset."""
         self._key, key = jax.random.split(self._key)
         mask = np.zeros((self.num_envs, self.env.num_agents), bool)
-        driven = np.zeros(self.env.action_size, np.float32)
+        driven = np.zeros(self.env.action_size, np.float32)  # change of the commands
         if self.drivable and self.drive.robot is not None:
             mask[self.drive.env, self.drive.robot] = True
-            driven[self._columns] = self.drive.now() / self._gain
+            driven[self._columns] = self.drive.now()
         self.state, self.memory, done, ended, rewards, commands = self._step(self.state, self.memory, key, mask, driven)
         self.steps += 1
         self.episodes += np.asarray(done)
@@ -183,6 +188,7 @@ class Session:
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.
+            driven = env.controller.action_of(driven)
             own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, env.action_size)))
             action = jnp.where(mask[..., None], own, action)
             applied = jax.vmap(lambda a: env.controller.skill_commands(env.unmirror_action(jnp.clip(a, -1.0, 1.0))))

@@ -1,0 +1,136 @@
+"""Command ranges: from actions to commands, scripted policies under other ranges, NPC robots, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import agile, make
+from mqe_jax.control import Controller
+from mqe_jax.errors import InputError
+from mqe_jax.policies import load_as, load_policy
+from mqe_jax.robots.go1 import GO1
+from mqe_jax.skills import make as make_skill
+from mqe_jax.walk_policy import WalkPolicy
+
+WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
+NAMES = ("vx", "vy", "yaw_rate")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("weights") / "agile.safetensors"
+    agile.NETWORKS.save(agile.NETWORKS.init(jax.random.PRNGKey(0)), path)
+    return str(path)
+
+
+def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges: Any) -> Controller:
+    made = make_skill(skill, GO1)
+    return Controller("command", GO1, 1, 1, made, (), commands, made.default_commands(), ranges)
+
+
+@pytest.mark.parametrize(
+    ("skill", "ranges", "action", "commands"),
+    [
+        ("walk", {}, (0.25, -1.0, 0.5), (0.5, -0.5, 0.25)),
+        ("walk", WIDE, (0.5, 1.0, 1.0), (2.5, 1.0, 2.5)),
+        ("walk", WIDE, (1.0, 0.5, -0.5), (2.5, 0.5, -1.25)),
+        ("walk", WIDE, (-0.25, -1.0, 0.0), (-0.75, -1.0, 0.0)),
+        ("walk", {"vx": (0.0, 2.0)}, (-1.0, 1.0, 1.0), (0.0, 0.5, 0.5)),
+        ("walk", {"vy": (-0.2, 0.4)}, (0.0, -0.5, 0.5), (0.0, -0.1, 0.2)),
+        ("agile", WIDE, (0.5, 0.0, 1.0), (2.5, 0.0, 1.2)),  # |vx x yaw rate| is at most 3
+        ("agile", WIDE, (-0.5, 0.0, -1.0), (-1.5, 0.0, -2.0)),
+        ("agile", WIDE, (0.1, 0.0, -1.0), (0.5, 0.0, -2.5)),
+    ],
+)
+def test_actions_are_scaled_to_the_range_on_their_side(skill: str, ranges: Any, action: Any, commands: Any) -> None:
+    given = controller(skill, **ranges).skill_commands(jnp.array([action]))
+    np.testing.assert_allclose(given[0, :3], commands, rtol=1e-6)
+
+
+@pytest.mark.parametrize("commands", [NAMES, ("body_height", "gait_frequency", "pitch", "roll", "stance_width")])
+def test_the_default_ranges_change_nothing(commands: tuple[str, ...]) -> None:
+    walk = WalkPolicy(GO1)
+    gain, limit = (walk.column(field, commands) for field in ("gain", "limit"))
+    action = jax.random.uniform(jax.random.PRNGKey(0), (500, len(commands)), minval=-1.0, maxval=1.0)
+    expected = walk.default_commands()[walk.index(commands)] + jnp.clip(gain * action, -limit, limit)
+    given = controller(commands=commands).skill_commands(action)[:, walk.index(commands)]
+    np.testing.assert_array_equal(given, expected)
+
+
+def test_a_range_is_of_the_command_not_of_its_change() -> None:
+    commands = controller(commands=("gait_frequency",), gait_frequency=(2.0, 5.0)).skill_commands(
+        jnp.array([[-1.0], [0.0], [1.0]])
+    )
+    np.testing.assert_allclose(commands[:, 4], [2.0, 3.0, 5.0])
+
+
+@pytest.mark.parametrize("task", ["go1football-1vs1", "go1football-2vs2", "go1revolvingdoor"])
+def test_scripted_policies_command_the_same_in_other_ranges(task: str, weights: str) -> None:
+    plain = make(task, impl="c", num_envs=1)
+    wide = make(task, impl="c", num_envs=1, skill="agile", skill_weights=weights, command_ranges=WIDE)
+    obs = 3.0 * jax.random.normal(jax.random.PRNGKey(1), (40, len(plain.teams[0]), plain.observation_size))
+    first, second = (
+        np.asarray(env.controller.skill_commands(load_policy("scripted", env).act(obs, (), None)[0].reshape(-1, 3)))
+        for env in (plain, wide)
+    )
+    np.testing.assert_allclose(second, first[:, :3], atol=1e-6)
+    assert np.abs(first[:, :3]).max(0) == pytest.approx([1.0, 0.5, 0.5])
+
+
+@pytest.mark.parametrize(("control", "size"), [("command", 3), ("position", 12)])
+def test_npc_robots_keep_the_walk_policy(control: str, size: int, weights: str) -> None:
+    """The defender's joint targets are those beside agents that walk."""
+    parameters: dict[str, Any] = {"impl": "c", "num_envs": 1, "control": control}
+    agile_env = make("go1football-defender", skill="agile", skill_weights=weights, command_ranges=WIDE, **parameters)
+    targets = []
+    for env in (make("go1football-defender", **parameters), agile_env):
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        assert env.controller.clock(state.control).shape == (3, 2)
+        sensed = env.read(state.data)
+        act = jax.jit(env.controller.targets)
+        control_state = state.control
+        for _ in range(3):
+            commands = env.npc_commands(state, sensed)
+            target, control_state = act(control_state, jnp.ones((2, size)), sensed.proprioception, commands)
+        targets.append(np.asarray(target))
+    np.testing.assert_allclose(targets[0][2], targets[1][2], atol=1e-5)
+    assert (np.abs(targets[0][:2] - targets[1][:2]).max() > 0.05) == (control == "command")
+
+
+@pytest.mark.parametrize(
+    ("ranges", "message"),
+    [
+        ({"vz": (-1, 1)}, r"command_ranges: unknown command 'vz' .did you mean 'v.'.*allowed: vx, vy, yaw_rate"),
+        ({"roll": (-0.1, 0.1)}, r"command_ranges: unknown command 'roll'.*allowed: vx, vy, yaw_rate"),
+        ({"vx": (0.5, 1.0)}, r"command_ranges.vx: \(0.5, 1.0\) .*lowest < highest, with the default 0 between"),
+        ({"vx": (-1.0, -0.5)}, r"command_ranges.vx: .*default 0 between"),
+        ({"vx": (0.0, 0.0)}, r"command_ranges.vx: .*lowest < highest"),
+        ({"vx": (1.0, -1.0)}, r"command_ranges.vx: .*\(lowest, highest\), in this order"),
+        ({"vx": (-1.0, float("inf"))}, r"command_ranges.vx"),
+        ({"vx": (True, 1.0)}, r"command_ranges.vx"),
+        ({"vx": 1.0}, r"command_ranges.vx"),
+        ({"vy": (-0.2, 0.5)}, r"command_ranges.vy: \(-0.2, 0.5\) .*symmetric in go1revolvingdoor"),
+    ],
+)
+def test_bad_ranges_are_named(ranges: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make("go1revolvingdoor", impl="c", num_envs=1, command_ranges=ranges)
+
+
+def test_ranges_beyond_training_warn() -> None:
+    with pytest.warns(UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$"):
+        make("go1gate", impl="c", num_envs=1, command_ranges={"vx": (-1.5, 2), "vy": (-0.6, 0.6)})
+
+
+@pytest.mark.parametrize("parameters", [{"command_ranges": {"vx": (-1.0, 1.2)}}, {"skill": "agile"}])
+def test_opponents_of_other_skills_or_ranges_are_refused(parameters: Any, weights: str) -> None:
+    if "skill" in parameters:
+        parameters = {**parameters, "skill_weights": weights}
+    env = make("go1football-1vs1", impl="c", num_envs=1, **parameters)
+    with pytest.raises(InputError, match=r"opponent: go1football-1vs1 was trained with (skill|command_ranges)"):
+        load_as("opponent", "go1football-1vs1", env)
