@@ -103,7 +103,9 @@ class QuadrupedEnv(Task[S, P]):
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
         if uses_skill and (beyond := skill.untrained(self.params.command_ranges)):
-            warnings.warn(f"command_ranges: the skill {skill.name!r} was not trained for {', '.join(beyond)}", stacklevel=1)
+            warnings.warn(
+                f"command_ranges: the skill {skill.name!r} was not trained for {', '.join(beyond)}", stacklevel=1
+            )
         self.controller = Controller(
             mode=control,
             robot=self.robot,

@@ -74,7 +74,7 @@ class Drive:
         total = self.command + np.sum([np.zeros(3), *map(self._scaled, held)], axis=0)
         return np.clip(total, self.low, self.high)
 
-    def _scaled(self, direction: tuple[float, float, float]) -> np.ndarray:
+    def _scaled(self, direction: tuple[float, ...]) -> np.ndarray:
         """Returns fractions of the maximum command as a command (3,)."""
         return np.abs(direction) * np.where(np.asarray(direction) < 0, self.low, self.high)
 
