@@ -6,8 +6,8 @@
 | `position` | 12 | joint target = default + scale x action, then PD at every physics step |
 | `torque` | 12 | joint torque = action x torque limit |
 
-Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the command, a negative one by
-the lowest, both times the skill's gain / limit. PD control runs inside the physics engine, at every physics step.
+Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the command, a negative one
+by the lowest, both times the skill's gain / limit. PD control runs inside the physics engine, at every physics step.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class ControlState:
     """Controller state of one environment (R robots)."""
 
     skill: Any
-    """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of the agents and of the NPC robots,
-    if these have another skill."""
+    """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and NPC robots, if
+    these have another skill."""
     delayed: jax.Array
     """Past actuator targets, newest first (lag + 1, R, 12)."""
 
@@ -118,7 +118,7 @@ class Controller:
         return self.skill.bounded(commands)
 
     def action_of(self, change: jax.Array) -> jax.Array:
-        """Computes the actions (..., action_size) that change the commands by (..., action_size) around the defaults."""
+        """Computes the actions (..., action_size) that change the commands (..., action_size) from the defaults."""
         down, up = (np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes)
         return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
 

@@ -12,6 +12,7 @@ import pytest
 from mqe_jax import agile, make
 from mqe_jax.control import Controller
 from mqe_jax.errors import InputError
+from mqe_jax.export.task import TaskFunctions
 from mqe_jax.policies import load_as, load_policy
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.skills import make as make_skill
@@ -103,6 +104,12 @@ def test_npc_robots_keep_the_walk_policy(control: str, size: int, weights: str) 
         targets.append(np.asarray(target))
     np.testing.assert_allclose(targets[0][2], targets[1][2], atol=1e-5)
     assert (np.abs(targets[0][:2] - targets[1][:2]).max() > 0.05) == (control == "command")
+
+
+def test_graphs_of_tasks_need_one_skill(weights: str) -> None:
+    env = make("go1football-defender", impl="c", num_envs=1, skill="agile", skill_weights=weights)
+    with pytest.raises(InputError, match="skill: 'agile' is not allowed"):
+        TaskFunctions(env)
 
 
 @pytest.mark.parametrize(

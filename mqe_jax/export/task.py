@@ -59,6 +59,10 @@ class TaskFunctions:
             raise InputError(f"control: {env.control!r} is not allowed; graphs of tasks need 'command'")
         if env.params.actuator_network is not None:
             raise InputError("actuator_network: not allowed; graphs of tasks need PD control")
+        if env.controller.npc:
+            raise InputError(
+                f"skill: {env.params.skill!r} is not allowed; graphs of tasks need one skill for all robots"
+            )
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
         robots = env.read(self._start.data)
