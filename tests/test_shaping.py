@@ -232,6 +232,11 @@ def test_a_demonstrator_needs_episodes_of_sixteen_steps() -> None:
         Demonstrated(task, N, Bending())
 
 
+def test_thousands_of_environments_have_a_demonstrator() -> None:
+    """More than 4096, whose memory is checked before they are made."""
+    assert Demonstrated(make("go1plane", impl="c", control="position"), 4097, Bending()).num_envs == 4097
+
+
 @pytest.fixture(scope="module")
 def rollout() -> tuple[Any, dict[str, Any]]:
     """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading axis time."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Self
 
@@ -91,7 +92,7 @@ class VectorEnv(Batch):
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
         self.num_envs, self.copies = num_envs, copies
         if num_envs * copies > _SMALL:
-            state = jax.eval_shape(self.reset, jax.random.PRNGKey(0))
+            state = jax.eval_shape(functools.partial(VectorEnv.reset, self), jax.random.PRNGKey(0))
             check_memory("num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count())
         self.name = env.name
         self.max_episode_steps = env.max_steps
