@@ -14,8 +14,11 @@ import jax.numpy as jnp
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 
 
-def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, float, Any]:
-    """Returns the seconds of the first call, which compiles, the median seconds of `repeats` further ones, the state.
+WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
+
+
+def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, list[float], Any]:
+    """Returns the seconds of the first call, which compiles, those of `repeats` calls after `WARM_UP` ones, the state.
 
     `run(state) -> state`; each call continues from the previous state and is synchronised.
     """
@@ -23,11 +26,11 @@ def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, f
     state = jax.block_until_ready(run(state))
     first = time.perf_counter() - began
     seconds = []
-    for _ in range(repeats):
+    for _ in range(WARM_UP + repeats):
         began = time.perf_counter()
         state = jax.block_until_ready(run(state))
         seconds.append(time.perf_counter() - began)
-    return first, median(seconds), state
+    return first, seconds[WARM_UP:], state
 
 
 def programs(
@@ -54,14 +57,15 @@ def programs(
 
 
 def bench(
-    env: QuadrupedEnv, vector_env: VectorEnv, key: jax.Array, *, steps: int = 50, repeats: int = 5
+    env: QuadrupedEnv, vector_env: VectorEnv, key: jax.Array, *, steps: int = 50, repeats: int = 10
 ) -> dict[str, str | int | float]:
     """Measures one task on one engine.
 
     An environment step is one step of one environment. `env_steps_per_s` includes everything: control, walk policy,
     physics steps, observations, rewards and automatic resets, under random actions sampled inside the same scan.
     `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without policy, reward
-    and resets. `compile_s` is the first call minus the median call. `overflow` counts the environment steps of one call
+    and resets. Both are medians of `repeats` calls after `WARM_UP` ones; `slowest` and `fastest` are the range of the
+    former. `compile_s` is the first call minus the median call. `overflow` counts the environment steps of one call
     in which the engine may have dropped contacts or constraints.
     """
     whole, bare = programs(env, vector_env, steps, lambda state: jnp.sum(state.metrics["overflow"]))
@@ -69,15 +73,17 @@ def bench(
     walk = jax.jit(lambda carry: whole(carry[0]))
     first, full_s, (_, overflow) = timed(walk, ((state, key), jnp.zeros(steps)), repeats)
     _, bare_s, _ = timed(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
-    full_rate, bare_rate = count * steps / full_s, count * steps / bare_s
+    full_rate, bare_rate = count * steps / median(full_s), count * steps / median(bare_s)
     return {
         "task": vector_env.name,
         "impl": env.physics.impl,
         "num_envs": count,
         "env_steps_per_s": round(full_rate, 1),
+        "slowest": round(count * steps / max(full_s), 1),
+        "fastest": round(count * steps / min(full_s), 1),
         "bare_env_steps_per_s": round(bare_rate, 1),
         "ratio": round(full_rate / bare_rate, 4),
-        "compile_s": round(max(first - full_s, 0.0), 2),
+        "compile_s": round(max(first - median(full_s), 0.0), 2),
         "overflow": round(float(jnp.sum(overflow))),
         "device": device_name(),
         "jax": jax.__version__,

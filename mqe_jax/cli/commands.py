@@ -198,8 +198,8 @@ class Bench(TaskOptions):
     """Number of parallel environments."""
     steps: Horizon = 50
     """Environment steps per timed call."""
-    repeats: Horizon = 5
-    """Number of timed calls; the median is reported."""
+    repeats: Horizon = 10
+    """Number of timed calls after five that warm up; their median, slowest and fastest are reported."""
     seed: Seed = 0
     profile: bool = False
     """Also measure what an environment step and a training update consist of: physics, walk policy (control),
