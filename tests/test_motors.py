@@ -21,7 +21,7 @@ from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.motors import BAND, CLAMP, Motors, leg_response
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
-from tests.soak.play import MODES, drive
+from tests.soak.play import MODES, drive, start_in_air
 from tests.states import initial
 from tests.test_engines import QUICK
 
@@ -179,11 +179,20 @@ def test_hard_driving_stays_within_the_limits(robot: str, mode: str, steps: int)
     assert all(figures[name] <= bar for name, bar in BARS.items()), figures
 
 
-def test_engines_agree_where_motors_saturate() -> None:
+@pytest.mark.parametrize("robot", ["go1", "go2"])
+def test_joints_in_the_air_start_along_their_torque_line(robot: str) -> None:
+    """Explicit integration of a physics step exceeds the line, an implicit one stays below."""
+    for joint, row in start_in_air(robot).items():
+        for name in ("torque", "speed_5", "speed_10"):
+            assert 0.75 < row[name] / row[f"line_{name}"] < 1.35, (joint, row)
+
+
+@pytest.mark.parametrize("robot", ["go1", pytest.param("go2", marks=SOAK)])
+def test_engines_agree_where_motors_saturate(robot: str) -> None:
     """One environment step under saturated torques, from joints in motion."""
     states = {}
     for impl in ("c", "jax"):
-        env: Any = make("go1plane", impl=impl, control="torque", num_agents=1, num_envs=4)
+        env: Any = make("go1plane", impl=impl, control="torque", robot=robot, num_agents=1, num_envs=4)
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
         speed = 0.9 * env.robot.joint_speed_limit * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
         data = state.data.replace(qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(speed))

@@ -46,20 +46,26 @@ def armature(motors: Motors, torque: np.ndarray, joint: int, speeds: np.ndarray)
     share = min(max((fast - 0.85) / 0.15, 0.0), 1.0)
     reach = (abs(speeds[joint]) + motors.timestep * motors.response[own] @ np.abs(torque[leg])) / top
     needed = min(4.0 / motors.response[own, own] * (reach - 1.0), full) if reach > 1.25 else 0.0
+    inertia, line = 1.0 / motors.response[own, own], float(motors.stall[joint]) / top
+    if motors.timestep * line > 2.0 * inertia:
+        most = line * (top - speeds[joint] * np.sign(torque[joint]))
+        needed = max(abs(torque[joint]) / most * (inertia + motors.timestep * line) - inertia, 0.0)
     return max(share * full, needed)
 
 
-def test_motors_are_those_of_a_plain_implementation() -> None:
-    scene = compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1))
+@pytest.mark.parametrize("name", ["go1", "go2"])
+def test_motors_are_those_of_a_plain_implementation(name: str) -> None:
+    robot = robots.get(name)
+    scene = compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robot=robot))
     motors = scene.motors
     random, rows = np.random.default_rng(0), 60
-    assert (motor.SLOW, motor.FAST, motor.REACH, motor.GAIN) == (0.85, 1.0, 1.25, 4.0)
+    assert (motor.SLOW, motor.FAST, motor.REACH, motor.GAIN, motor.STEEP) == (0.85, 1.0, 1.25, 4.0, 2.0)
     velocity = random.uniform(-1.3, 1.3, (rows, 12)) * motors.speed * np.linspace(0, 1, rows)[:, None]
     position, target = random.normal(size=(2, rows, 12))
-    gain, bias = np.full(12, GO1.kp), np.tile([0.3, -GO1.kp, -GO1.kd], (12, 1))
+    gain, bias = np.full(12, robot.kp), np.tile([0.3, -robot.kp, -robot.kd], (12, 1))
     ctrl, added = motors.limit(np, target, position, velocity, gain, bias)
-    asked = GO1.kp * (target - position) - GO1.kd * velocity + 0.3
-    given = GO1.kp * (ctrl - position) - GO1.kd * velocity + 0.3
+    asked = robot.kp * (target - position) - robot.kd * velocity + 0.3
+    given = robot.kp * (ctrl - position) - robot.kd * velocity + 0.3
     expected = [[limited(motors, asked[row, j], j, velocity[row]) for j in range(12)] for row in range(rows)]
     np.testing.assert_allclose(given, expected, rtol=1e-4, atol=1e-4)
     expected = [[armature(motors, given[row], j, velocity[row]) for j in range(12)] for row in range(rows)]

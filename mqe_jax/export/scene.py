@@ -71,5 +71,6 @@ def _motors(env: QuadrupedEnv) -> dict[str, Any]:
         "fast": motors.FAST,
         "reach": motors.REACH,
         "gain": motors.GAIN,
+        "steep": motors.STEEP,
         "clamped": motors.CLAMP,
     }

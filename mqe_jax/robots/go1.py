@@ -2,6 +2,11 @@
 
 Source: the public Unitree Go1 description (masses, inertias, limits); collision shapes are spheres and capsules,
 which all three engines support.
+
+Motors are those of the simulation in which walk-these-ways was trained (its `go1.urdf`), so that its walk policies and
+the paper's results are comparable: 33.5 N m, and 50 rad/s at the hip, 28 at thigh and calf. Unitree's description
+gives 23.7 N m and 30.1 rad/s, at the calf 35.55 N m and 20.06 rad/s. The torque line of a thigh, 20 N m up to 11.3
+rad/s and zero at 28, is conservative beside a measured curve of the motor: 20.2 N m up to 13.5 rad/s, zero at 30.
 """
 
 from __future__ import annotations
@@ -96,9 +101,9 @@ GO1 = Robot(
     default_joints=np.array([0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5]),
     joint_lower=np.tile([-0.803, -1.047, -2.697], 4),
     joint_upper=np.tile([0.803, 4.189, -0.916], 4),
-    joint_speed_limit=np.tile([50.0, 28.0, 28.0], 4),
+    joint_speed_limit=np.tile([50.0, 28.0, 28.0], 4),  # of go1.urdf of walk-these-ways
     torque_limit=np.tile([20.0, 20.0, 25.0], 4),  # of the released controller
-    stall_torque=np.full(12, 33.5),  # the motors' torque limit in the public description
+    stall_torque=np.full(12, 33.5),  # the torque limit in go1.urdf of walk-these-ways
     # Of the robot's model in MuJoCo Menagerie, as are the two after it.
     rotor_inertia=np.full(12, 0.01),
     joint_damping=np.tile([1.0, 2.0, 2.0], 4),

@@ -4,10 +4,12 @@ A motor gives at most its controller's limit L and at most the torque of a DC mo
 its speed v: S is its stall torque, V its speed limit. Above V it brakes, with L at (1 + `BAND`) V. These bounds are
 evaluated at the start of every physics step.
 
-Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So a leg that is fast, or
-whose torques can carry it far beyond V within the step, also gets an armature (rotor inertia) for this physics step:
-the implicit form of the braking above V. A robot that walks has none. What torques, joint limits and contacts still
-accelerate beyond `CLAMP` V is set to `CLAMP` V, as PhysX does with a joint's velocity limit.
+Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So some joints get an
+armature (rotor inertia) for this physics step. In a leg that is fast, or whose torques can carry it far beyond V within
+the step, it is the implicit form of the braking above V. In a joint whose torque line is too steep for the step (the
+calf of the Go2), it is the implicit form of that line, in proportion to the torque; a free joint then moves as by
+backward Euler. What torques, joint limits and contacts still accelerate beyond `CLAMP` V is set to `CLAMP` V, as PhysX
+does with a joint's velocity limit.
 
 The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
 """
@@ -29,6 +31,7 @@ BAND = 0.15  # share of the speed limit above it at which the motor brakes with 
 SLOW, FAST = 0.85, 1.0  # shares of a leg's lowest speed limit at which its armature begins and is complete
 REACH = 1.25  # share of its speed limit that a joint's torques may carry it to within a physics step without armature
 GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
+STEEP = 2.0  # timestep x slope of the torque line / inertia, above which explicit integration of the line is unstable
 CLAMP = 1.09  # greatest share of the speed limit after a physics step
 ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
 
@@ -101,7 +104,7 @@ class Motors:
         force = _force(ctrl, position, velocity, gain, bias)
         given = sign * xp.minimum(xp.maximum(sign * force, -self.torque), most)
         ctrl = ctrl + (given - force) / xp.where(gain == 0, 1, gain)
-        return ctrl, self._armature(xp, pace, xp.abs(given))
+        return ctrl, self._armature(xp, pace, xp.abs(given), given * sign < 0)
 
     def idle(self, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> np.ndarray:
         """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no armature (...,) bool.
@@ -113,7 +116,7 @@ class Motors:
         """
         pace = np.abs(velocity)
         effort = np.abs(_force(ctrl, position, velocity, gain, bias))
-        idle = effort <= np.minimum(self._line * (self.speed - pace), self.torque)
+        idle = effort <= np.minimum(self._light * (self.speed - pace), self.torque)
         idle &= pace <= self._slow
         pace += self._kick(np, effort)
         idle &= pace <= self._near
@@ -131,15 +134,27 @@ class Motors:
             total += legs[:, i : i + 1] * added[i]
         return total.reshape(effort.shape)
 
-    def _armature(self, xp: Any, pace: Any, effort: Any) -> Any:
-        """Returns the armature (..., J), kg m^2, at speeds of magnitude `pace` and torques of magnitude `effort`."""
+    def _armature(self, xp: Any, pace: Any, effort: Any, against: Any) -> Any:
+        """Returns the armature (..., J), kg m^2.
+
+        Args:
+            xp: numpy or jax.numpy.
+            pace: magnitudes of the speeds (..., J), rad/s.
+            effort: magnitudes of the torques (..., J), N m.
+            against: whether a torque is against its speed (..., J).
+        """
         size = len(self.response)
         fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
         near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
         reach = (pace + self._kick(xp, effort)) / self.speed
-        if xp is np and near.max() <= 0.0 and reach.max() <= REACH:
+        if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
             return np.zeros_like(pace)
         needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH)
+        if self._steep.any():
+            line = self._line * (self.speed + xp.where(against, pace, -pace))
+            share = xp.minimum(effort / xp.maximum(line, ROUNDING), 1.0)  # of the line's torque
+            implicit = share * (self._inertia + self.timestep * self._line) - self._inertia
+            needed = xp.where(self._steep, xp.maximum(implicit, 0.0), needed)
         return xp.maximum(xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1) * self._full, needed)
 
     @functools.cached_property
@@ -151,6 +166,22 @@ class Motors:
     def _line(self) -> np.ndarray:
         """Slope of the torque line (..., J), N m s; smaller than `_brake`."""
         return self.stall / self.speed
+
+    @functools.cached_property
+    def _inertia(self) -> np.ndarray:
+        """Inertia of each joint in a free leg (..., J), kg m^2."""
+        return np.tile(1.0 / np.diag(self.response), self._leg_speed.shape)
+
+    @functools.cached_property
+    def _steep(self) -> np.ndarray:
+        """Joints whose torque line is too steep for explicit integration (..., J) bool."""
+        return self.timestep * self._line > STEEP * self._inertia
+
+    @functools.cached_property
+    def _light(self) -> np.ndarray:
+        """Slope of the torques without armature (..., J), N m s; less than `_line` where that is steep."""
+        share = self._inertia / (self._inertia + self.timestep * self._line)
+        return np.where(self._steep, np.float32(1.0 - ROUNDING) * share, np.float32(1.0)) * self._line
 
     @functools.cached_property
     def _brake(self) -> np.ndarray:
@@ -165,7 +196,7 @@ class Motors:
     @functools.cached_property
     def _needed(self) -> np.ndarray:
         """Armature per share of the speed limit beyond it (..., J), kg m^2."""
-        return np.tile(GAIN / np.diag(self.response), self._leg_speed.shape)
+        return np.float32(GAIN) * self._inertia
 
     @functools.cached_property
     def _leg_speed(self) -> np.ndarray:
@@ -180,7 +211,7 @@ class Motors:
     @functools.cached_property
     def _near(self) -> np.ndarray:
         """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry it further."""
-        return np.float32((1.0 - ROUNDING) * REACH) * self.speed
+        return np.float32((1.0 - ROUNDING) * REACH) * np.where(self._steep, np.float32(np.inf), self.speed)
 
     def repeated(self, count: int) -> Motors:
         """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""

@@ -2,7 +2,7 @@
 
 Robots driven hard on flat ground: joint speeds and angles against their limits, in every physics step;
 `python -m tests.soak.play [--robot go1] [--mode saturated] [--control torque] [--steps 1000000]` prints the figures;
-`--mode walk` those of the walk policy under commands.
+`--mode walk` those of the walk policy under commands, `--mode air` how fast each joint starts from rest.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from mqe_jax.cli.bench import device_name
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.planners import scripted_policy
+from mqe_jax.robots.motors import leg_response
+from mqe_jax.robots.robot import JOINTS
 
 if TYPE_CHECKING:
     from tests.soak.__main__ import Report
@@ -179,6 +181,37 @@ def drive(robot: str, mode: str, steps: int, control: str = "torque", num_envs: 
     }
 
 
+def start_in_air(robot: str) -> dict[str, dict[str, float]]:
+    """Drives each joint of a leg in the air from rest with its torque limit, on the C engine.
+
+    Returns:
+        by joint, simulated and, as `line_*`, of a free joint that follows its torque line exactly: mean `torque` of the
+        first physics step, N m; `speed_5` and `speed_10` after 5 and 10 ms, rad/s.
+    """
+    env: Any = make("go1plane", impl="c", robot=robot, num_agents=1, control="torque", num_envs=3)
+    index, own, timestep = env.index, env.robot, env.compiled.model.opt.timestep
+    data = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3)).data
+    qpos = data.qpos.at[:, index.base_qpos[0, 2]].set(2.0).at[:, index.joint_qpos[0]].set(own.default_joints)
+    data = data.replace(qpos=qpos, qvel=jnp.zeros_like(data.qvel))
+    step = jax.jit(jax.vmap(lambda data, torque: env.physics.step(data, torque, num_substeps=1)[0]))
+    rows = {}
+    for j, (name, torque) in enumerate(zip(JOINTS, own.torque_limit, strict=False)):
+        first = step(data, jnp.zeros((3, 12)).at[:, j].set(torque))
+        second = step(first, jnp.zeros((3, 12)).at[:, j].set(torque))
+        speeds = [float(state.qvel[0, index.joint_qvel[0, j]]) for state in (first, second)]
+        response, top, stall = leg_response(own)[j, j], own.joint_speed_limit[j], own.stall_torque[j]
+        line, speed = [], 0.0
+        for i in range(2000):
+            speed += timestep / 1000 * response * min(torque, stall * (1 - speed / top))
+            line += [speed] * (i % 1000 == 999)
+        rows[name] = {
+            prefix + key: round(value, 2)
+            for prefix, pair in (("", speeds), ("line_", line))
+            for key, value in (("torque", pair[0] / timestep / response), ("speed_5", pair[0]), ("speed_10", pair[1]))
+        }
+    return rows
+
+
 def _quantile(counts: np.ndarray, top: float) -> float:
     """Returns the 99.9% quantile of a histogram over [0, top], at the upper edge of its bin; 0 in the first bin."""
     place = int(np.searchsorted(np.cumsum(counts), 0.999 * counts.sum()))
@@ -188,8 +221,9 @@ def _quantile(counts: np.ndarray, top: float) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="go1")
-    parser.add_argument("--mode", default="saturated", choices=(*MODES, WALK))
+    parser.add_argument("--mode", default="saturated", choices=(*MODES, WALK, "air"))
     parser.add_argument("--control", default="torque", choices=("torque", "position"))
     parser.add_argument("--steps", type=int, default=1_000_000)
     arguments = parser.parse_args()
-    print(json.dumps(vars(arguments) | drive(**vars(arguments))))
+    driven = start_in_air(arguments.robot) if arguments.mode == "air" else drive(**vars(arguments))
+    print(json.dumps(vars(arguments) | driven))

@@ -62,7 +62,7 @@ class Motors {
       const wanted = clip(force, -torque[i], torque[i]);
       const result = Math.min(Math.max(wanted, lower), upper);
       ctrl[this.actuator[i]] = result === wanted ? asked[i] : asked[i] + (result - force) / gain[i];
-      given[i] = Math.abs(result);
+      given[i] = result;
     }
     const armature = model.dof_armature;
     const size = this.response.length;
@@ -71,7 +71,7 @@ class Motors {
 
   /** Sets the armature of the joints of one leg, which begin at `leg`. */
   setArmature(armature, leg, size) {
-    const { velocity, given, speed, torque, response, timestep, band, slow, fast, reach, gain } = this;
+    const { velocity, given, speed, torque, stall, response, timestep, band, slow, fast, reach, gain, steep } = this;
     let [fastest, lowest] = [0, Infinity];
     for (let i = leg; i < leg + size; i++) {
       fastest = Math.max(fastest, Math.abs(velocity[i]));
@@ -81,10 +81,16 @@ class Motors {
     for (let j = 0; j < size; j++) {
       const i = leg + j;
       let kick = 0;
-      for (let k = 0; k < size; k++) kick += response[k][j] * given[leg + k];
+      for (let k = 0; k < size; k++) kick += response[k][j] * Math.abs(given[leg + k]);
       const full = (timestep * torque[i]) / (band * speed[i]);
       const reached = (Math.abs(velocity[i]) + timestep * kick) / speed[i];
-      const needed = reached > reach ? clip((gain * (reached - 1)) / response[j][j], 0, full) : 0;
+      let needed = reached > reach ? clip((gain * (reached - 1)) / response[j][j], 0, full) : 0;
+      const [line, inertia] = [stall[i] / speed[i], 1 / response[j][j]];
+      if (timestep * line > steep * inertia) {
+        const most = line * (speed[i] - velocity[i] * Math.sign(given[i]));
+        const share = Math.min(Math.abs(given[i]) / Math.max(most, 1e-5), 1);
+        needed = Math.max(share * (inertia + timestep * line) - inertia, 0);
+      }
       armature[this.qvel[i]] = this.armature[i] + Math.max(near * full, needed);
     }
   }
