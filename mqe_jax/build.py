@@ -21,10 +21,10 @@ from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_as, load_policy
 from mqe_jax.settings import Parameters, check, fail, load_yaml, override
-from mqe_jax.train.checks import check_divisible
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
-from mqe_jax.train.learner import env_dims
+from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.start import initial_key, policy_to_start
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
@@ -82,6 +82,8 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     eval_env = None
     if config.evaluation.every is not None:
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
+    if config.train_env:
+        _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env)
     _check_teams(both, config)
     learning: Any
     if len(both.teams) < 2:
@@ -99,31 +101,28 @@ def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
     return learning, eval_env
 
 
-def check_start(config: TrainConfig) -> None:
-    """Raises an InputError where a training could not start: for parameters, rewards, policies, or sizes of rollouts.
-
-    It makes the task with the parameters of training and of evaluation, for one environment.
-    """
-    env, single = make_env(config.task or "", "auto", config.training_env, 1)
-    if config.train_env:
-        make_env(config.task or "", "auto", config.env, 1)
-    _check_teams(env, config)
-    dims = env_dims(single, config)
-    if len(env.teams) > 1:  # the policy has one team
-        size = len(env.teams[0])
-        dims = dims._replace(agents=size, values=min(dims.values, size))
-    network = config.network.build(dims)
-    check_divisible(config, network)
+def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
+    """Raises an InputError where a training of seeds could not start."""
+    check_loggers(config.loggers)
+    env, _ = environments(impl, config, seeds)
+    make_learner(env, config)
     if config.start is not None:
+        network = config.network.build(env_dims(env, config))
         policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config)
-    for name in {*config.opponents} - {*MOVING}:
-        load_as("opponent", name, env)
-    for field, name in (
-        ("curriculum.demonstrator", config.curriculum.demonstrator),
-        ("imitation.teacher", config.imitation.teacher),
+
+
+def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv) -> None:
+    """Raises an InputError where a policy that is trained in a task could not act in it as it is evaluated."""
+    for name, own, other in (
+        ("control", training.control, env.control),
+        ("robot", training.robot.name, env.robot.name),
+        ("skill", training.params.skill, env.params.skill),
+        ("commands", training.params.commands, env.params.commands),
+        ("command_ranges", training.params.command_ranges, env.params.command_ranges),
+        ("size of the observation", training.observation_size, env.observation_size),
     ):
-        if name is not None:
-            load_as(field, name, env)
+        if own != other:
+            fail(f"train_env.{name}", own, f"that of env, {other!r}, in which the policy is evaluated")
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import itertools
 import json
 import os
 import platform
@@ -43,7 +44,7 @@ _locks: dict[Path, os.stat_result] = {}  # folders that this process has locked,
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a new file of the same folder and suffix, with a name that nobody can know, renamed to `path` at the end.
 
-    The file is removed if this fails, or a signal ends the process. An OSError names `path`.
+    It creates the folder. The file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
     unique = f"{_HOST}-{os.getpid()}-{secrets.token_hex(8)}"
     temporary = path.with_name(f".mqe-{unique}.tmp{path.suffix}")
@@ -51,6 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
     interrupts.temporaries.add(temporary)
     try:
         with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
             yield temporary
             check_locks(path)
@@ -301,14 +303,42 @@ def user_cache() -> Path:
     return Path(home) / "mqe_jax"
 
 
-def check_folder(folder: Path, field: str = "run_dir") -> None:
-    """Creates a folder, and raises an InputError that names the field if it cannot be written."""
+def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None) -> None:
+    """Raises an InputError that names the field unless a folder, for a file, can be written, or created.
+
+    It leaves nothing behind.
+    """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{field}: {folder} cannot be written ({error.strerror or error})") from None
+        there = next(path for path in (folder, *folder.parents) if path.exists() or path.is_symlink())
+        with tempfile.TemporaryDirectory(prefix=".mqe-", dir=there) as inner:
+            made = Path(inner, folder.relative_to(there))
+            made.mkdir(parents=True, exist_ok=True)
+            (made / (file.name if file is not None and file.name else "a")).touch()
+    except (OSError, ValueError) as error:  # ValueError: a null byte
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{field}: {file or folder} cannot be written ({reason})") from None
+
+
+def check_output(path: Path, field: str = "output") -> None:
+    """Raises an InputError that names the field unless a file can be written, in a folder that need not exist."""
+    check_folder(path.parent, field, path)
+    if not path.name or (path.exists() and not path.is_file()):
+        raise InputError(f"{field}: {str(path)!r} is not allowed; it must be a file, not a folder or a device")
+
+
+@contextlib.contextmanager
+def making(folder: Path) -> Iterator[None]:
+    """Creates a folder; where its use raises, those that were missing and are empty go again. An OSError names it."""
+    missing = list(itertools.takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
+    try:
+        with naming(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for path in missing:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+        raise
 
 
 @contextlib.contextmanager

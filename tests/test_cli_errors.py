@@ -99,6 +99,55 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "fifo.yaml"]  # nothing half-written
 
 
+OUTPUTS = {
+    "render": (["render", "go1gate", "-o"], ".gif"),
+    "replay": (["replay", "none.npz", "-o"], ".png"),
+    "bench": (["bench", "--profile", "-o"], ".png"),
+    "export": (["export", "go1gate", "--onnx"], ".onnx"),
+    "convert": (["skill", "convert", "walk", "fifo", "fifo", "-o"], ".safetensors"),
+}
+"""Commands that write a file, and its suffix."""
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("kind", ["in no folder", "folder", "device", "long", "below a file"])
+def test_an_output_is_checked_before_the_work(
+    name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(build, "make_env", lambda *_: pytest.fail("it was not checked first"))
+    monkeypatch.setattr("mqe_jax.policies.load_policy", lambda *_: pytest.fail("it was not checked first"))
+    os.mkfifo("fifo")
+    words, suffix = OUTPUTS[name]
+    Path(f"folder{suffix}").mkdir()
+    os.mkfifo(f"device{suffix}")
+    before = sorted(tmp_path.iterdir())
+    place = {"in no folder": "/proc/none/a", "long": "new/" + "a" * 300, "below a file": "fifo/new/a"}.get(kind, kind)
+    assert cli.main([*words, place + suffix]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and place in error and ("cannot be written" in error or "must be a file" in error)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["tournament", "go1tug", "nobody", "-o", "new/tournament"],
+        ["play-site", "nobody", "-o", "new/site"],
+        ["play-site", "go1gate", "--libraries", ".", "-o", "new/site"],
+        ["demo", "--run-dir", "new/demo", "--config", "nobody"],
+        ["train", "go1plane", *SMALL, "--control", "position", "--start", "go1gate", "--run-dir", "new/run"],
+        ["eval", "go1plane", "--episodes", "1", "--policy", "nobody", "--dump-diverged", "new/diverged"],
+        ["sweep", "none.yaml", "--folder", "new/sweep"],
+        ["report", "new/sweep"],
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_errors_leave_no_folders(arguments: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(arguments) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

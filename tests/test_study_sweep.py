@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -265,6 +267,12 @@ def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) ->
         (f"settings: {{start: {zoo.file_of('go1gate')}}}\n", r"^go1gate/mappo: .* with this run's network"),
         ("settings: {num_envs: 7, ppo: {minibatches: 1000}}\n", r"^go1gate/mappo: ppo\.minibatches: 1000"),
         ("settings: {opponents: [idle]}\n", r"^go1gate/mappo: opponents"),
+        ("settings: {train_env: {control: position}}\n", r"^go1gate/mappo: train_env\.control: .* env, 'command'"),
+        ("settings: {train_env: {robot: go2}}\n", r"^go1gate/mappo: train_env\.robot: 'go2' .* env, 'go1'"),
+        (
+            "tasks: [go1tug]\nsettings: {opponents: [older, older], league: {members: 2}}\n",
+            r"^go1tug/mappo: league\.members: 2",
+        ),
         ("tasks: [go1gate, go1tug]\nvariants: {a: {opponents: [nobody]}}\n", r"^go1gate/mappo\+a: opponents"),
     ],
 )
@@ -272,6 +280,34 @@ def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, 
     sweep = load(tmp_path, text if text.startswith("tasks") else "tasks: [go1gate]\n" + text)
     with pytest.raises(InputError, match=message):
         sweeps.plan(sweep, tmp_path, config_of, check=setup.check_start)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda study: (study / "runs").touch(), r"run_dir: .*seed0 cannot be written \(Not a directory"),
+        (lambda study: (study / "runs/go1gate/jrpo/seed1/a").mkdir(parents=True), None),
+        (lambda study: (study / "runs/go1gate/jrpo/seed1/a/b").mkdir(parents=True), "seed1 holds a but no checkpoint"),
+        (lambda study: (study / "report").symlink_to("/proc/none"), "folder: .*report cannot be written"),
+        (
+            lambda study: (study / "sweep.yaml").write_text("tasks: [go1gate]\nsettings: {num_envs: 8}"),
+            "settings: .* differs",
+        ),
+    ],
+    ids=["file", "empty folder", "other files", "report", "other sweep"],
+)
+def test_folders_are_checked_before_the_first_cell_trains(
+    make: Callable[[Path], object], message: str | None, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Also by --dry-run."""
+    load(tmp_path)
+    (tmp_path / "study").mkdir()
+    make(tmp_path / "study")
+    before = sorted(tmp_path.rglob("*"))
+    code = cli.main(["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study"), "--dry-run"])
+    assert code == (0 if message is None else 2)
+    assert re.search(message or "^$", capfd.readouterr().err)
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_the_shipped_policies_can_be_planned_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:

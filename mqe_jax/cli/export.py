@@ -11,7 +11,7 @@ import tyro
 
 from mqe_jax.cli.options import Json, echo, print_table
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, write_atomically
+from mqe_jax.files import check_folder, check_output, write_atomically
 from mqe_jax.settings import record
 
 
@@ -31,8 +31,9 @@ class Export:
         from mqe_jax.policies import load_policy
 
         _check_installed()
-        if self.onnx.suffix != ".onnx" or self.onnx.is_dir():
+        if self.onnx.suffix != ".onnx":
             raise InputError(f"onnx: {str(self.onnx)!r} is not allowed; it must be a file that ends in .onnx")
+        check_output(self.onnx, "onnx")
         policy = load_policy(self.run_dir)
         task = policy.config.task
         if task is None:
@@ -43,7 +44,6 @@ class Export:
 
         env, _ = make_env(task, "auto", policy.config.env, 1)
         model, error = checked_onnx(policy, env)
-        check_folder(self.onnx.parent, "onnx")
         write_atomically(self.onnx, model.SerializeToString())
         sizes = shapes(model)
         echo(f"mqe: wrote {self.onnx}, {self.onnx.stat().st_size / 1e6:.1f} MB")

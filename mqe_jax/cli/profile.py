@@ -25,10 +25,11 @@ from mqe_jax import build
 from mqe_jax.cli.bench import device_name, programs
 from mqe_jax.cli.options import print_table
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
-from mqe_jax.files import replacing
-from mqe_jax.settings import override
+from mqe_jax.files import check_output, replacing
+from mqe_jax.settings import fail, override
 from mqe_jax.train.learner import make_learner
 
+SUFFIXES = (".png", ".pdf", ".svg")
 SCOPES = ("physics", "control", "task", "reset")
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%(\S+) = .*?\s([a-z][a-z\-]*)\(", re.MULTILINE)
 _SAMPLE = 8  # environments in which contacts are counted in every step
@@ -211,6 +212,10 @@ def profile_training(task: str, impl: str, env: dict[str, Any], num_envs: int) -
 
 def run(command: Any) -> dict[str, Any]:
     """Returns the object of `mqe bench --profile`: a profile for each number of environments."""
+    if command.output is not None:
+        check_output(command.output)
+        if command.output.suffix not in SUFFIXES:
+            fail("output", str(command.output), f"a file that ends in {', '.join(SUFFIXES)}")
     rows, impl = [], command.impl
     for num_envs in command.sizes or (command.num_envs,):
         env, vector = build.make_env(command.task, command.impl, command.overrides(), num_envs)

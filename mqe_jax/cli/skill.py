@@ -11,6 +11,7 @@ import tyro
 
 from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed, echo, print_table
 from mqe_jax.errors import InputError
+from mqe_jax.files import check_output
 from mqe_jax.limits import Environments
 from mqe_jax.settings import record
 
@@ -82,6 +83,7 @@ class SkillConvert:
 
         if self.output.suffix != ".safetensors":
             raise InputError(f"output: {str(self.output)!r} is not allowed; it must end in .safetensors")
+        check_output(self.output)
         for path in (self.adaptation, self.body):
             if not path.is_file():
                 raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")

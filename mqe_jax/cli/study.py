@@ -15,7 +15,7 @@ import tyro
 from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions, echo
 from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
-from mqe_jax.files import check_folder
+from mqe_jax.files import check_output
 from mqe_jax.limits import Candidates, Positive
 from mqe_jax.literal import line
 from mqe_jax.settings import fail, record
@@ -68,7 +68,9 @@ class Sweep:
         def stop() -> bool:
             return self.time_limit is not None and time.monotonic() - began > 60.0 * self.time_limit
 
-        jobs = sweeps.plan(settings, folder, config_of, self.cells, self.seeds, check_start)
+        sweeps.prepare(settings, folder, write=False)
+        check = functools.partial(check_start, impl=self.impl)
+        jobs = sweeps.plan(settings, folder, config_of, self.cells, self.seeds, check)
         result = _estimate(sweeps.estimate(folder, jobs), jobs)
         if self.dry_run:
             if not self.json:
@@ -143,10 +145,11 @@ class Tournament(TaskOptions):
         from mqe_jax.league import tournament
         from mqe_jax.policies import load_policy
 
+        for name in (tournament.CSV, tournament.PICTURE):
+            check_output(self.output / name)
         env, _ = make_env(self.task, self.impl, self.overrides(), 1)
         if len(env.teams) < 2:
             fail("task", self.task, "a match: it has one team")
-        check_folder(self.output, "output")
         names = list(dict.fromkeys([*self.policies, *anchors(env)]))
         _, matches = make_env(self.task, self.impl, self.overrides(), len(names) * self.episodes)
         policies = {name: load_policy(name, matches.env, deterministic=self.deterministic) for name in names}

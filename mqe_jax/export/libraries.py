@@ -57,15 +57,16 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
     Raises:
         InputError: for a file that the other folder lacks, or where npm cannot fetch a package of the pinned content.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    contents = {}
     for package in PACKAGES:
         archive = None if source is not None else _archive(package)
         for file in package.files:
             name = Path(file).name
             if source is not None and not (source / name).is_file():
                 raise InputError(f"libraries: {source} has no {name}, of {package.name}@{package.version}")
-            content = (source / name).read_bytes() if source is not None else _member(archive, file)
-            write_atomically(folder / name, content)
+            contents[name] = (source / name).read_bytes() if source is not None else _member(archive, file)
+    for name, content in contents.items():
+        write_atomically(folder / name, content)
 
 
 def _archive(package: Package) -> Path:

@@ -113,7 +113,6 @@ def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings
     writer.writerow(("team0", "team1", *OUTCOMES, "rating_of_team0", "low", "high"))
     for i, j in itertools.product(range(len(names)), repeat=2):
         writer.writerow((names[i], names[j], *results[i, j], *(f"{x[i]:.1f}" for x in ratings)))
-    folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / CSV, text.getvalue().encode())
     _draw(names, results, folder / PICTURE)
 

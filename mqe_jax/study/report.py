@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mqe_jax.files import write_atomically
+from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.literal import to_markdown
 from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
@@ -25,7 +25,9 @@ def report(folder: Path, reference: Reference | None = None) -> list[Path]:
     Raises:
         InputError: if no run is finished, or a file of one is damaged.
     """
-    return write_report(read_runs(folder), folder / "report", reference or Reference())
+    runs = read_runs(folder)
+    check_folder(folder / "report", "folder")
+    return write_report(runs, folder / "report", reference or Reference())
 
 
 def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> list[Path]:
@@ -53,7 +55,6 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
     if any(run.absolute is not None for run in runs):
         files["marl_eval.json"] = (json.dumps(to_marl_eval(runs), indent=1) + "\n").encode()
     files["report.md"] = "\n".join(text).encode()
-    target.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         write_atomically(target / name, content)
     return [target / name for name in files]

@@ -21,12 +21,13 @@ import yaml
 from annotated_types import MaxLen, MinLen
 
 from mqe_jax.errors import InputError, InUseError, NonFiniteError, nearest
-from mqe_jax.files import check_folder, locked, write_atomically
+from mqe_jax.files import check_folder, locked, making, write_atomically
 from mqe_jax.limits import Seed, Seeds
 from mqe_jax.settings import build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.folder import check_folders
 from mqe_jax.train.runner import OnUpdate, train_seeds
 from mqe_jax.train.types import VectorEnv
 
@@ -125,15 +126,15 @@ def plan(
     config_of: Callable[[str, str], TrainConfig],
     cells: Sequence[str] = (),
     seeds: Sequence[int] = (),
-    check: Callable[[TrainConfig], object] = lambda config: None,
+    check: Callable[[TrainConfig, int], object] = lambda config, seeds: None,
 ) -> list[Job]:
     """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
 
     Of the sweep's seeds those in `seeds` are trained, or all if it is empty. `config_of(task, algorithm)` gives the
-    settings that those of the sweep override, and `check` raises an InputError for settings with which a run could not
-    start: here, before the first cell is trained. Finished runs are left out. Seeds whose newest checkpoints differ are
-    trained in separate jobs, so that all seeds of a job start from the same step. InputError for a task, an
-    algorithm, a setting, a pattern or a seed that is not allowed.
+    settings that those of the sweep override, and `check(config, seeds)` raises an InputError for settings with which
+    so many seeds could not start: here, before the first cell is trained. Finished runs are left out. Seeds whose
+    newest checkpoints differ are trained in separate jobs, so that all seeds of a job start from the same step.
+    InputError for a task, an algorithm, a setting, a pattern, a seed or a run folder that is not allowed.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
@@ -144,14 +145,16 @@ def plan(
         named = {"start": config.start, "opponents": config.opponents}
         if "{task}" in str(named):
             config = override(config, _for_task(named, cell.task))
-        try:
-            check(config)
-        except InputError as error:
-            raise InputError(f"{cell.path.as_posix()}: {error}") from None
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
-        newest = {seed: "".join(file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:]) for seed in left}
         size = sweep.seeds_together or len(sweep.seeds)
+        try:
+            check(config, min(size, len(wanted)))
+            for seed in left:
+                check_folders([_run(folder, cell, seed)], resume=True)
+        except InputError as error:
+            raise InputError(f"{cell.path.as_posix()}: {error}") from None
+        newest = {seed: "".join(file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:]) for seed in left}
         for name in sorted({*newest.values()}, reverse=True):  # those without a checkpoint last
             group = [seed for seed in left if newest[seed] == name]
             jobs += [_job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)]
@@ -208,13 +211,16 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
     return seconds
 
 
-def prepare(sweep: Sweep, folder: Path) -> None:
-    """Creates the folder and writes sweep.yaml into it; tasks, algorithms, variants and seeds may be added later.
+def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
+    """Writes sweep.yaml into a folder; tasks, algorithms, variants and seeds may be added later.
+
+    Without `write` it only checks what the sweep will need.
 
     Raises:
-        InputError: if the folder contains a sweep with different settings.
+        InputError: if the folder contains a sweep with different settings, or cannot be written.
     """
-    check_folder(folder, "folder")
+    for place in (folder, folder / "report"):
+        check_folder(place, "folder")
     path = folder / SWEEP_FILE
     if path.is_file():
         before = load_sweep(path)
@@ -225,7 +231,8 @@ def prepare(sweep: Sweep, folder: Path) -> None:
         for name, values in before.variants.items():
             if sweep.variants.get(name, values) != values:
                 raise InputError(f"variants.{name}: differs from {path}, which has {values!r}; name another folder")
-    write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
+    if write:
+        write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
 
 class Outcome(NamedTuple):
@@ -273,7 +280,7 @@ def _train(job: Job, environments: Environments, on_update: OnUpdate | None, sto
         return
     with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
         for run_dir in job.folders:
-            run_dir.mkdir(parents=True, exist_ok=True)
+            locks.enter_context(making(run_dir))
             locks.enter_context(locked(run_dir))
     env, eval_env = environments(job.configs[0], len(job.configs))
     train_seeds(env, job.configs, job.folders, True, on_update, eval_env, stop=stop)

@@ -16,7 +16,7 @@ from pathlib import Path
 import yaml
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, locked, remove_temporaries, write_atomically
+from mqe_jax.files import check_folder, locked, making, remove_temporaries, write_atomically
 from mqe_jax.settings import to_mapping
 from mqe_jax.train.checkpoint import checkpoint_step, latest, list_checkpoints
 from mqe_jax.train.config import TrainConfig, load_config
@@ -36,19 +36,26 @@ _OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of thei
 def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
     """Creates and locks run folders; raises an InputError for one that holds a run, or what `resume` cannot resume."""
     with contextlib.ExitStack() as locks:
+        check_folders(folders, resume)
         for folder in folders:
-            check_links(folder)
-            check_alone(folder)
-        if resume:
-            common_checkpoints(folders)
-        for folder in folders:
-            check_folder(folder)
+            locks.enter_context(making(folder))
             locks.enter_context(locked(folder))
             for inner in (folder, *folder.glob("*/")):
                 remove_temporaries(inner)
         for folder in folders:
             check_run(folder, resume)
         yield
+
+
+def check_folders(folders: Sequence[Path], resume: bool) -> None:
+    """Raises an InputError for folders in which no training, or with `resume` no resumed one, could start."""
+    for folder in folders:
+        check_links(folder)
+        check_alone(folder)
+        check_folder(folder)
+        check_run(folder, resume)
+    if resume:
+        common_checkpoints(folders)
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

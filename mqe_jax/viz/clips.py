@@ -13,8 +13,9 @@ import numpy as np
 from annotated_types import Gt
 from PIL import Image
 
+from mqe_jax import files
 from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, replacing
+from mqe_jax.files import replacing
 from mqe_jax.interrupts import child
 from mqe_jax.settings import PathText, checked, fail
 
@@ -22,7 +23,7 @@ SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
 
 def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at: float | None = None) -> Path:
-    """Returns the path if it can be written, in a folder that it creates, with options of `render_episode`.
+    """Returns the path if it can be written, with options of `render_episode`.
 
     The InputError names what is allowed.
     """
@@ -33,9 +34,7 @@ def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at
     for name, value in unused.items():
         if value is not None:
             fail(name, value, f"left out for a {suffix} file")
-    if path.is_dir():
-        raise InputError(f"output {str(path)!r} is a folder, it must be a file")
-    check_folder(path.parent, f"output {str(path)!r}")
+    files.check_output(path)
     if suffix == ".mp4":
         try:
             import_module("imageio_ffmpeg")
