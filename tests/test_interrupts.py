@@ -18,7 +18,7 @@ import pytest
 from mqe_jax import cli
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
-from tests.training import assert_same_run, rows
+from tests.training import assert_same_run, rows, without_progress
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
@@ -62,7 +62,7 @@ def end(process: subprocess.Popen[str], number: signal.Signals, seconds: float =
         process.kill()
         pytest.fail(f"{number.name} was swallowed: {process.communicate()[1]}")
     code, line = ENDS[number]
-    lines = [text for text in said.splitlines() if " steps/s, " not in text and "a new run" not in text]
+    lines = [text for text in without_progress(said.splitlines()) if "a new run" not in text]
     assert process.returncode == code, said
     assert len(lines) == 1 and lines[0].startswith(line), said
     return lines

@@ -27,7 +27,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.train import devices
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests.test_interrupts import updates, wait_for
-from tests.training import rows
+from tests.training import rows, without_progress
 
 MQE = [sys.executable, "-m", "mqe_jax.cli"]
 TRAIN = ["train", "go1gate", "--impl", "c", "--control", "position", "--num-envs", "4", "--rollout-steps", "4"]
@@ -133,7 +133,7 @@ def mqe(*words: str) -> None:
 
 def lines(said: str) -> list[str]:
     """Returns what was said, without progress."""
-    return [line for line in said.splitlines() if " steps/s, " not in line]
+    return list(without_progress(said.splitlines()))
 
 
 def content(run_dir: Path) -> dict[str, np.ndarray]:
@@ -242,7 +242,7 @@ def test_a_process_of_a_sweep_that_is_killed(tmp_path: Path) -> None:
         both = children(process)
         os.kill(both[1], signal.SIGKILL)
         assert process.stderr is not None
-        line = next(line for line in process.stderr if " steps/s, " not in line)
+        line = next(without_progress(process.stderr))
         assert line == "mqe: a process of the training was killed by SIGKILL; the same command goes on\n"
         wait_for(lambda: not Path(f"/proc/{both[1]}").exists(), process)
         assert Path(f"/proc/{both[0]}").exists()

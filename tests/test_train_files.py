@@ -125,9 +125,35 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_progress_shows_what_is_known(row: dict[str, float], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with logs.ProgressLog("walk", 0, 100) as log:
+    with logs.ProgressLog("walk", 100) as log:
         log.write({"env_steps": 100, "fps": 8.0, **row})
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_compiling_is_shown_and_does_not_count(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """40 s of compiling, then 60 s for each hundredth of the steps; a long training names a shorter one once."""
+    now = [0.0]
+    monkeypatch.setattr(logs.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(logs, "_PLAIN_SECONDS", 0.0)
+    monkeypatch.setattr(logs.Console, "is_terminal", terminal)
+    monkeypatch.setenv("COLUMNS", "120")
+    with logs.ProgressLog("gate", 10_000) as log:
+        for _ in range(2):
+            with log.doing("compiling"):
+                now[0] += 20.0
+                if log._bar is not None:
+                    log._bar.refresh()
+        log.start(1_000)
+        for step in (1_100, 1_200):
+            now[0] += 60.0
+            log.write({"env_steps": step, "fps": 10.0})
+    said = capsys.readouterr().err
+    assert ("compiling (0:00:40)" if terminal else "gate: compiling") in said
+    assert said.count("--config demo takes minutes") == 1
+    assert "gate: takes about 89 minutes here" in said and "1:28:00 left" in said
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -199,6 +200,12 @@ def rows(run: Path) -> list[dict[str, str]]:
     """Returns the rows of a run's metrics.csv without the columns of times."""
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
         return [{k: v for k, v in row.items() if k not in ("seconds", "fps")} for row in csv.DictReader(file)]
+
+
+def without_progress(lines: Iterable[str]) -> Iterator[str]:
+    """Yields the lines of a training's standard error but those of its progress."""
+    progress = re.compile(r"[\w-]+: (compiling|evaluating|takes about|.* steps/s, )")
+    return (line for line in lines if not progress.match(line))
 
 
 def content(run: Path) -> dict[str, np.ndarray]:

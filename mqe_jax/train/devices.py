@@ -159,7 +159,7 @@ class Processes:
         other._specs = jax.tree.map(stack, shared, self._specs)
         return other
 
-    def compile(self, function: Callable[..., Any], *, start: bool = False, more: bool = False) -> Callable[[Any], Any]:
+    def compile(self, function: Callable[..., Any], *, start: bool = False, more: bool = False) -> jax.stages.Wrapped:
         """Returns a compiled function of the state, to be called by all processes.
 
         Args:

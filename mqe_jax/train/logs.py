@@ -14,14 +14,16 @@ import struct
 import sys
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self
 
+import jax
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.text import Text
 
+from mqe_jax import interrupts
 from mqe_jax.errors import InputError
 from mqe_jax.files import append, make_folder, read_rows, write_atomically
 from mqe_jax.train.config import TrainConfig
@@ -184,58 +186,106 @@ def check_loggers(names: tuple[str, ...]) -> None:
 
 
 class ProgressLog:
-    """Progress on standard error: a live bar on a terminal, otherwise a plain line every ten seconds."""
+    """Progress on standard error: a live bar on a terminal, otherwise a plain line every ten seconds.
 
-    def __init__(self, title: str, env_steps: int, total_steps: int) -> None:
-        self._title, self._first, self._total = title, env_steps, total_steps
-        self._began = time.perf_counter()
+    The time left is that of the updates to come: compiling and evaluating do not count.
+    """
+
+    def __init__(self, title: str, total_steps: int, *, shown: bool = True) -> None:
+        self._title, self._total, self._silent = title, total_steps, not shown
+        self._first = self._step = 0
+        self._numbers = ""
+        self._doing, self._active, self._began = "", False, 0.0
+        self._since, self._seconds = time.perf_counter(), 0.0  # start of this update, time of those before
         self._last_line = -math.inf
+        self._open = contextlib.ExitStack()
         self._bar: Progress | None = None
         console = Console(stderr=True)
-        if console.is_terminal:
-            self._bar = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[numbers]}"),
-                TimeRemainingColumn(),
-                console=console,
-            )
-            self._task = self._bar.add_task(title, total=total_steps, completed=env_steps, numbers="")
+        if shown and console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(10), _Column(self._text))
+            self._bar = Progress(*columns, console=console)
+            self._task = self._bar.add_task(title, total=total_steps)
 
     def __enter__(self) -> Self:
         if self._bar is not None:
-            self._bar.start()
+            self._open.enter_context(self._bar)
+            self._open.enter_context(interrupts.before_exit(self._bar.stop))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+    def start(self, env_steps: int) -> None:
+        """Begins the first update of a run, after `env_steps`."""
+        self._first = self._step = env_steps
         if self._bar is not None:
-            self._bar.stop()
+            self._bar.update(self._task, completed=env_steps)
+        self._since = time.perf_counter()
+        self._doing, self._began, self._active = "first update", self._since, True
+
+    @contextlib.contextmanager
+    def doing(self, what: str) -> Iterator[None]:
+        """Shows that something else than an update is being done, and for how long."""
+        now = time.perf_counter()
+        if what != self._doing:
+            self._doing, self._began = what, now
+            if self._bar is None:
+                self._print(what)
+        self._active = True
+        yield
+        self._active = False
+        self._since += time.perf_counter() - now
 
     def write(self, row: Mapping[str, float]) -> None:
         """Shows steps, speed and the remaining time, and what there is of reward per step (else return) and success."""
-        step = int(row["env_steps"])
+        now, first = time.perf_counter(), not self._numbers
+        self._seconds += now - self._since
+        self._since, self._step, self._active = now, int(row["env_steps"]), False
         known = {name: value for name, value in row.items() if math.isfinite(value)}
         rewards = {"average_step_reward": "reward", "episode_return": "return"}
-        parts = [f"{word} {known[name]:.4g}" for name, word in rewards.items() if name in known][:1]
+        parts = [f"{word} {known[name]:.3g}" for name, word in rewards.items() if name in known][:1]
         parts += [f"success {known['success']:.0%}"] if "success" in known else []
-        numbers = ", ".join([*parts, f"{row['fps']:,.0f} steps/s"])
+        self._numbers = ", ".join([*parts, f"{row['fps']:,.0f} steps/s"])
         if self._bar is not None:
-            self._bar.update(self._task, completed=step, numbers=numbers)
-            return
-        now = time.perf_counter()
-        if now - self._last_line < _PLAIN_SECONDS and step < self._total:
-            return
-        self._last_line = now
-        speed = (step - self._first) / max(now - self._began, 1e-9)
-        left = max(self._total - step, 0) / max(speed, 1e-9)
-        print(
-            f"{self._title}: {step:,} of {self._total:,} steps, {numbers}, {_clock(left)} left",
-            file=sys.stderr,
-            flush=True,
-        )
+            self._bar.update(self._task, completed=self._step)
+        minutes = self._left / 60
+        if first and minutes > 1:
+            slow = minutes > 60 and jax.default_backend() == "cpu"
+            advice = "; on a CPU, mqe train go1gate --config demo takes minutes" if slow else ""
+            hours = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{minutes:.0f} minutes"
+            self._print(f"takes about {hours} here{advice}")
+        if self._bar is None and (now - self._last_line >= _PLAIN_SECONDS or self._step >= self._total):
+            self._last_line = now
+            self._print(self._text())
+
+    @property
+    def _left(self) -> float:
+        """Seconds until the end at the mean speed of the updates so far."""
+        return max(self._total - self._step, 0) * self._seconds / max(self._step - self._first, 1)
+
+    def _text(self) -> str:
+        """Returns what follows the bar."""
+        steps = f"{self._step:,} of {self._total:,} steps"
+        if self._total >= 1_000_000:
+            steps = f"{self._step / 1e6:.2f} of {self._total / 1e6:g} M steps"
+        if self._active:
+            return f"{steps}, {self._doing} ({_clock(time.perf_counter() - self._began)})"
+        return f"{steps}, {self._numbers}, {_clock(self._left)} left" if self._numbers else steps
+
+    def _print(self, text: str) -> None:
+        if not self._silent:
+            print(f"{self._title}: {text}", file=sys.stderr, flush=True)
+
+
+class _Column(ProgressColumn):
+    """The text that a function returns."""
+
+    def __init__(self, text: Callable[[], str]) -> None:
+        super().__init__()
+        self._text = text
+
+    def render(self, task: Any) -> Text:
+        return Text(self._text())
 
 
 def _clock(seconds: float) -> str:

@@ -112,7 +112,11 @@ def open_training(
         processes.gather([0])  # the others wait for these checks
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
-        yield Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder)
+        total = configs[0].num_updates * configs[0].steps_per_update
+        with ProgressLog(configs[0].task or env.name, total, shown=processes.leads) as progress:
+            with progress.doing("compiling"):
+                own = Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder, progress)
+            yield own
 
 
 class Training:
@@ -135,9 +139,10 @@ class Training:
         checkpoints: Sequence[Path | None],
         eval_env: VectorEnv | None,
         recorder: Recorder | None,
+        progress: ProgressLog,
     ) -> None:
         self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
-        self._config, self._processes = configs[0], processes
+        self._config, self._processes, self._progress = configs[0], processes, progress
         self._seeds = seeds = Seeds(learner.init, len(configs))
         first = [
             first_state(env, learner, processes, own, path, seeds.shared)
@@ -176,16 +181,16 @@ class Training:
                 for make_log in (CsvLog, *(LOGGERS[name] for name in config.loggers)):
                     own_logs.append(make_log(folder, self.env_steps))
                     logs.callback(own_logs[-1].close)
-            progress_log = ProgressLog(config.task or self._env.name, self.env_steps, total_steps)
-            if self._processes.leads:
-                logs.enter_context(progress_log)
             logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
+                if self.env_steps < total_steps:
+                    with self._progress.doing("compiling"):
+                        self._update.lower(self._state).compile()
+                self._progress.start(self.env_steps)
                 while self.env_steps < total_steps and not self._stopped(stop):
                     rows = self._step(files)
-                    if self._processes.leads:
-                        progress_log.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                    self._progress.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                     if on_update is not None:
                         for state, row in zip(self._own(), rows, strict=True):
                             on_update(state, row)
@@ -312,7 +317,8 @@ class Training:
             return
         policies = self.policies()
         steps = [self.env_steps] * len(policies)
-        results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
+        with self._progress.doing("evaluating"):
+            results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
         with self._writing:
             for log, result, policy in zip(self.evaluations, results, policies, strict=True):
                 log.add(result, policy)
@@ -324,7 +330,8 @@ class Training:
         self._evaluate()
         policies, steps = zip(*(log.best_policy() for log in self.evaluations), strict=True)
         episodes = ABSOLUTE_FACTOR * self._config.evaluation.episodes
-        results = self._monitor.evaluate(policies, steps, episodes, absolute=True)
+        with self._progress.doing("evaluating"):
+            results = self._monitor.evaluate(policies, steps, episodes, absolute=True)
         with self._writing:
             for log, result in zip(self.evaluations, results, strict=True):
                 log.end(result, self.env_steps)
