@@ -142,7 +142,7 @@ def test_blocks_follow_each_other_along_the_track() -> None:
     blocks = (SpawnArea(3.0), Gate(2.0, width=0.8, offset=(0.2, -0.1), random=(0.1, 0.3), depth=0.2), Plane(1.5))
     track = Track((*blocks, Gate(4.0, width=1.0), EndWall()), width=4.0, num_robots=3, wall_height=0.6)
     layout = track.layout()
-    np.testing.assert_allclose(layout.spawn, [[1.5, -4 / 3, 0], [1.5, 0, 0], [1.5, 4 / 3, 0]], atol=1e-9)
+    np.testing.assert_allclose(np.array(layout.spawn), [[1.5, -4 / 3, 0], [1.5, 0, 0], [1.5, 4 / 3, 0]], atol=1e-9)
     assert [(a.name, a.position, a.spread) for a in layout.anchors] == [
         ("gate1", (pytest.approx(4.2), -0.1), (0.1, 0.3)),
         ("gate3", (pytest.approx(8.5), 0.0), (0.0, 0.0)),
@@ -158,7 +158,7 @@ def test_blocks_follow_each_other_along_the_track() -> None:
         "side_left": ((5.25, 2.0), (0.0, -1.0), 10.5),
     }
     spaced = Track((Plane(1.0), SpawnArea(2.0, spawn_x=0.5, spacing=0.7)), num_robots=2).layout()
-    np.testing.assert_allclose(spaced.spawn, [[1.5, -0.35, 0], [1.5, 0.35, 0]])
+    np.testing.assert_allclose(np.array(spaced.spawn), [[1.5, -0.35, 0], [1.5, 0.35, 0]])
 
 
 def test_rough_ground_is_gradient_noise_in_octaves() -> None:
