@@ -274,6 +274,8 @@ def linear_layers(
             raise InputError(f"{what}: {name} is not expected; expected {', '.join(shapes)}")
         if tuple(arrays[name].shape) != shapes[name]:
             raise InputError(f"{what}: {name} has shape {tuple(arrays[name].shape)}; expected {shapes[name]}")
+        if (most := float(np.abs(arrays[name].astype(np.float64)).max())) > limits.WEIGHT:
+            raise InputError(f"{what}: {name} holds magnitudes to {most:g}; at most {limits.WEIGHT:g} is allowed")
     kinds = ("weight", "bias")
     return {layer: {kind: np.asarray(arrays[f"{layer}.{kind}"], np.float32) for kind in kinds} for layer in sizes}
 

@@ -67,6 +67,7 @@ CSV_BYTES = 2**27
 WEIGHTS_BYTES = 2**27  # walk weights and actuator networks; in a TorchScript archive, all members and all tensors
 POLICY_BYTES = 2**28
 CHECKPOINT_BYTES = 2**34
+WEIGHT = 1e4  # magnitude of a weight of a policy or an actuator network; trained ones are below 10
 RECORDING_BYTES = 2**28  # all members
 
 # -- memory, refused before it is allocated ----------------------------------------------------------------------------

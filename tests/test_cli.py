@@ -286,7 +286,7 @@ def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: py
     arrays[next(name for name in arrays if name.endswith("weight"))][0] = float("nan")
     checkpoint.save_tree(broken / "policy.safetensors", arrays, metadata, kind="policy")
     assert cli.main(["eval", str(broken)]) == 2
-    assert "holds NaN" in capfd.readouterr().err
+    assert "holds nan" in capfd.readouterr().err
 
 
 START = """

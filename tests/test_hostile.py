@@ -125,7 +125,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32))]), 25), (None,)),
     ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([v]), 25), ("x",)),
     ("fps: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32, 3), np.uint8)]), 0), (None,)),
-    ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), (None, "", 3)),
+    ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
     ("path: ", lambda x, v: load_config(v), (None, 3)),

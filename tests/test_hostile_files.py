@@ -8,6 +8,7 @@ import json
 import math
 import os
 import resource
+import shutil
 import struct
 import zipfile
 from collections.abc import Callable
@@ -22,15 +23,20 @@ from mqe_jax import limits
 from mqe_jax.cli.options import parse_overrides
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
-from mqe_jax.files import parse_json, parse_yaml, read_rows, read_tensors
-from mqe_jax.settings import build
-from mqe_jax.study.runs import read_curve
+from mqe_jax.files import linear_layers, parse_json, parse_yaml, read_rows, read_tensors
+from mqe_jax.league import pool
+from mqe_jax.settings import build, override
+from mqe_jax.study.runs import read_curve, read_runs
 from mqe_jax.train import checkpoint
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import read_policy
+from mqe_jax.train.runner import train
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
+from tests import training as probes
+from tests.test_train_run import settings as run_settings
+from tests.training import Probe
 
 
 def peak() -> int:
@@ -90,6 +96,7 @@ def test_bad_json(text: str) -> None:
         [],
         {"evaluations": [{}], "absolute": None},
         {"evaluations": [], "absolute": {"env_steps": "x"}},
+        {"evaluations": [{"env_steps": 1, "sampled": {"x": math.nan}, "deterministic": {}}], "absolute": None},
     ],
     ids=str,
 )
@@ -259,3 +266,130 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
 
 
 # -- what is packed for another machine --------------------------------------------------------------------------------
+
+
+# -- impossible content, whose checksum is right -----------------------------------------------------------------------
+
+PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
+SETTINGS = run_settings(normalization__observations=True, ppo__epochs=1, ppo__minibatches=1, total_steps=32)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short run."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    train(PROBE, SETTINGS, folder)
+    return folder
+
+
+def rewrite(path: Path, kind: str, name: str, value: Any, metadata: dict[str, Any] | None = None) -> None:
+    """Writes a file anew with a value in the last place of the first array whose name starts so."""
+    arrays, about = checkpoint._read(path, kind)
+    name = next(other for other in arrays if other.startswith(name))
+    changed = np.array(arrays[name])
+    changed[(-1,) * changed.ndim] = value
+    checkpoint.save_tree(path, {**arrays, name: changed}, {**about, **(metadata or {})}, kind=kind)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("normalizer/variance", -1.0),
+        ("normalizer/variance", math.nan),
+        ("normalizer/samples", -1.0),
+        ("normalizer/mean", math.inf),
+        ("params/log_std", 1e5),
+        ("params/actor", 1e30),
+        ("params/actor", math.nan),
+    ],
+)
+def test_a_policy_of_impossible_numbers(name: str, value: float, trained: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(trained / "policy.safetensors", tmp_path))
+    rewrite(path, "policy", name, value)
+    with pytest.raises(InputError, match=rf"policy\.safetensors: {name}.* holds .*; a number from "):
+        read_policy(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("updates", -1),
+        ("updates", 10**6),
+        ("learning_rate", -1e-3),
+        ("assistance", 2.0),
+        ("optimizer/square/log_std", -1.0),
+        ("optimizer/updates", -3),
+        ("obs_normalizer/privileged/variance", -1.0),
+        ("value_normalizer/square", -1.0),
+        ("value_normalizer/mean", math.nan),
+        ("rollout/memory/actor", math.nan),
+        ("rollout/episode_steps", -1),
+        ("rollout/env_state/obs", math.nan),
+    ],
+)
+def test_a_checkpoint_of_impossible_numbers(name: str, value: float, trained: Path, tmp_path: Path) -> None:
+    """Its updates are those of its name: a run that seems to be finished is not, however untrained."""
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    path = checkpoint.list_checkpoints(run)[-1]
+    rewrite(path, "checkpoint", name, value)
+    with pytest.raises(InputError, match=rf"{path.name}: ({name}.* holds .*; a number from|holds 1000000 updates)"):
+        train(PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
+
+
+@pytest.mark.parametrize("name", ["games", "score", "born"])
+def test_a_pool_of_impossible_numbers(name: str, tmp_path: Path) -> None:
+    members: Any = pool.new_pool({"params": np.ones(2, np.float32)}, 3)
+    tree = {"extra": {"pool": members._replace(**{name: np.array([0, 0, -2], getattr(members, name).dtype)})}}
+    checkpoint.save_tree(tmp_path / "a", tree, {}, kind="checkpoint")
+    with pytest.raises(InputError, match=rf"a: extra/pool/{name} holds -2"):
+        checkpoint.load_tree(tmp_path / "a", tree, kind="checkpoint")
+    with pytest.raises(InputError, match=rf"a: extra/pool/{name} holds -2"):
+        checkpoint.load_tree(tmp_path / "a", members, kind="checkpoint", part="extra/pool/")
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        ({"seconds": -1.0}, "its settings or its seconds"),
+        ({"seconds": math.nan}, "its settings or its seconds"),
+        ({"task": ["probe"]}, "belongs to task"),
+    ],
+)
+def test_a_checkpoint_of_impossible_metadata(
+    metadata: dict[str, Any], said: str, trained: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    path = checkpoint.list_checkpoints(run)[-1]
+    rewrite(path, "checkpoint", "assistance", 0.0, metadata)
+    with pytest.raises(InputError, match=said):
+        train(PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
+
+
+@pytest.mark.parametrize("metadata", [{"env_steps": -1}, {"env_steps": "many"}, {"task": ["probe"]}], ids=str)
+def test_a_policy_of_impossible_metadata(metadata: dict[str, Any], trained: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(trained / "policy.safetensors", tmp_path))
+    rewrite(path, "policy", "normalizer/samples", 1.0, metadata)
+    with pytest.raises(InputError, match=rf"policy\.safetensors: its settings cannot be read \({next(iter(metadata))}"):
+        read_policy(path)
+
+
+def test_weights_that_no_network_has(tmp_path: Path) -> None:
+    layers = {"0.weight": np.full((32, 6), 1e20, np.float32), "0.bias": np.zeros(32, np.float32)}
+    with pytest.raises(InputError, match=r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed"):
+        linear_layers("weights", layers, {"0": (6, 32)})
+
+
+@pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])
+def test_steps_that_do_not_increase(steps: str, tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("env_steps,average_step_reward\n" + steps.replace("\n", ",1\n") + ",1\n")
+    with pytest.raises(InputError, match=r"metrics\.csv: its env_steps must be positive and increase"):
+        read_curve(tmp_path / "metrics.csv")
+
+
+def test_a_finished_run_whose_rows_end_earlier(trained: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "runs" / "fake" / "mappo" / "seed0"))
+    assert read_runs(tmp_path)[0].curve["env_steps"][-1] == 32
+    rows = (run / "metrics.csv").read_text().splitlines(keepends=True)
+    (run / "metrics.csv").write_text("".join(rows[:-1]))
+    with pytest.raises(InputError, match=r"metrics\.csv: ends after 16 steps; the finished run has 32"):
+        read_runs(tmp_path)

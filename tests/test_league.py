@@ -127,7 +127,7 @@ def test_a_league_resumed_without_environments_plays_its_members(history: list[T
     config, state = config_of(), history[9]
     env = League(matches(num_envs=8), SOURCES, config)
     metadata = {"task": env.name, "config": to_mapping(config), "environments": False}
-    file = save_checkpoint(tmp_path, without_environments(state), 9, metadata, keep=1)
+    file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
     learner, processes = own_learner(env, config, None)
     resumed, _ = first_state(env, learner, processes, config, file, Seeds(learner.init, 1).shared)
     seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)

@@ -321,9 +321,9 @@ def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainStat
     assert newest is not None
     spoil(newest, "checkpoint")
     spoil(run_dir / "policy.safetensors", "policy")
-    with pytest.raises(InputError, match=r"policy.safetensors: .*weight holds NaN"):
+    with pytest.raises(InputError, match=r"policy.safetensors: .*weight holds nan"):
         read_policy(run_dir)
-    with pytest.raises(InputError, match=r"step_000000000080.safetensors: .*weight holds NaN"):
+    with pytest.raises(InputError, match=r"step_000000000080.safetensors: .*weight holds nan"):
         train(PROBE, settings(), run_dir, resume=True)
     policy = read_policy(straight[0])
     broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 
-
 WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
 
 

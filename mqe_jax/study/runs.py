@@ -93,7 +93,10 @@ def read_runs(folder: Path) -> list[Run]:
         if path.parent.name.removeprefix("seed").isdecimal() and finished(path.parent):
             seed = int(path.parent.name.removeprefix("seed"))
             evaluations = read_evaluations(path.parent)
-            curve = read_curve(path.parent / CSV_FILE)
+            curve, config = read_curve(path.parent / CSV_FILE), load_run_config(path.parent)
+            if curve["env_steps"][-1] != (total := config.num_updates * config.steps_per_update):
+                ends = number(float(curve["env_steps"][-1]))
+                raise InputError(f"{path.parent / CSV_FILE}: ends after {ends} steps; the finished run has {total}")
             cell = Cell.at(path.parent.parent)
             runs.append(Run(cell, seed, curve, evaluations["evaluations"], evaluations["absolute"]))
     if not runs:
@@ -115,6 +118,8 @@ def read_curve(path: Path) -> Curve:
     curve = {name: np.array(column) for name, column in zip(names, columns, strict=True)}
     if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
         raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
+    if not np.all(np.diff(curve["env_steps"], prepend=0.0) > 0):
+        raise InputError(f"{path}: its env_steps must be positive and increase from row to row")
     return curve
 
 

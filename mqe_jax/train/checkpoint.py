@@ -24,6 +24,19 @@ VERSION = 3
 _LARGEST = {"policy": limits.POLICY_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
 
+_FINITE = (-float(np.finfo(np.float32).max), float(np.finfo(np.float32).max))
+_RANGES: tuple[tuple[str, float, float], ...] = (
+    (r"normalizer/(obs/|privileged/)?(variance|samples|square|weight)$", 0.0, _FINITE[1]),
+    (r"^optimizer/(square/|updates$)|^learning_rate$", 0.0, _FINITE[1]),
+    (r"^(updates|rollout/episode_steps|extra/(played|snapshot|recent|member|pool/(games|score)))$", 0.0, _FINITE[1]),
+    (r"^extra/pool/born$", -1.0, _FINITE[1]),
+    (r"^assistance$", 0.0, 1.0),
+    (r"(^|/)params/(?!critic)", -limits.WEIGHT, limits.WEIGHT),
+)
+"""Lowest and highest value of arrays by patterns of their names; of others any finite number."""
+_ANY = re.compile(r"/env_state/(?!.*(arrays|before)/)(?!.*(obs|qpos|qvel)$)")
+"""Names of arrays in which NaN may be meant."""
+
 
 class Checkpoint(NamedTuple):
     """A restored tree and its metadata."""
@@ -135,8 +148,17 @@ def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False,
             arrays[name] = found.astype(np.float32)
         elif found.dtype != leaf.dtype:
             raise InputError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
+        _check_range(path, part + name, arrays[name])
     leaves = [jax.device_put(arrays[name]) for name in expected]
     return Checkpoint(jax.tree_util.tree_unflatten(structure, leaves), metadata)
+
+
+def _check_range(path: Path, name: str, array: np.ndarray) -> None:
+    """Raises an InputError for numbers that no training writes."""
+    low, high = next(((low, high) for pattern, low, high in _RANGES if re.search(pattern, name)), _FINITE)
+    if array.dtype.kind in "fiu" and not _ANY.search(name) and not np.all(within := (array >= low) & (array <= high)):
+        wrong = array[~within].flat[0]
+        raise InputError(f"{path}: {name} holds {wrong}; a number from {low:g} to {high:g} is needed")
 
 
 def checkpoint_folder(run_dir: str | Path) -> Path:

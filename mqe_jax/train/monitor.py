@@ -37,7 +37,7 @@ _SAMPLED, _DETERMINISTIC = 0, 1
 
 
 class _Evaluation(TypedDict):
-    __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True)  # type: ignore[misc]
+    __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True, allow_inf_nan=False)  # type: ignore[misc]
     env_steps: Annotated[int, Ge(0)]
     sampled: dict[str, float | None]
     deterministic: dict[str, float | None]

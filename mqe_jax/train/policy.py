@@ -6,10 +6,11 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+from annotated_types import Ge
 
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import make_folder
@@ -186,6 +187,8 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         dims = check("dims", EnvDims(**metadata.pop("dims")), EnvDims)
         config = build(TrainConfig, metadata.pop("config"))
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
+        check("task", metadata.get("task"), str | None)
+        check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
     network = config.network.build(dims)
@@ -195,6 +198,4 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         return {"params": params, "normalizer": running_init(dims.observation)}
 
     tree = load_tree(path, jax.eval_shape(template), kind="policy", half=True).tree
-    if wrong := nonfinite(tree):
-        raise InputError(f"{path}: {wrong[0]} holds NaN or infinite numbers; it was written by a diverged run")
     return TrainedPolicy(tree["params"], tree["normalizer"], dims, config, metadata, deterministic)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import InputError
 from mqe_jax.settings import fail, is_record, override, to_mapping
-from mqe_jax.train.checkpoint import checkpoint_step, load_tree, nonfinite, read_metadata
+from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.folder import CONFIG_FILE
@@ -71,7 +72,7 @@ def first_state(
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
     before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
-    if not isinstance(before, dict) or not isinstance(seconds, int | float):
+    if not isinstance(before, dict) or not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
     check_same(checkpoint.parent.parent, before, config)
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
@@ -80,8 +81,10 @@ def first_state(
     template = processes.whole
     saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
     tree = load_tree(checkpoint, saved, kind="checkpoint").tree
-    if wrong := nonfinite(learned(tree) if whole else {name: tree[name] for name in learned(template)}):
-        raise InputError(f"{checkpoint}: {wrong[0]} holds NaN or infinite numbers")
+    updates = int(tree.updates if whole else tree["updates"])
+    if updates * config.steps_per_update != steps:
+        held = f"{updates} updates of {config.steps_per_update} environment steps"
+        raise InputError(f"{checkpoint}: holds {held}; its name says {steps} steps")
     if not whole:
         fresh = init(jax.random.fold_in(tree["key"], tree["updates"]))
         state = jax.tree.map(jnp.asarray, dataclasses.replace(fresh, **tree))
