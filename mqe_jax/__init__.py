@@ -2,6 +2,10 @@
 
 import jax, mqe_jax
 
+run = mqe_jax.learn("go1gate", "demo")  # a training
+mqe_jax.evaluate("go1gate", run.policy)  # success with its interval
+mqe_jax.render("go1gate", run.policy).save("gate.gif")
+
 env = mqe_jax.make("go1gate")
 state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
 state = jax.jit(jax.vmap(env.step))(state, action)  # (64, env.num_agents, env.action_size)
@@ -13,12 +17,48 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mqe_jax.build import make_learner
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
     from mqe_jax.opponents import versus
     from mqe_jax.policies import load_policy
+    from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
+    from mqe_jax.runs.playing import Clip, evaluate, render
+    from mqe_jax.train.config import TrainConfig
+    from mqe_jax.train.evaluate import Result
 
 __version__ = "0.2.0"
-__all__ = ["QuadrupedEnv", "Randomization", "State", "VectorEnv", "load_policy", "make", "tasks", "versus"]
+__all__ = [
+    "Clip",
+    "QuadrupedEnv",
+    "Randomization",
+    "Result",
+    "Run",
+    "State",
+    "TrainConfig",
+    "VectorEnv",
+    "evaluate",
+    "learn",
+    "learn_seeds",
+    "load_policy",
+    "load_run",
+    "make",
+    "make_learner",
+    "render",
+    "tasks",
+    "versus",
+]
+_LEARNING = dict.fromkeys(("Run", "learn", "learn_seeds", "load_run"), "runs.learning")
+_PLAYING = dict.fromkeys(("Clip", "evaluate", "render"), "runs.playing")
+_HOMES = {
+    **_LEARNING,
+    **_PLAYING,
+    "Result": "train.evaluate",
+    "TrainConfig": "train.config",
+    "load_policy": "policies",
+    "make_learner": "build",
+    "versus": "opponents",
+}
+"""Modules of the names; those of the others are in `envs`."""
 
 
 def __dir__() -> list[str]:
@@ -29,5 +69,4 @@ def __getattr__(name: str) -> Any:
     # Heavy imports (JAX, MuJoCo) are deferred to keep `mqe --help` fast.
     if name not in __all__:
         raise AttributeError(f"module 'mqe_jax' has no attribute {name!r}")
-    home = {"load_policy": "policies", "versus": "opponents"}.get(name, "envs")
-    return getattr(importlib.import_module(f"mqe_jax.{home}"), name)
+    return getattr(importlib.import_module(f"mqe_jax.{_HOMES.get(name, 'envs')}"), name)

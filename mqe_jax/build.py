@@ -1,16 +1,16 @@
-"""Environments and training settings from what users name: tasks, runs, settings and their changes."""
+"""Settings to environments and learners: what users name becomes a training, or the players of an episode."""
 
 from __future__ import annotations
 
 import functools
 import os
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
+from mqe_jax import zoo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.match import Match
@@ -18,55 +18,138 @@ from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.league.league import League
 from mqe_jax.league.sides import BothSides
+from mqe_jax.literal import echo
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_as, load_policy
-from mqe_jax.settings import Parameters, check, fail, load_yaml, override
+from mqe_jax.settings import Parameters, check, differences, fail, joined, load_yaml, override
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
+from mqe_jax.train.evaluate import Act
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
-from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.learner import Learner, env_dims, make_ppo
 from mqe_jax.train.logs import check_loggers
+from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.start import initial_key, policy_to_start
+from mqe_jax.train.types import AnyBatch
+from mqe_jax.train.types import VectorEnv as AnyVectorEnv
+
+Task = str | QuadrupedEnv | AnyVectorEnv
+"""A task's id, its environment, or a batch of environments."""
+Config = str | Path | TrainConfig | Mapping[str, Any] | None
+"""Settings of a training: a shipped name, a file, settings, or changes of the task's default ones."""
+Player = str | Path | Policy | Act | None
+"""A policy, its function `act` without recurrent state, or what `load_policy` accepts."""
+
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
 
 
-def run_config(target: str) -> Any:
-    """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
-    if target.endswith(".safetensors"):
-        return load_policy(target).config
-    if not Path(target).is_dir():
-        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
-        raise InputError(f"run: {target!r} is {'not a' if Path(target).exists() else 'no'} folder; allowed: {allowed}")
-    if not (Path(target) / CONFIG_FILE).is_file():
-        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{CONFIG_FILE}"))
-        hint = f"; did you mean {runs[0]}?" if runs else ""
-        raise InputError(f"run: {target!r} has no {CONFIG_FILE}; it is not a run folder{hint}")
-    config = load_run_config(target)
-    if config.task is None:
-        raise InputError(f"{target}: {CONFIG_FILE} has no 'task' entry")
-    return config
+class Environments(NamedTuple):
+    """What a training is made of."""
+
+    configs: list[TrainConfig]
+    """Settings of each seed."""
+    learning: Any
+    """Environments in which the policy learns."""
+    evaluation: Any
+    """Environments of evaluations during training; None without."""
+
+
+def prepare(
+    task: Task,
+    config: Config = None,
+    env: Mapping[str, Any] | None = None,
+    *,
+    impl: str = "auto",
+    seeds: Sequence[int] | None = None,
+) -> Environments:
+    """Returns settings and environments of a training; arguments and errors as `mqe_jax.learn`.
+
+    `seeds` are trained in one program; by default the one of the settings.
+    """
+    if isinstance(task, str | QuadrupedEnv):
+        settings = for_task(_settings(task, config), task, env)
+    else:
+        settings = _settings("", config)
+        batch = check("task", task, AnyBatch)
+        for name, value in {
+            "env": env,
+            "opponents": settings.opponents,
+            "demonstrator": settings.curriculum.demonstrator,
+        }.items():
+            if value:
+                fail(name, value, "left out for a batch of environments, which has its own")
+        settings = override(settings, {"num_envs": batch.num_envs, "evaluation.every": None})
+    configs = [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
+    if not configs:
+        fail("seeds", seeds, "at least one")
+    if isinstance(task, str | QuadrupedEnv):
+        return Environments(configs, *environments(impl, settings, len(configs), task))
+    return Environments(configs, task, None)
+
+
+def make_learner(
+    task: Task, config: Config = None, *, env: Mapping[str, Any] | None = None, impl: str = "auto", seeds: int = 1
+) -> Learner:
+    """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure functions, not compiled.
+
+    ```python
+    import jax, mqe_jax
+
+    init, update = mqe_jax.make_learner("go1gate", "demo", seeds=3)
+    states = jax.jit(jax.vmap(init))(jax.random.split(jax.random.PRNGKey(0), 3))
+    ```
+
+    Args:
+        task: as `mqe_jax.learn`, and so are config, env and impl.
+        config: settings; the evaluation during training is left to the caller.
+        env: task parameters.
+        impl: physics engine.
+        seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
+
+    Raises:
+        InputError: as `mqe_jax.learn`.
+    """
+    (settings, *_), learning, _ = prepare(task, config, env, impl=impl, seeds=range(seeds))
+    return make_ppo(learning, settings)
 
 
 def make_env(
-    task: str, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
+    task: str | QuadrupedEnv, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
 ) -> tuple[Any, VectorEnv]:
-    """Returns a task and its vectorised environment with automatic reset; `copies` as in `VectorEnv`."""
+    """Returns a task and its vectorised environment with automatic reset; `copies` as in `VectorEnv`.
+
+    The task is an id, or an environment whose class and engine count; `parameters_of` returns its parameters.
+    """
     check("set", overrides, Parameters)
     device = platform()
     if impl == "warp" and device != "gpu":
         raise InputError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax")
-    env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
+    if isinstance(task, QuadrupedEnv):
+        control, params = overrides.get("control", "command"), {k: v for k, v in overrides.items() if k != "control"}
+        env = type(task)(override(task.Params(), params), impl=task.impl, control=control, num_envs=num_envs * copies)
+    else:
+        env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
     return env, VectorEnv(env, num_envs, copies)
 
 
-def environments(impl: str, config: TrainConfig, seeds: int) -> tuple[Any, Any]:
+def parameters_of(task: str | QuadrupedEnv) -> dict[str, Any]:
+    """Returns the parameters and the control mode in which an environment differs from its task's; none of an id."""
+    if not isinstance(task, QuadrupedEnv):
+        return {}
+    control = {} if task.control == "command" else {"control": task.control}
+    return {**control, **differences(task.params, task.Params())}
+
+
+def environments(impl: str, config: TrainConfig, seeds: int, task: str | QuadrupedEnv | None = None) -> tuple[Any, Any]:
     """Returns training and evaluation environments (None without evaluation) of seeds trained together.
+
+    The task is that of the settings, or `task` as in `make_env`.
 
     In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
     environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
-    task, episodes, opponents = config.task or "", config.evaluation.episodes, config.opponents
+    task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
     both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
     demonstrator = config.curriculum.demonstrator
 
@@ -105,7 +188,7 @@ def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None
     """Raises an InputError where a training of seeds could not start."""
     check_loggers(config.loggers)
     env, _ = environments(impl, config, seeds)
-    make_learner(env, config)
+    make_ppo(env, config)
     if config.start is not None:
         network = config.network.build(env_dims(env, config))
         policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config)
@@ -150,6 +233,78 @@ def platform() -> str:
         raise InputError(f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu") from None
 
 
+class Players(NamedTuple):
+    """An environment, and who acts in it."""
+
+    env: Any
+    """The task."""
+    batch: VectorEnv
+    """Environments with automatic reset."""
+    policy: Policy
+    """The policy of all agents."""
+    about: dict[str, Any]
+    """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
+
+
+def players(
+    task: str | Path | QuadrupedEnv,
+    policy: Player = None,
+    opponent: Player = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    num_envs: int = 1,
+    deterministic: bool = False,
+) -> Players:
+    """Returns what is evaluated, rendered and viewed; arguments and errors as `mqe_jax.evaluate`.
+
+    A run has its own task, parameters and policy. Without a policy, a task has its shipped one if its parameters are
+    the default ones, on both sides of a match; else its scripted one, or `forward`; where actions are not commands,
+    `random`.
+    """
+    if isinstance(task, QuadrupedEnv):
+        name, params = task.name, joined(parameters_of(task), env or {})
+    else:
+        task = name = ALIASES.get(str(task), str(task))
+        params = dict(env or {})
+        if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
+            config = run_config(name)
+            task, params, policy = config.task or "", joined(config.env, params), policy or name
+    shipped = name in zoo.names() and not params and policy is None
+    walking = "scripted" if name in PLANNERS else "forward"
+    default = walking if params.get("control", "command") == "command" else "random"
+    made, batch = make_env(task, impl, params, num_envs)
+    chosen = (name if shipped else default) if policy is None else policy
+    own = load_as("policy", chosen, made, deterministic=deterministic)
+    match = len(made.teams) > 1
+    other, against = (own, chosen) if shipped and match else (None, "idle")
+    if opponent is not None:
+        other, against = load_as("opponent", opponent, made, deterministic=deterministic), opponent
+    about: dict[str, Any] = {"policy": str(chosen)}
+    if isinstance(own, TrainedPolicy):
+        about["actions"] = "mean" if own.deterministic else "sampled"
+    if match:
+        about["opponent"] = str(against)
+    return Players(made, batch, all_agents(made, own, other), about)
+
+
+def run_config(target: str) -> Any:
+    """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
+    if target.endswith(".safetensors"):
+        return load_policy(target).config
+    if not Path(target).is_dir():
+        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
+        raise InputError(f"run: {target!r} is {'not a' if Path(target).exists() else 'no'} folder; allowed: {allowed}")
+    if not (Path(target) / CONFIG_FILE).is_file():
+        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{CONFIG_FILE}"))
+        hint = f"; did you mean {runs[0]}?" if runs else ""
+        raise InputError(f"run: {target!r} has no {CONFIG_FILE}; it is not a run folder{hint}")
+    config = load_run_config(target)
+    if config.task is None:
+        raise InputError(f"{target}: {CONFIG_FILE} has no 'task' entry")
+    return config
+
+
 @functools.cache
 def _parts(file: str) -> dict[str, Any]:
     """Returns the parts of a shipped file of settings: those `common` to all, and changes of them by name."""
@@ -186,6 +341,18 @@ def named_config(name: str, task: str) -> TrainConfig:
     return load_config(path)
 
 
+def _settings(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
+    """Returns the settings that `mqe_jax.learn` is given, without a task's parameters."""
+    if isinstance(config, TrainConfig):
+        return config
+    changes = dict(config) if isinstance(config, Mapping) else {"config": config}
+    name, algorithm = changes.pop("config", None), changes.pop("algorithm", None)
+    if not isinstance(name, str | Path | None) or not isinstance(algorithm, str | None):
+        fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
+    task = task.name if isinstance(task, QuadrupedEnv) else task
+    return override(base_config(task, None if name is None else str(name), algorithm), changes)
+
+
 def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
     """Returns the settings of a file or a shipped name, with the algorithm's preset.
 
@@ -201,8 +368,9 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
     return override(named_config(name, task), changes)
 
 
-def for_task(config: TrainConfig, task: str, env: Mapping[str, Any] | None = None) -> TrainConfig:
+def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
     """Returns the settings with a task and its parameters; says so where they are those of another task."""
-    if config.task not in (None, task):
-        print(f"mqe: the settings are for {config.task!r}; training {task!r} with them", file=sys.stderr)
-    return override(config, {"task": task, "env": dict(env or {})})
+    name = task.name if isinstance(task, QuadrupedEnv) else task
+    if config.task not in (None, name):
+        echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
+    return override(config, {"task": name, "env": joined(parameters_of(task), env or {})})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+import sys
 
 _MARKDOWN = re.compile(r"[\\`*_\[\]|~]")
 
@@ -11,6 +12,11 @@ _MARKDOWN = re.compile(r"[\\`*_\[\]|~]")
 def line(text: object) -> str:
     """Returns a text as one line for a terminal: no control character, such as escape, remains."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(str(text).split()))
+
+
+def echo(text: object) -> None:
+    """Prints a text as one line to standard error."""
+    print(line(text), file=sys.stderr, flush=True)
 
 
 def to_html(text: object) -> str:

@@ -217,11 +217,7 @@ def versus(env: VectorEnv | Wrapper, opponents: Sequence[Policy | str | Path], *
     """
     if isinstance(opponents, str) or not isinstance(opponents, Sequence):
         fail("opponents", opponents, "a list of policies")
-    for policy in opponents:
-        if not isinstance(policy, str | Path) and not hasattr(policy, "initial_memory"):
-            fail("opponents", policy, "a policy, or what load_policy accepts")
-    policies = [load_as("opponent", x, env.env) if isinstance(x, str | Path) else x for x in opponents]
-    return Versus(env, policies, draw_reward)
+    return Versus(env, [load_as("opponent", each, env.env) for each in opponents], draw_reward)
 
 
 class Mirror(OneTeam):

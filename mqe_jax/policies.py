@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,10 @@ from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
-from mqe_jax.settings import PathText, checked
+from mqe_jax.settings import PathText, check, checked
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
-from mqe_jax.train.types import AnyEnvironment, Memory
+from mqe_jax.train.types import AnyEnvironment, Memory, PolicyOrAct
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -122,15 +122,27 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     return policy
 
 
-def load_as(field: str, source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
-    """Returns `load_policy` for a setting or argument, which errors name."""
+def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
+    """Returns the policy of a setting or argument, which errors name: a policy, its `act`, or what `load_policy` takes.
+
+    A function has no recurrent state, and acts for one team. A policy that acts beside another one must have the same
+    skill and command ranges.
+    """
     try:
-        policy = load_policy(source, env, deterministic=deterministic)
+        if isinstance(source, str | Path):
+            policy: Any = load_policy(source, env, deterministic=deterministic)
+        else:
+            policy = check("policy", source, PolicyOrAct)
+            if isinstance(policy, TrainedPolicy):
+                check_policy(policy, env, repr(policy))
+                policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
     except InputError as error:
-        optional = "" if field == "opponent" else ", or none"
+        optional = ", or none" if "." in field else ""
         raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
-    if isinstance(policy, TrainedPolicy) and (other := _other_commands(policy, env)):
+    if field != "policy" and isinstance(policy, TrainedPolicy) and (other := _other_commands(policy, env)):
         raise InputError(f"{field}: {source} was trained with {other}; its actions mean other commands there")
+    if not hasattr(policy, "act"):
+        return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: policy(obs, (), key)[0])
     return policy
 
 

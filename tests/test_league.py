@@ -28,7 +28,7 @@ from mqe_jax.opponents import versus
 from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import TrainState, env_dims, make_learner
+from mqe_jax.train.learner import TrainState, env_dims, make_ppo
 from mqe_jax.train.policy import policy_of, read_policy, save_policy
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
@@ -71,7 +71,7 @@ def history() -> list[TrainState]:
     """States of a training after each update; episodes have ten steps, a rollout four, a snapshot is due every one."""
     config = config_of()
     env = League(matches(num_envs=8), SOURCES, config)
-    learner = make_learner(env, config)
+    learner = make_ppo(env, config)
     update, states = jax.jit(learner.update), [jax.jit(learner.init)(KEY)]
     for _ in range(9):
         states.append(update(states[-1])[0])

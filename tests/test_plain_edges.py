@@ -20,7 +20,7 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.settings import build
 from mqe_jax.terrain import Gate, Track
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import make_learner
+from mqe_jax.train.learner import make_ppo
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
 from mqe_jax.train.optim import adam
 from mqe_jax.train.rollout import _means, _sums
@@ -133,7 +133,7 @@ def test_rewards_that_are_always_zero_leave_everything_finite() -> None:
         },
     )
     env = Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4)
-    learner = make_learner(env, config)
+    learner = make_ppo(env, config)
     state, metrics = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state.params)) and float(metrics["value_mean"]) == 0.0
     assert np.isfinite(float(metrics["explained_variance"]))

@@ -22,7 +22,7 @@ from mqe_jax.settings import build, to_mapping
 from mqe_jax.train import learner as learning
 from mqe_jax.train.checkpoint import save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.learner import env_dims, make_ppo
 from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import Seeds
@@ -70,7 +70,7 @@ def test_environments_get_the_assistance_of_the_schedule_and_of_their_success() 
     """It falls by 0.3 with every update that succeeds, from 0.8, and is annealed to 0 within 5 of 10 updates."""
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
     values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5, "assistance_step": 0.3}}
-    learner = make_learner(Help(), build(TrainConfig, {**values, "network": {"recurrent": False}}))
+    learner = make_ppo(Help(), build(TrainConfig, {**values, "network": {"recurrent": False}}))
     state, update = jax.jit(learner.init)(KEY), jax.jit(learner.update)
     for expected in (0.8, 0.5, 0.2, 0.0):
         state, metrics = update(state)
@@ -108,7 +108,7 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
         config = build(
             TrainConfig, {**values, "network": {"recurrent": False, "hidden_sizes": [4]}, "rollout_steps": 4}
         )
-        state = jax.jit(make_learner(env, config).init)(KEY)
+        state = jax.jit(make_ppo(env, config).init)(KEY)
         policy = policy_of(state, env_dims(env, config), config, task="probe")
         one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
         assert (one["env_steps"], two["env_steps"]) == (3, 5) and one["sampled"] == two["sampled"] != one[

@@ -86,7 +86,7 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     """A state after some updates, whose statistics are not trivial, and a rollout of random numbers."""
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
     env = dataclasses.replace(env, teacher=Teacher(), show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
-    made = learning.make_learner(env, config)
+    made = learning.make_ppo(env, config)
     normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
     shapes = jax.eval_shape(made.init, jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
@@ -330,7 +330,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
     length = made.network.chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
     monkeypatch.setattr(learning, "minibatches", lambda *_: jnp.asarray(order))
-    after, metrics = jax.jit(learning.make_learner(env, config).update)(state)
+    after, metrics = jax.jit(learning.make_ppo(env, config).update)(state)
 
     plain = Plain(config, state, data)
     plain.prepare()

@@ -15,7 +15,7 @@ from mqe_jax.policies import SimplePolicy
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
-from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.learner import TrainState, env_dims, make_ppo
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
 from tests import training as probes
@@ -37,7 +37,7 @@ def small(**values: Any) -> TrainConfig:
 
 def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState, dict[str, jax.Array]]:
     """Runs updates and returns the last state and metrics."""
-    learner = make_learner(env, config)
+    learner = make_ppo(env, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     update = jax.jit(learner.update)
     metrics = {}
@@ -50,7 +50,7 @@ def test_values_bootstrap_at_truncation_and_not_at_termination() -> None:
     env = Probe(probes.show_step_and_parity, probes.pay_one, num_envs=32, features=5, even_truncate=True)
     config = small(ppo__gamma=0.8, ppo__value_clip=None, normalization__value_decay=0.9)
     state, _ = learn(env, config, 60)
-    network = make_learner(env, config).network
+    network = config.network.build(env_dims(env, config))
     seen = jnp.stack([probes.show_step_and_parity(jnp.ones(2), jnp.full(2, s)) for s in range(4)])
     value, _ = network.value(state.params, (), jnp.zeros((4, 2), bool), jnp.zeros((4, 2, 2, 7)), seen)
     value = value_denormalize(state.value_normalizer, value)
@@ -68,12 +68,13 @@ def test_small_rewards_are_learnt_as_large_ones() -> None:
     def trained(scale: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The values of both signs in units of the scale, and the explained variance."""
         env = Probe(probes.show_hidden, lambda hidden, action: scale * hidden, num_envs=16)
-        learner = make_learner(env, small(num_envs=16, ppo__epochs=1))
+        config = small(num_envs=16, ppo__epochs=1)
+        learner = make_ppo(env, config)
         state, metrics = jax.lax.scan(
             lambda state, _: learner.update(state), learner.init(jax.random.PRNGKey(0)), None, 30
         )
         seen = jnp.zeros((1, 2), bool), jnp.zeros((1, 2, 2, 3)), jnp.array([[[1.0], [-1.0]]])
-        value, _ = learner.network.value(state.params, (), *seen)
+        value, _ = config.network.build(env_dims(env, config)).value(state.params, (), *seen)
         return value_denormalize(state.value_normalizer, value[0]) / scale, metrics["explained_variance"][-1]
 
     values, explained = zip(*map(trained, (1.0, 1e-3)), strict=True)
@@ -104,7 +105,7 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
 def test_an_environment_of_two_teams_is_refused() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=32, teams=((1,), (0,)))
     with pytest.raises(ValueError, match="probe has 2 teams"):
-        make_learner(env, small())
+        make_ppo(env, small())
 
 
 def test_memory_carries_a_sign_through_an_episode() -> None:
@@ -137,7 +138,7 @@ class OnePass(NamedTuple):
 def one_pass() -> OnePass:
     """Runs updates of one epoch over one batch, with a recurrent network; odd environments have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
-    learner = make_learner(
+    learner = make_ppo(
         env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
     )
     update = jax.jit(learner.update)
@@ -174,7 +175,7 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
         return order
 
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    learner = make_learner(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
+    learner = make_ppo(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     monkeypatch.setattr(jax.random, "permutation", noted)
     jax.block_until_ready(jax.jit(learner.update)(state))
@@ -204,7 +205,7 @@ def test_a_teacher_is_imitated_while_its_weight_lasts() -> None:
     env = dataclasses.replace(env, num_envs=32, teacher=Opposite())
     config = small(total_steps=32 * 8 * 120, network__log_std_min=-1.0)
     config = override(config, {"imitation": {"teacher": "scripted", "weight": 20.0, "until": 0.5}})
-    learner = make_learner(env, config)
+    learner = make_ppo(env, config)
     state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
     rewards = []
     for _ in range(120):
@@ -213,7 +214,7 @@ def test_a_teacher_is_imitated_while_its_weight_lasts() -> None:
     assert np.mean(rewards[20:40]) < -0.3
     assert np.mean(rewards[-10:]) > 0.6
     with pytest.raises(InputError, match=r"^imitation\.teacher: 'scripted' is not allowed; .* without recurrent state"):
-        make_learner(dataclasses.replace(env, teacher=Recurrent()), config)
+        make_ppo(dataclasses.replace(env, teacher=Recurrent()), config)
 
 
 def test_settings_must_fit_the_environment() -> None:
@@ -230,7 +231,7 @@ def test_settings_must_fit_the_environment() -> None:
         ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
     ):
         with pytest.raises(InputError, match=f"^{message}"):
-            make_learner(env, small(**values))
+            make_ppo(env, small(**values))
 
 
 class WrongSize(Probe):
@@ -242,7 +243,7 @@ class WrongSize(Probe):
 def test_a_wrong_observation_size_is_named() -> None:
     env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
     with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)"):
-        make_learner(env, small(num_envs=4))
+        make_ppo(env, small(num_envs=4))
 
 
 class Tuple(NamedTuple):
@@ -282,13 +283,13 @@ def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered
     config = small(num_envs=4, stagger_episodes=True, network__critic_input="observations", ppo__epochs=1)
     config = override(config, {"normalization.observations": True})
     config = override(config, {"curriculum.failure_bootstrap": 0.5})
-    learner = make_learner(Foreign(), config)
+    learner = make_ppo(Foreign(), config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(1))
     assert len(np.unique(state.rollout.env_state.step)) > 1
     _, metrics = jax.jit(learner.update)(state)
     assert all(np.isfinite(float(value)) for value in metrics.values())
     with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
-        make_learner(Foreign(), small(num_envs=4))
+        make_ppo(Foreign(), small(num_envs=4))
 
 
 def test_a_policy_of_another_task_is_not_evaluated() -> None:

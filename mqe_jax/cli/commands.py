@@ -8,13 +8,14 @@ from __future__ import annotations
 import textwrap
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions, echo, print_table
+from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Episodes, Horizon
+from mqe_jax.literal import echo
 from mqe_jax.settings import record
 
 _ZOO = Path(__file__).parent.parent / "zoo"
@@ -113,32 +114,24 @@ class Eval(PolicyOptions):
     """Number of evaluation episodes, split evenly over environments."""
     num_envs: Environments = 128
     """Number of parallel environments."""
+    sides: Literal["both", "first"] = "first"
+    """Side of the policy in a match: the task's team 0 in all episodes (first), or in half of them (both)."""
     dump_diverged: DumpDiverged = None
 
     def run(self) -> dict[str, Any]:
         """Evaluates a policy; prints a table, or returns the object for `--json`."""
-        import jax
+        from mqe_jax.runs.playing import evaluate
 
-        from mqe_jax.cli.train import DivergenceRecorder
-        from mqe_jax.train import evaluate as evaluation
-
-        num_envs = min(self.num_envs, self.episodes)
-        env, vector_env, policy, about = self.environments(num_envs)
-        recorder = None if self.dump_diverged is None else DivergenceRecorder(env, self.dump_diverged)
-        result = evaluation.evaluate_batch(
-            vector_env, policy, self.episodes, jax.random.PRNGKey(self.seed), recorder=recorder
-        )
-        if recorder is not None:
-            recorder.report()
+        options = {"episodes": self.episodes, "num_envs": self.num_envs, "sides": self.sides, "seed": self.seed}
+        result = evaluate(**self.playing, **options, dump_diverged=self.dump_diverged)
         if result.overflow:
             echo(
                 f"mqe: warning: the engine may have dropped contacts in {result.overflow} environment steps; "
                 "raise --set contacts_per_robot and --set constraints_per_robot"
             )
-        told = {"task": result.task, **about, **result.to_dict()}
         if not self.json:
-            print_table(told)
-        return told
+            print(result)
+        return result.to_dict()
 
 
 @record

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from collections.abc import Mapping
@@ -11,18 +10,15 @@ from typing import Any
 import jax
 
 from mqe_jax import interrupts
-from mqe_jax.build import base_config, environments, for_task, make_env
+from mqe_jax.build import base_config, for_task, make_env
 from mqe_jax.cli.commands import Demo
-from mqe_jax.cli.options import echo
-from mqe_jax.cli.render import draw
-from mqe_jax.envs import VectorEnv
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
-from mqe_jax.train import evaluate as evaluation
-from mqe_jax.train import runner
-from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import env_dims, make_learner
-from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy
+from mqe_jax.literal import echo
+from mqe_jax.runs.learning import learn
+from mqe_jax.runs.playing import evaluate, render
+from mqe_jax.train.learner import env_dims, make_ppo
+from mqe_jax.train.policy import policy_of
 from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
 from mqe_jax.viz.clips import check_output
@@ -35,42 +31,41 @@ def demo(arguments: Demo) -> None:
     began, run_dir = time.perf_counter(), arguments.run_dir
     config = for_task(base_config(DEMO_TASK, arguments.config), DEMO_TASK)
     check_folder(run_dir)
-    env, vector_env = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
-    training_env, _ = environments(arguments.impl, config, 1)
+    _, batch = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
+    playing: dict[str, Any] = {"env": config.env, "impl": arguments.impl, "deterministic": True}
+    measure: dict[str, Any] = playing | {
+        "episodes": arguments.episodes,
+        "num_envs": config.num_envs,
+        "seed": config.seed + 1000,
+    }
 
-    untrained = make_learner(vector_env, config)
-    state = jax.jit(untrained.init)(initial_key(config))
-    before = policy_of(state, env_dims(vector_env, config), config, task=DEMO_TASK)
+    state = jax.jit(make_ppo(batch, config).init)(initial_key(config))
+    before = policy_of(state, env_dims(batch, config), config, task=DEMO_TASK)
     del state
     echo("mqe demo: evaluating the untrained policy")
-    table = {"before": _measure(vector_env, before, arguments.episodes, config)}
+    table = {"before": evaluate(DEMO_TASK, before, **measure).to_dict()}
     print(f"before training: {_summary(table['before'])}", flush=True)
     with interrupts.before_exit(lambda: "the same command resumes from here"):
-        runner.train(training_env, config, run_dir, resume=True)
-    after = read_policy(run_dir)
-    table["after"] = _measure(vector_env, after, arguments.episodes, config)
+        run = learn(DEMO_TASK, config, impl=arguments.impl, run_dir=run_dir, resume=True)
+    if not run.finished:
+        raise KeyboardInterrupt
+    table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
-    curves.draw_curve([run_dir], run_dir / "curve.png", DEMO_TASK, "Narrow Gate, trained on the CPU")
+    curves.save_figure(curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU"), run_dir / "curve.png")
     video = run_dir / "video.mp4"
     try:
         check_output(video)
     except InputError:
         video = run_dir / "video.gif"
     echo("mqe demo: rendering an episode")
-    draw(env, dataclasses.replace(after, deterministic=True), video, seed=config.seed + 1, episodes=16, size=(640, 360))
+    render(DEMO_TASK, run.policy, **playing, seed=config.seed + 1, episodes=16, width=640).save(video)
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
     minutes = (time.perf_counter() - began) / 60
     print(f"took {minutes:.1f} minutes; evaluate it again with: mqe eval {run_dir} --deterministic")
-
-
-def _measure(env: VectorEnv, policy: TrainedPolicy, episodes: int, config: TrainConfig) -> dict[str, Any]:
-    """Evaluates a policy with its mean actions."""
-    mean = dataclasses.replace(policy, deterministic=True)
-    return evaluation.evaluate_batch(env, mean, episodes, jax.random.PRNGKey(config.seed + 1000)).to_dict()
 
 
 def _summary(result: Mapping[str, Any]) -> str:

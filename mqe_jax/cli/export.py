@@ -9,9 +9,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax.cli.options import Json, echo, print_table
+from mqe_jax.cli.options import Json, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, check_output, write_atomically
+from mqe_jax.literal import echo
 from mqe_jax.settings import record
 
 

@@ -20,9 +20,9 @@ import tyro
 
 from mqe_jax import interrupts
 from mqe_jax.cli.meeting import LIMIT, meet
-from mqe_jax.cli.options import echo
 from mqe_jax.errors import InputError
 from mqe_jax.limits import PositiveInt
+from mqe_jax.literal import echo
 from mqe_jax.settings import fail, record
 from mqe_jax.train.devices import PEER, PEER_ENDED
 

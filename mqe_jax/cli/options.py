@@ -19,7 +19,7 @@ from mqe_jax.literal import line
 from mqe_jax.settings import joined, record
 
 if TYPE_CHECKING:
-    from mqe_jax.train.policy import Policy
+    pass
 
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[
@@ -77,36 +77,17 @@ class PolicyOptions(TaskOptions):
     declares."""
     seed: Seed = 0
 
-    def environments(self, num_envs: int) -> tuple[Any, Any, Policy, dict[str, Any]]:
-        """Returns task and vectorised environment as `make_env`, the policy of all agents, and who acts, by name.
-
-        A run has its own task, parameters and policy; a task has its shipped policy, if its parameters are the default
-        ones, its scripted policy, or forward if it has neither; random, where actions are not commands.
-        """
-        from mqe_jax import build, zoo
-        from mqe_jax.envs import ALIASES, PLANNERS, TASKS
-        from mqe_jax.policies import all_agents, load_as, load_policy
-        from mqe_jax.train.policy import TrainedPolicy
-
-        task, params = ALIASES.get(self.target, self.target), self.overrides()
-        shipped = task in zoo.names() and not params and self.policy is None
-        walking = "scripted" if task in PLANNERS else "forward"
-        default = walking if params.get("control", "command") == "command" else "random"
-        name = task if shipped else self.policy or default
-        if task not in (*TASKS, *zoo.names()) and (os.sep in self.target or Path(self.target).exists()):
-            config = build.run_config(self.target)
-            task, params, name = config.task, settings.joined(config.env, params), self.policy or self.target
-        env, vector_env = build.make_env(task, self.impl, params, num_envs)
-        own = load_policy(name, env, deterministic=self.deterministic)
-        match = len(env.teams) > 1
-        opponent, against = (own, name) if shipped and match else (None, "idle")
-        if self.opponent is not None:
-            opponent, against = load_as("opponent", self.opponent, env, deterministic=self.deterministic), self.opponent
-        about: dict[str, Any] = {"policy": name}
-        if isinstance(own, TrainedPolicy):
-            about["actions"] = "mean" if own.deterministic else "sampled"
-        about |= {"opponent": against, "seed": self.seed} if match else {"seed": self.seed}
-        return env, vector_env, all_agents(env, own, opponent), about
+    @property
+    def playing(self) -> dict[str, Any]:
+        """Arguments of `evaluate`, `render` and `players`."""
+        return {
+            "task": self.target,
+            "policy": self.policy,
+            "opponent": self.opponent,
+            "env": self.overrides(),
+            "impl": self.impl,
+            "deterministic": self.deterministic,
+        }
 
 
 def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
@@ -119,11 +100,6 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
         value = parse_yaml(text, f"set: the value of {shown(pair)}")
         values = joined(values, {name.strip().replace("-", "_"): value})
     return values
-
-
-def echo(text: str) -> None:
-    """Prints a line to standard error."""
-    print(line(text), file=sys.stderr, flush=True)
 
 
 def print_table(values: Mapping[str, Any]) -> None:

@@ -27,7 +27,7 @@ from mqe_jax.cli.options import print_table
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.files import check_output, replacing
 from mqe_jax.settings import fail, override
-from mqe_jax.train.learner import make_learner
+from mqe_jax.train.learner import make_ppo
 
 SUFFIXES = (".png", ".pdf", ".svg")
 SCOPES = ("physics", "control", "task", "reset")
@@ -199,7 +199,7 @@ def profile_training(task: str, impl: str, env: dict[str, Any], num_envs: int) -
     """Returns the seconds of a training update with the task's settings and its shares, `learner` among them."""
     config = build.for_task(build.base_config(task, None), task, env)
     config = override(config, {"num_envs": num_envs, "evaluation.every": None})
-    learner = make_learner(build.environments(impl, config, 1)[0], config)
+    learner = make_ppo(build.environments(impl, config, 1)[0], config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     update = jax.jit(learner.update).lower(state).compile()
     state, _ = jax.block_until_ready(update(state))

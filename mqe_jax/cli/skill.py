@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed, echo, print_table
+from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed, print_table
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_output
 from mqe_jax.limits import Environments
+from mqe_jax.literal import echo
 from mqe_jax.settings import record
 
 

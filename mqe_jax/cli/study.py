@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from mqe_jax import interrupts
-from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions, echo
+from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
 from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
 from mqe_jax.files import check_output
 from mqe_jax.limits import Candidates, Positive
-from mqe_jax.literal import line
+from mqe_jax.literal import echo, line
 from mqe_jax.settings import fail, record
 
 if TYPE_CHECKING:

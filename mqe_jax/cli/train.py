@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated, Any
 
 import jax
-import numpy as np
 import pydantic
 import tyro
 
 from mqe_jax import interrupts, robots
-from mqe_jax.build import base_config, environments, for_task
-from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions, echo
-from mqe_jax.envs import ALIASES, TASKS, QuadrupedEnv
-from mqe_jax.envs.replay import content, save_recording
-from mqe_jax.envs.wrappers import WrappedState
-from mqe_jax.files import check_folder
+from mqe_jax.build import base_config
+from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions
+from mqe_jax.errors import InputError
 from mqe_jax.limits import Seeds
-from mqe_jax.opponents import TeamState
-from mqe_jax.settings import fail, is_record, override, record
-from mqe_jax.train import runner
-from mqe_jax.train.checkpoint import latest
+from mqe_jax.literal import echo
+from mqe_jax.runs.learning import learn, learn_seeds
+from mqe_jax.settings import fail, override, record
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.folder import check_alone, check_run
-from mqe_jax.train.networks import NETWORKS
-from mqe_jax.train.types import Trace
 from mqe_jax.viz import curves
 from mqe_jax.walk.network import HistorySettings
 from mqe_jax.walk.task import WalkTask
@@ -83,28 +73,21 @@ class Train(TaskOptions):
 
     def run(self) -> None:
         """Trains into the run folder."""
-        config = for_task(self.settings, self.target, self.overrides())
-        run_dir = self.run_dir or Path("runs") / self.target
-        configs, folders = [config], [run_dir]
-        if self.num_seeds > 1:
-            configs = [override(config, {"seed": config.seed + i}) for i in range(self.num_seeds)]
-            folders = [run_dir / f"seed{each.seed}" for each in configs]
-        vector_env, eval_env = environments(self.impl, config, len(configs))
-        recorder = None if self.dump_diverged is None else DivergenceRecorder(vector_env.env, self.dump_diverged)
-        if self.resume and not any(map(latest, folders)):
-            for folder in folders:  # as the trainer does later, after this line would have been wrong
-                check_alone(folder)
-                check_run(folder, resume=True)
-            echo(f"mqe: {run_dir} has no checkpoint to resume from; starting a new run")
+        run_dir, seed = self.run_dir or Path("runs") / self.target, self.settings.seed
+        options: dict[str, Any] = {"env": self.overrides(), "impl": self.impl, "resume": self.resume}
+        options |= {"run_dir": run_dir, "dump_diverged": self.dump_diverged}
         with interrupts.before_exit(lambda: _HINT.format(run_dir)):
-            try:
-                runner.train_seeds(vector_env, configs, folders, self.resume, eval_env=eval_env, recorder=recorder)
-            finally:
-                if recorder is not None:
-                    recorder.report()
+            if self.num_seeds == 1:
+                folders, runs = [run_dir], [learn(self.target, self.settings, **options)]
+            else:
+                seeds = range(seed, seed + self.num_seeds)
+                folders = [run_dir / f"seed{number}" for number in seeds]
+                runs = learn_seeds(self.target, self.settings, seeds=seeds, **options)
+        if not all(run.finished for run in runs):
+            raise KeyboardInterrupt  # which ended the training in Python, not in the command line
         if jax.process_index() > 0:  # one process writes the files
             return
-        curves.draw_curve(folders, run_dir / "curve.png", self.target)
+        curves.save_figure(curves.plot_curves([run.metrics for run in runs], self.target), run_dir / "curve.png")
         for folder in folders:
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")
@@ -146,39 +129,21 @@ def parse_train(arguments: Sequence[str]) -> Train:
     """Parses the arguments of `mqe train`; the settings' file, algorithm and network decide the flags' defaults.
 
     Raises:
-        InputError: for a file, an algorithm or a network that is not allowed.
+        InputError: without a task in front, or for a file, an algorithm or a network that is not allowed.
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
+    task, helps = next(iter(arguments), ""), {"-h", "--help"}.intersection(arguments)
+    if not helps and (not task or task.startswith("-")):
+        raise InputError(f"task: is missing; it comes first: mqe train TASK {' '.join(arguments)}".rstrip())
     source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
     network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
-    settings = base_config(_task(others), source.config, source.algorithm)
+    settings = base_config(task, source.config, source.algorithm)
     if network.name is not None and network.name != settings.network.name:
         settings = override(settings, {"network": {"name": network.name}})
     if any(word.split("=")[0] == "--opponent" for word in others):  # tyro would append to those of the file
         settings = override(settings, {"opponents": ()})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=_MARKERS)
-
-
-def _task(words: Sequence[str]) -> str:
-    """Returns the first task's id that is not the value of a flag; empty without one."""
-    switches = {"help", *_switches(Train), *(name for network in NETWORKS.values() for name in _switches(network))}
-
-    def takes_value(word: str) -> bool:
-        name = word.split(".")[-1].replace("-", "_").lstrip("_").removeprefix("no_")
-        return word.startswith("--") and "=" not in word and name not in switches
-
-    pairs = zip(["", *words], words, strict=False)
-    return next((word for before, word in pairs if word in (*TASKS, *ALIASES) and not takes_value(before)), "")
-
-
-def _switches(kind: Any) -> Iterator[str]:
-    """Yields the names of a record's flags without a value, at any depth."""
-    for name, hint in typing.get_type_hints(kind).items():
-        if is_record(hint):
-            yield from _switches(hint)
-        elif hint is bool:
-            yield name
 
 
 def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
@@ -194,56 +159,3 @@ def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
     settings, task = SETTINGS.get(name, SETTINGS["walk"])
     default = SkillTrain(skill=tyro.MISSING, settings=settings, task=task)
     return tyro.cli(SkillTrain, prog="mqe skill train", args=list(arguments), default=default, config=_MARKERS)
-
-
-STEPS = 64
-"""Maximum number of steps in a recording, the last of which diverges."""
-LIMIT = 100
-"""Maximum number of recordings per command."""
-
-
-class DivergenceRecorder:
-    """Writes the last steps of environments that diverge to `FOLDER/diverged_0000.npz`, ..."""
-
-    written: list[Path]
-    """Files written."""
-
-    def __init__(self, env: QuadrupedEnv, folder: Path) -> None:
-        check_folder(folder, "dump_diverged")
-        self.written: list[Path] = []
-        self._env, self._folder = env, folder
-        self._previous: Trace | None = None
-
-    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace:
-        """Returns the fields on which a step of all environments depends, and all agents' actions."""
-        if isinstance(after, TeamState):
-            before, action, after = before.match, after.action, after.match
-        while isinstance(after, WrappedState):
-            before, action, after = before.inner, after.action, after.inner
-        return Trace(content(before), action, after.metrics["diverged"])
-
-    def add(self, trace: Trace) -> None:
-        """Writes a recording of each environment that diverged in a trace, with steps of the previous one if needed."""
-        for step, index in np.argwhere(np.asarray(trace.diverged) > 0.0)[: LIMIT - len(self.written)]:
-            parts = [trace] if self._previous is None else [self._previous, trace]
-            steps, actions = jax.tree.map(
-                lambda *leaves, i=index: np.concatenate([np.asarray(leaf[:, i]) for leaf in leaves]),
-                *[(part.snapshot, part.action) for part in parts],
-            )
-            end = len(actions) - len(trace.diverged) + step + 1
-            last = slice(max(0, end - STEPS), end)
-            steps: Any = jax.tree.map(lambda leaf, last=last: leaf[last], steps)
-            states: Any = SimpleNamespace(data=SimpleNamespace(**steps.pop("data")), **steps)
-            save_recording(self._next_file(), self._env, states, actions[last])
-        self._previous = trace
-
-    def report(self) -> None:
-        """Prints how many recordings there are, if any, and how to replay one."""
-        if self.written:
-            echo(f"mqe: recorded {len(self.written)} divergences; replay the first with: mqe replay {self.written[0]}")
-
-    def _next_file(self) -> Path:
-        taken = {file.name for file in self._folder.glob("diverged_*.npz")}
-        name = next(name for i in range(len(taken) + 1) if (name := f"diverged_{i:04d}.npz") not in taken)
-        self.written.append(self._folder / name)
-        return self.written[-1]

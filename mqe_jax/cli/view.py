@@ -11,9 +11,10 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from mqe_jax.cli.options import PolicyOptions, echo
+from mqe_jax.cli.options import PolicyOptions
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Port
+from mqe_jax.literal import echo
 from mqe_jax.settings import fail, record
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
@@ -35,8 +36,7 @@ class View(PolicyOptions):
         if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
             raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
         _check_address(self.host, self.port)
-        env, vector_env, policy, _ = self.environments(self.num_envs)
-
+        from mqe_jax.build import players
         from mqe_jax.envs import ALIASES
         from mqe_jax.view.menu import DEFAULT, Choice, Menu, find_runs
         from mqe_jax.view.session import Session
@@ -47,8 +47,9 @@ class View(PolicyOptions):
             names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
             target = choice.policy if choice.policy in runs else choice.task
             options = dataclasses.replace(self, target=target, policy=names[0], opponent=names[1], set=[])
-            return Session(*options.environments(self.num_envs)[:3], self.seed)
+            return Session(*players(**options.playing, num_envs=self.num_envs)[:3], self.seed)
 
+        env, vector_env, policy, _ = players(**self.playing, num_envs=self.num_envs)
         runs = find_runs([Path("runs"), Path(self.target).parent])
         own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
         menu = Menu(open_choice, Choice(env.name, own, self.opponent or DEFAULT), runs)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
-from mqe_jax.files import parsing, read_rows
 from mqe_jax.literal import line
 from mqe_jax.settings import build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
-from mqe_jax.train.logs import number
+from mqe_jax.train.logs import number, read_metrics
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import POLICY_FILE
 
@@ -105,17 +103,8 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def read_curve(path: Path) -> Curve:
-    """Reads the columns of a metrics.csv; InputError naming the file, if it is missing or malformed."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file; a run folder has one after its first update")
-    rows = read_rows(path)
-    names = next(rows, [])
-    columns = [array("d") for _ in names]
-    with parsing(path, "a metrics.csv"):
-        for row in rows:
-            for column, text in zip(columns, row, strict=True):
-                column.append(float(text))
-    curve = {name: np.array(column) for name, column in zip(names, columns, strict=True)}
+    """Reads the columns of a metrics.csv; InputError naming the file, if it is missing, malformed or has no row."""
+    curve = read_metrics(path)
     if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
         raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
     if not np.all(np.diff(curve["env_steps"], prepend=0.0) > 0):

@@ -6,8 +6,9 @@ Short episodes are therefore not over-represented.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Episodes, Horizon, PositiveInt
+from mqe_jax.literal import line, to_html
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.types import (
     AnyBatch,
@@ -36,8 +38,29 @@ if TYPE_CHECKING:
 Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
 
+_NORMAL = 1.959964  # two-sided 95% quantile
 
-@dataclass(frozen=True)
+
+class Rate(NamedTuple):
+    """A rate of episodes with its 95% Wilson interval (Wilson 1927, doi 10.1080/01621459.1927.10502953)."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{100 * self.value:.1f}% ({100 * self.low:.1f} to {100 * self.high:.1f}%)"
+
+    @classmethod
+    def of(cls, value: float, episodes: int) -> Rate:
+        """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is conservative."""
+        spread = _NORMAL**2 / episodes
+        middle = (value + spread / 2) / (1 + spread)
+        half = math.sqrt(spread * max(value * (1 - value), 0.0) + spread**2 / 4) / (1 + spread)
+        return cls(value, max(middle - half, 0.0), min(middle + half, 1.0))
+
+
+@dataclass(frozen=True, repr=False)
 class Result:
     """Results of an evaluation; means are over the steps of the counted episodes or over episodes."""
 
@@ -59,17 +82,61 @@ class Result:
     """Number of episodes that ended because the physics diverged."""
     endings: dict[str, float]
     """Fraction of episodes that ended by each cause, from metrics `ending/<name>`."""
-    success: dict[str, float]
+    outcomes: dict[str, float]
     """Other outcomes by name, mean over episodes, from metrics `success/<name>`."""
     match: dict[str, float]
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
+    about: dict[str, Any] = field(default_factory=dict)
+    """Who acted, by name: policy, actions, opponent, sides, seed."""
+
+    @property
+    def success(self) -> Rate:
+        """Rate of success."""
+        return Rate.of(self.success_rate, self.episodes)
+
+    @property
+    def win(self) -> Rate | None:
+        """Rate of wins of a match; None of another task."""
+        return self._rate("win_rate")
+
+    @property
+    def draw(self) -> Rate | None:
+        """Rate of draws of a match; None of another task."""
+        return self._rate("draw_rate")
+
+    @property
+    def loss(self) -> Rate | None:
+        """Rate of losses of a match; None of another task."""
+        return self._rate("loss_rate")
+
+    def _rate(self, name: str) -> Rate | None:
+        return Rate.of(self.match[name], self.episodes) if name in self.match else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; the entries of `endings`, `success` and `match` become top-level keys."""
-        values = {k: v for k, v in vars(self).items() if k not in ("endings", "success", "match")}
-        named = {"ending": self.endings, "success": self.success}
+        """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys."""
+        values = {k: v for k, v in vars(self).items() if k not in ("task", "about", "endings", "outcomes", "match")}
+        named = {"ending": self.endings, "success": self.outcomes}
         flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
-        return {**values, **self.match, **flat}
+        return {"task": self.task, **self.about, **values, **self.match, **flat}
+
+    def rows(self) -> dict[str, str]:
+        """Returns all results as text by name; rates have their intervals."""
+        found = {}
+        for name, value in self.to_dict().items():
+            if name == "terms":
+                found |= {f"reward/{term}": f"{mean:.4g}" for term, mean in value.items()}
+            elif name == "success_rate" or name in self.match:
+                found[name] = str(Rate.of(value, self.episodes))
+            else:
+                found[name] = f"{value:.4g}" if isinstance(value, float) else line(value)
+        return found
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{name:<28} {text}" for name, text in self.rows().items())
+
+    def _repr_html_(self) -> str:
+        cells = ((to_html(name), to_html(text)) for name, text in self.rows().items())
+        return "<table>" + "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in cells) + "</table>"
 
 
 class _Progress(NamedTuple):
@@ -123,8 +190,8 @@ def evaluate_batch(
 ) -> Result:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
-    Environment i contributes its first `episodes // N` episodes (one more if i < `episodes % N`); later ones are
-    ignored, so the sample is not biased by episode length.
+    Each environment contributes its first `episodes // N` episodes, every few of them one more; later ones are ignored,
+    so the sample is not biased by episode length.
 
     Args:
         env: the environments.
@@ -191,7 +258,7 @@ class Evaluator:
         """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate_batch`."""
         episodes = check("episodes", episodes, Episodes)
         count = self._env.num_envs
-        quota = episodes // count + (np.arange(count) < episodes % count).astype(np.int32)
+        quota = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
         progress = self._begin(keys)
         for done_steps in range(0, self._max_steps, self._block):
             progress, trace = self._run(progress, params, keys, np.uint32(done_steps), quota)
@@ -269,6 +336,6 @@ def _result(task: str, episodes: int, progress: _Progress) -> Result:
         overflow=round(per_step.get("overflow", 0.0) * steps),
         diverged=round(per_episode.get("diverged", 0.0) * episodes),
         endings={n.removeprefix("ending/"): v for n, v in per_episode.items() if n.startswith("ending/")},
-        success={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
+        outcomes={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
         match={f"{n}_rate": per_episode[f"team0/{n}"] for n in ("win", "draw", "loss") if f"team0/{n}" in per_episode},
     )

@@ -68,7 +68,6 @@ class Learner(NamedTuple):
 
     init: Callable[[jax.Array], TrainState]
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
-    network: Network
 
 
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
@@ -82,9 +81,7 @@ def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     )
 
 
-def make_learner(
-    env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None = None, processes: int = 1
-) -> Learner:
+def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None = None, processes: int = 1) -> Learner:
     """Returns the learner of an environment.
 
     With `trace_step` (`Recorder.trace`), the metrics of an update also hold `trace`, a `Trace` of the rollout. With
@@ -176,7 +173,7 @@ def make_learner(
         metrics |= {"assistance": now.assistance, "entropy_coef": now.entropy_coef}
         return _strongly_typed(new_state), {**metrics, **batch_metrics, **loss_metrics}
 
-    return Learner(init, update, network)
+    return Learner(init, update)
 
 
 def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:

@@ -14,18 +14,20 @@ import struct
 import sys
 import time
 import uuid
+from array import array
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 import jax
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.text import Text
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError
-from mqe_jax.files import append, make_folder, read_rows, write_atomically
+from mqe_jax.files import append, make_folder, parsing, read_rows, write_atomically
 from mqe_jax.train.config import TrainConfig
 
 CSV_FILE = "metrics.csv"
@@ -73,6 +75,20 @@ class CsvLog:
         writer.writeheader()
         writer.writerows(rows)
         write_atomically(self._path, text.getvalue().encode())
+
+
+def read_metrics(path: Path) -> dict[str, np.ndarray]:
+    """Reads the columns of a metrics.csv (U,) each; InputError naming the file, if it is missing or malformed."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file; a run folder has one after its first update")
+    rows = read_rows(path)
+    names = next(rows, [])
+    columns = [array("d") for _ in names]
+    with parsing(path, "a metrics.csv"):
+        for row in rows:
+            for column, text in zip(columns, row, strict=True):
+                column.append(float(text))
+    return {name: np.array(column) for name, column in zip(names, columns, strict=True)}
 
 
 def number(value: float, digits: int = 8) -> str:

@@ -128,6 +128,8 @@ class Training:
     """The rows of metrics.csv that `run` has added, of each seed."""
     evaluations: list[EvaluationLog]
     """Evaluations of each seed; empty without evaluation."""
+    resumed: bool
+    """Whether it continues from checkpoints."""
 
     def __init__(
         self,
@@ -152,7 +154,8 @@ class Training:
         self._state = self._stacked.together(seeds.stack([state for state, _ in first]))
         self._update = self._stacked.compile(seeds.map(learner.update), more=True)
         self.env_steps = int(first[0][0].updates) * self._config.steps_per_update
-        self._saved = -1 if checkpoints[0] is None else self.env_steps
+        self.resumed = checkpoints[0] is not None
+        self._saved = self.env_steps if self.resumed else -1
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
         if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
@@ -162,7 +165,7 @@ class Training:
         self._writing = threading.RLock()  # held while files are written and the state is exchanged
         self._signal, self._ended = threading.Event(), threading.Event()  # in one of several processes
 
-    def run(self, on_update: OnUpdate | None, stop: Callable[[], bool]) -> list[TrainState]:
+    def run(self, on_update: OnUpdate | None = None, stop: Callable[[], bool] = lambda: False) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
         config = self._config
         if self._saved == self.env_steps and self._folders:

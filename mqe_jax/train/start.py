@@ -17,7 +17,7 @@ from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.folder import CONFIG_FILE
-from mqe_jax.train.learner import Learner, TrainState, make_learner
+from mqe_jax.train.learner import Learner, TrainState, make_ppo
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
 from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv
@@ -35,14 +35,14 @@ def initial_key(config: TrainConfig) -> jax.Array:
 def own_learner(env: VectorEnv, config: TrainConfig, recorder: Recorder | None) -> tuple[Learner, Processes]:
     """Returns the learner of this process, which has its share of the environments, and all processes."""
     trace, count = None if recorder is None else recorder.trace, jax.process_count()
-    whole = own = make_learner(env, config, trace)
+    whole = own = make_ppo(env, config, trace)
     if count > 1:
         if recorder is not None:
             raise InputError(f"recorder: not allowed in {count} processes; start the same training in one")
         share: Any = getattr(env, "share", None)
         if share is None:
             raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
-        own = make_learner(share(count), config, processes=count)
+        own = make_ppo(share(count), config, processes=count)
     return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
 
 

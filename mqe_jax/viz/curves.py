@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -15,6 +17,10 @@ from mqe_jax.literal import to_label
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_REWARDS = ("average_step_reward", "episode_return")
 _INK, _RUN, _SECOND = "#23252b", "#2f7fd6", "#3fae49"
 
 
@@ -27,24 +33,34 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
     return [float(window.mean()) if window.size else math.nan for window in windows]
 
 
-def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = None) -> None:
-    """Plots average step reward (and success) of runs over environment steps, and writes the image atomically."""
+def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figure:
+    """Returns a figure of average step reward (else return) and success over environment steps.
+
+    `tables` are columns of metrics.csv by name, of each seed.
+    """
     from matplotlib.figure import Figure
 
-    from mqe_jax.study.runs import REWARD, read_curve
+    class Plot(Figure):
+        def _repr_png_(self) -> bytes:  # in a notebook, whatever its backend
+            file = io.BytesIO()
+            self.savefig(file, format="png", dpi=80)
+            return file.getvalue()
 
-    tables = [read_curve(run / "metrics.csv") for run in runs]
-    figure = Figure((7.2, 4.2), dpi=150, layout="constrained")
+    figure = Plot((7.2, 4.2), dpi=150, layout="constrained")
     axes = figure.add_subplot()
+    axes.set_title(to_label(title), color=_INK, loc="left")
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    tables = [table for table in tables if len(table.get("env_steps", ()))]
+    if not tables:
+        return figure
+    name = next((name for name in _REWARDS if name in tables[0]), "updates")
     for table in tables:
-        steps, reward = table["env_steps"] / 1e6, table[REWARD]
+        steps, reward = table["env_steps"] / 1e6, table[name]
         axes.plot(steps, reward, color=_RUN, lw=0.6, alpha=0.3)
         axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label="mqe_jax" if table is tables[0] else None)
     last = max(table["env_steps"][-1] for table in tables) / 1e6
-    axes.set(xlabel="environment steps (millions)", ylabel="average step reward", xlim=(0, last))
-    axes.set_title(to_label(title or task), color=_INK, loc="left")
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set(xlabel="environment steps (millions)", ylabel=name.replace("_", " "), xlim=(0, last))
     if any(math.isfinite(v) for t in tables for v in t.get("success", [])):
         right = axes.twinx()
         for table in tables:
@@ -54,6 +70,11 @@ def draw_curve(runs: Sequence[Path], path: Path, task: str, title: str | None = 
         right.set_ylabel("success rate (%)", color=_SECOND)
         right.spines[["top", "left"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="best")
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Writes a figure atomically, in a folder that it creates."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         figure.savefig(temporary)

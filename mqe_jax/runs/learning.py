@@ -1,0 +1,197 @@
+"""A training by one call: `learn`, `learn_seeds`, and the `Run` that they return."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from mqe_jax.build import Config, Environments, Task, prepare
+from mqe_jax.files import check_folder
+from mqe_jax.limits import Seed, Seeds
+from mqe_jax.literal import echo
+from mqe_jax.runs.divergence import record_divergences
+from mqe_jax.settings import PathText, check, checked
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.folder import check_run, write_config
+from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
+from mqe_jax.train.monitor import read_evaluations, write_evaluations
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
+from mqe_jax.train.runner import Training, open_training
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Run:
+    """A training: its policy, and how it learned."""
+
+    policy: TrainedPolicy
+    """The newest policy."""
+    metrics: dict[str, np.ndarray]
+    """The columns of metrics.csv, one entry an update (U,)."""
+    evaluations: list[dict[str, Any]]
+    """Evaluations during training: `env_steps`, `episodes`, and results under `sampled` and `deterministic` actions."""
+    absolute: dict[str, Any] | None = None
+    """The absolute metric: an evaluation of the best policy over more episodes; None unless a training has ended."""
+
+    @property
+    def config(self) -> TrainConfig:
+        """Settings of the training."""
+        return self.policy.config
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps done."""
+        return int(self.policy.metadata["env_steps"])
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps of the settings are done."""
+        return self.env_steps >= self.config.num_updates * self.config.steps_per_update
+
+    def __repr__(self) -> str:
+        total = self.config.num_updates * self.config.steps_per_update
+        return f"<Run of {self.policy.task}: {self.env_steps:,} of {total:,} environment steps>"
+
+    def plot(self) -> Figure:
+        """Returns a figure of reward and success over environment steps."""
+        from mqe_jax.viz.curves import plot_curves
+
+        return plot_curves([self.metrics], self.policy.task)
+
+    def save(self, folder: str | Path) -> None:
+        """Writes a run folder without checkpoints, for `load_run`, `load_policy` and the command line.
+
+        Raises:
+            InputError: if the folder cannot be written, or holds another run.
+        """
+        path = Path(check("folder", folder, PathText))
+        check_folder(path, "folder")
+        check_run(path)
+        write_config(path, self.config)
+        log = CsvLog(path, 0)
+        for values in zip(*self.metrics.values(), strict=True):
+            log.write(dict(zip(self.metrics, map(float, values), strict=True)))
+        if self.evaluations:
+            ended = {} if self.absolute is None else {"ended_at": self.env_steps}
+            write_evaluations(path, {"evaluations": self.evaluations, "absolute": self.absolute, **ended})
+        save_policy(path, self.policy)
+
+
+@checked(folder=PathText)
+def load_run(folder: str | Path) -> Run:
+    """Returns the run in a folder that a training or `Run.save` wrote.
+
+    Raises:
+        InputError: naming the file that is missing or damaged.
+    """
+    path, policy = Path(folder), read_policy(folder)
+    metrics = read_metrics(path / CSV_FILE) if (path / CSV_FILE).is_file() else {}
+    evaluations = read_evaluations(path)
+    return Run(policy, metrics, evaluations["evaluations"], evaluations["absolute"])
+
+
+@checked(seed=Seed | None, run_dir=PathText | None)
+def learn(
+    task: Task,
+    config: Config = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    seed: int | None = None,
+    run_dir: str | Path | None = None,
+    resume: bool = False,
+    dump_diverged: str | Path | None = None,
+) -> Run:
+    """Trains a policy on one device, as `mqe train` with the same settings does.
+
+    An interrupt (Ctrl-C, or a notebook's stop button) ends the training and returns the run so far. `mqe launch` trains
+    on several devices.
+
+    Example:
+        run = mqe_jax.learn("go1gate", {"config": "demo", "total_steps": 500_000})
+        run.plot()
+
+    Args:
+        task: id, environment, or a batch of environments, which is trained on as it is.
+        config: a shipped name, a file, settings, or a mapping of changes of the task's default settings; the mapping's
+            `config` and `algorithm` name others to change. Default: those of `mqe train`.
+        env: task parameters.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        seed: random seed. Default: that of the settings, 0 unless they name one.
+        run_dir: run folder. Default: nothing is written.
+        resume: whether to continue the run in the folder from its newest checkpoint, if there is one.
+        dump_diverged: folder for recordings of environments whose physics diverges (see `mqe replay`).
+
+    Raises:
+        InputError: for a task, settings or parameters that are not allowed, or a run folder that cannot be used.
+        NonFiniteError: after the first update with a loss or weight that is not finite.
+    """
+    prepared = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
+    return _train(prepared, [None if run_dir is None else Path(run_dir)], resume, dump_diverged)[0]
+
+
+@checked(run_dir=PathText | None)
+def learn_seeds(
+    task: Task,
+    config: Config = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    seeds: Sequence[int] = range(5),
+    run_dir: str | Path | None = None,
+    resume: bool = False,
+    dump_diverged: str | Path | None = None,
+) -> list[Run]:
+    """Trains several seeds in one program, each equivalent to a `learn` up to rounding; its arguments and errors.
+
+    Example:
+        runs = mqe_jax.learn_seeds("go1gate", "demo", seeds=range(3))
+        print([run.metrics["success"][-1] for run in runs])
+
+    Args:
+        task: as `learn`, and so are config, env, impl, resume and dump_diverged.
+        seeds: random seeds.
+        run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
+    """
+    check("seeds", len(seeds), Seeds)
+    numbers = [check("seeds", seed, Seed) for seed in seeds]
+    prepared = prepare(task, config, env, impl=impl, seeds=numbers)
+    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
+    return _train(prepared, folders, resume, dump_diverged)
+
+
+def _train(
+    prepared: Environments, folders: Sequence[Path | None], resume: bool, dump_diverged: str | Path | None
+) -> list[Run]:
+    """Trains into the folders of the seeds, or writes nothing where they are None."""
+    configs, learning, evaluation = prepared
+    with (
+        record_divergences(learning, dump_diverged) as recorder,
+        open_training(learning, configs, folders, resume, evaluation, recorder) as training,
+    ):
+        if resume and not training.resumed:
+            where = ", ".join(map(str, folders))
+            echo(f"mqe: {where} has no checkpoint to resume from; starting a new run")
+        try:
+            training.run()
+        except KeyboardInterrupt:
+            echo(f"mqe: interrupted after {training.env_steps:,} environment steps")
+        written = [folder for folder in folders if folder is not None]
+        if written and jax.process_index() == 0:  # one process writes the files
+            return [load_run(folder) for folder in written]
+        return list(_runs(training))
+
+
+def _runs(training: Training) -> Iterator[Run]:
+    """Yields the runs of the seeds of a training that writes nothing."""
+    for i, (policy, rows) in enumerate(zip(training.policies(), training.rows, strict=True)):
+        metrics = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+        log = training.evaluations[i] if training.evaluations else None
+        yield Run(policy, metrics, log.evaluations, log.absolute) if log else Run(policy, metrics, [])

@@ -1,0 +1,188 @@
+"""Policies at play by one call: `evaluate` measures them, `render` shows them."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import tempfile
+import threading
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+
+from mqe_jax import build
+from mqe_jax.build import Player
+from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.league.sides import BothSides
+from mqe_jax.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
+from mqe_jax.runs.divergence import record_divergences
+from mqe_jax.settings import PathText, checked, fail
+from mqe_jax.train.evaluate import Result, evaluate_batch
+
+View = Literal["follow", "near", "scene", "side"]
+
+
+@checked(episodes=Episodes, sides=Literal["both", "first"], num_envs=Environments, seed=Seed)
+def evaluate(
+    task: str | Path | QuadrupedEnv,
+    policy: Player = None,
+    opponent: Player = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    episodes: int = 512,
+    sides: str = "both",
+    num_envs: int = 128,
+    deterministic: bool = False,
+    seed: int = 0,
+    dump_diverged: str | Path | None = None,
+) -> Result:
+    """Evaluates a policy over complete episodes from fresh resets, as `mqe eval`.
+
+    Example:
+        result = mqe_jax.evaluate("go1wrestling", "go1wrestling", "scripted", episodes=256)
+        print(result.win)  # the rate of wins with its 95% interval
+
+    Args:
+        task: id, environment, or the run folder or policy file of a trained policy, which brings its task.
+        policy: a policy, or what `load_policy` accepts. Default: the run's; of a task the shipped one, else the
+            scripted one, else `forward`, or `random` where actions are not commands.
+        opponent: policy of the other team of a match. Default: that of the first team if it is the shipped one by
+            default, else `idle`.
+        env: task parameters.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        episodes: number of episodes.
+        sides: of a match, whether the policy is the task's team 0 in all episodes (`first`), or team 1 in half of them.
+        num_envs: environments in parallel, at most.
+        deterministic: whether trained policies act with their mean actions; a shipped one does so too where its card
+            declares it.
+        seed: random seed.
+        dump_diverged: folder for recordings of environments whose physics diverges (see `mqe replay`).
+
+    Raises:
+        InputError: for a task, parameters or a policy that is not allowed.
+    """
+    num_envs = min(num_envs, episodes)
+    playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=num_envs, deterministic=deterministic)
+    batch, about = playing.batch, dict(playing.about)
+    if len(playing.env.teams) > 1 and sides == "both":
+        for name, count in {"episodes": episodes, "num_envs": num_envs}.items():
+            if count % 2:
+                fail(name, count, "even: the policy plays half of the episodes on each side (sides: both)")
+        batch, about["sides"] = BothSides(batch), sides
+    with record_divergences(batch, dump_diverged) as recorder:
+        key = jax.random.PRNGKey(seed)
+        result = evaluate_batch(batch, playing.policy, episodes, key, recorder=recorder)
+    return dataclasses.replace(result, about={**about, "seed": seed})
+
+
+@checked(
+    episodes=Candidates,
+    seconds=ClipLength,
+    seed=Seed,
+    view=View | None,
+    width=ImageWidth | None,
+    fps=FrameRate | None,
+    speed=Speed,
+)
+def render(
+    task: str | Path | QuadrupedEnv,
+    policy: Player = None,
+    opponent: Player = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    episodes: int = 1,
+    seconds: float = 20.0,
+    deterministic: bool = False,
+    seed: int = 0,
+    view: str | None = None,
+    width: int | None = None,
+    fps: float | None = None,
+    speed: float = 1.0,
+) -> Clip:
+    """Records an episode as a clip, which shows itself in a notebook and can be saved.
+
+    Example:
+        clip = mqe_jax.render("go1sheep-easy", seconds=5)
+        clip.save("sheep.gif")
+
+    Args:
+        task: as `evaluate`, and so are policy, opponent, env, impl, deterministic and seed.
+        episodes: number of episodes, of which the clip is the best one, by success, then reward.
+        seconds: length of the clip, s, at most.
+        view: camera: `follow` (tracks robots and objects), `near` (fixed, frames their trajectories), `scene` (fixed,
+            whole scene), `side` (tracks the first robot). Default: `follow`, of an image `scene`.
+        width: image width, pixels, at 16:9. Default: 960 for .mp4, 480 for .webp, .gif and notebooks, 1280 for .png.
+        fps: frames per second. Default: 25 for .mp4, else 12.5.
+        speed: playback speed; 0.5 is slow motion.
+
+    Raises:
+        InputError: as `evaluate`.
+    """
+    from mqe_jax.viz.recording import record
+    from mqe_jax.viz.render import load_gl
+
+    threading.Thread(target=load_gl, daemon=True).start()  # while the episode is computed
+    playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=episodes, deterministic=deterministic)
+    key = jax.random.PRNGKey(seed)
+    recorded = record(playing.env, playing.policy, key, episodes=episodes, seconds=seconds)
+    size = None if width is None else (width, round(width * 9 / 32) * 2)
+    look = {"view": view, "size": size, "fps": fps, "speed": speed}
+    return Clip(playing.env, recorded, {**playing.about, "seed": seed}, look)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Clip:
+    """Recorded episodes, of which the best one is shown."""
+
+    env: QuadrupedEnv
+    """The task."""
+    episodes: list[Any]
+    """The episodes, `mqe_jax.viz.recording.Episode` each."""
+    about: dict[str, Any]
+    """Who acted, by name: policy, actions, opponent, seed."""
+    look: dict[str, Any]
+    """Options of `mqe_jax.viz.render.render_episode`: view, size, fps, speed."""
+
+    @property
+    def best(self) -> int:
+        """Index of the best episode."""
+        from mqe_jax.viz.recording import best
+
+        chosen = best(self.episodes)
+        return next(i for i, episode in enumerate(self.episodes) if episode is chosen)
+
+    def __repr__(self) -> str:
+        episode = self.episodes[self.best]
+        return f"<Clip of {self.env.name}: {(len(episode) - 1) * episode.dt:.1f} s, success {episode.success:g}>"
+
+    @checked(file=PathText)
+    def save(self, file: str | Path, *, at: float | None = None) -> str:
+        """Writes a .mp4, .webp, .gif or .png file; returns the renderer (`egl`, `osmesa` or `matplotlib`).
+
+        Args:
+            file: to write.
+            at: time of an image in the episode, s. Default: its middle.
+
+        Raises:
+            InputError: for another suffix, or a file that cannot be written.
+        """
+        from mqe_jax.viz.render import render_episode
+
+        return render_episode(self.env, self.episodes[self.best], Path(file), at=at, **self.look)
+
+    def _repr_html_(self) -> str:
+        """Returns a video (H.264 with imageio-ffmpeg, of the extra `render`), else a GIF, within the page."""
+        kind = "mp4" if find_spec("imageio_ffmpeg") is not None else "gif"
+        small = {**self.look, "size": self.look["size"] or (480, 270)}
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / f"clip.{kind}"
+            dataclasses.replace(self, look=small).save(file)
+            data = base64.b64encode(file.read_bytes()).decode("ascii")
+        if kind == "gif":
+            return f'<img src="data:image/gif;base64,{data}">'
+        return f'<video controls loop autoplay muted src="data:video/mp4;base64,{data}"></video>'
