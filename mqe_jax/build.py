@@ -29,7 +29,6 @@ from mqe_jax.train.learner import Learner, env_dims, make_ppo
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.start import initial_key, policy_to_start
-from mqe_jax.train.types import AnyBatch
 from mqe_jax.train.types import VectorEnv as AnyVectorEnv
 
 Task = str | QuadrupedEnv | AnyVectorEnv
@@ -67,21 +66,17 @@ def prepare(
     `seeds` are trained in one program; by default the one of the settings.
     """
     if isinstance(task, str | QuadrupedEnv):
-        settings = for_task(_settings(task, config), task, env)
-    else:
-        settings = _settings("", config)
-        batch = check("task", task, AnyBatch)
-        for name, value in {
-            "env": env,
-            "opponents": settings.opponents,
-            "demonstrator": settings.curriculum.demonstrator,
-        }.items():
+        settings = for_task(settings_of(task, config), task, env)
+    elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
+        settings = settings_of("", config)
+        theirs = {"env": env, "opponents": settings.opponents, "demonstrator": settings.curriculum.demonstrator}
+        for name, value in theirs.items():
             if value:
                 fail(name, value, "left out for a batch of environments, which has its own")
-        settings = override(settings, {"num_envs": batch.num_envs, "evaluation.every": None})
+        settings = override(settings, {"num_envs": task.num_envs, "evaluation.every": None})
+    else:
+        fail("task", task, "a task's id, an environment such as that of mqe_jax.make, or a batch of environments")
     configs = [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
-    if not configs:
-        fail("seeds", seeds, "at least one")
     if isinstance(task, str | QuadrupedEnv):
         return Environments(configs, *environments(impl, settings, len(configs), task))
     return Environments(configs, task, None)
@@ -92,12 +87,12 @@ def make_learner(
 ) -> Learner:
     """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure functions, not compiled.
 
-    ```python
-    import jax, mqe_jax
-
-    init, update = mqe_jax.make_learner("go1gate", "demo", seeds=3)
-    states = jax.jit(jax.vmap(init))(jax.random.split(jax.random.PRNGKey(0), 3))
-    ```
+    Example:
+        ```python
+        init, update = mqe_jax.make_learner("go1gate", "demo")
+        state = jax.jit(init)(jax.random.PRNGKey(0))
+        state, metrics = jax.jit(update)(state)
+        ```
 
     Args:
         task: as `mqe_jax.learn`, and so are config, env and impl.
@@ -262,30 +257,30 @@ def players(
     the default ones, on both sides of a match; else its scripted one, or `forward`; where actions are not commands,
     `random`.
     """
-    if isinstance(task, QuadrupedEnv):
-        name, params = task.name, joined(parameters_of(task), env or {})
+    made, name, params = task, "", dict(env or {})
+    if isinstance(made, QuadrupedEnv):
+        name, params = made.name, joined(parameters_of(made), params)
     else:
-        task = name = ALIASES.get(str(task), str(task))
-        params = dict(env or {})
+        made = name = ALIASES.get(str(made), str(made))
         if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
             config = run_config(name)
-            task, params, policy = config.task or "", joined(config.env, params), policy or name
+            made, params, policy = config.task or "", joined(config.env, params), policy or name
     shipped = name in zoo.names() and not params and policy is None
     walking = "scripted" if name in PLANNERS else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
-    made, batch = make_env(task, impl, params, num_envs)
+    task_env, batch = make_env(made, impl, params, num_envs)
     chosen = (name if shipped else default) if policy is None else policy
-    own = load_as("policy", chosen, made, deterministic=deterministic)
-    match = len(made.teams) > 1
+    own = load_as("policy", chosen, task_env, deterministic=deterministic)
+    match = len(task_env.teams) > 1
     other, against = (own, chosen) if shipped and match else (None, "idle")
     if opponent is not None:
-        other, against = load_as("opponent", opponent, made, deterministic=deterministic), opponent
+        other, against = load_as("opponent", opponent, task_env, deterministic=deterministic), opponent
     about: dict[str, Any] = {"policy": str(chosen)}
     if isinstance(own, TrainedPolicy):
         about["actions"] = "mean" if own.deterministic else "sampled"
     if match:
         about["opponent"] = str(against)
-    return Players(made, batch, all_agents(made, own, other), about)
+    return Players(task_env, batch, all_agents(task_env, own, other), about)
 
 
 def run_config(target: str) -> Any:
@@ -341,7 +336,7 @@ def named_config(name: str, task: str) -> TrainConfig:
     return load_config(path)
 
 
-def _settings(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
+def settings_of(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
     """Returns the settings that `mqe_jax.learn` is given, without a task's parameters."""
     if isinstance(config, TrainConfig):
         return config

@@ -245,7 +245,7 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
     assert parsed.settings == override(
         build.base_config("go1gate", "demo"), {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
     )
-    parsed = parse_train(["--network.name", "mat", "--network.heads", "2", "go1gate", "--checkpoint.no-environments"])
+    parsed = parse_train(["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"])
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
     assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
     flags = ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--task.vx", "-1", "2"]
@@ -261,18 +261,14 @@ def test_walk_commands_are_those_of_the_skill_walk() -> None:
     assert arguments.parse(["walk", "eval", "--seed", "3"]) == arguments.parse(["skill", "eval", "walk", "--seed", "3"])
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "--run-dir go1tug go1gate",
-        "--curriculum.no-backward go1gate --run_dir go1tug",
-        "--start go1tug --resume go1gate",
-    ],
-)
-def test_a_task_that_a_flag_names_is_not_the_one_to_train(words: str) -> None:
-    parsed, alone = parse_train(words.split()), parse_train(["go1gate"]).settings
+@pytest.mark.parametrize("words", ["--run-dir go1tug", "--curriculum.no-backward --run_dir go1tug", "--start go1tug"])
+def test_the_task_comes_first(words: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """A task that a flag names is not the one to train."""
+    parsed, alone = parse_train(["go1gate", *words.split()]), parse_train(["go1gate"]).settings
     assert parsed.target == "go1gate"
     assert override(parsed.settings, {"start": None, "curriculum.backward": alone.curriculum.backward}) == alone
+    assert cli.main(["train", *words.split(), "go1gate"]) == 2
+    assert capfd.readouterr().err.startswith("mqe: task: is missing; it comes first: mqe train TASK --")
 
 
 def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,8 @@ from fake_env import SMALL
 
 from mqe_jax import build, cli
 from mqe_jax.cli import commands
-from mqe_jax.cli.train import runner
 from mqe_jax.errors import NonFiniteError
+from mqe_jax.runs import learning
 from mqe_jax.train.nn import mlp_init
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")
@@ -185,7 +185,7 @@ def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch,
     def stop(*arguments: Any, **named: Any) -> None:
         raise NonFiniteError("run: update 3 made loss/value NaN or infinite")
 
-    monkeypatch.setattr(runner, "train_seeds", stop)
+    monkeypatch.setattr(learning, "open_training", stop)
     assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 1
     assert capfd.readouterr().err.splitlines()[-1] == "mqe: run: update 3 made loss/value NaN or infinite"
 
@@ -194,7 +194,7 @@ def test_a_file_that_cannot_be_written_ends_with_2(monkeypatch: pytest.MonkeyPat
     def stop(*arguments: Any, **named: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/metrics.csv")
 
-    monkeypatch.setattr(runner, "train_seeds", stop)
+    monkeypatch.setattr(learning, "open_training", stop)
     assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 2
     assert capfd.readouterr().err == "mqe: run/metrics.csv: No space left on device\n"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import re
 import runpy
@@ -18,11 +19,12 @@ import matplotlib
 import numpy as np
 import pytest
 
-from mqe_jax.build import for_task
+import mqe_jax
+from mqe_jax import build
 from mqe_jax.cli.arguments import COMMANDS, FIRST_STEPS, parse
-from mqe_jax.cli.train import parse_train
-from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.envs import PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
 from mqe_jax.planners import scripted_policy
+from mqe_jax.settings import override
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.networks import NETWORKS
 
@@ -31,11 +33,6 @@ sys.path.insert(0, str(ROOT / "tools"))
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *(ROOT / "docs").rglob("*.md")])
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
-# Blocks that are not run, by page and first line, with the reason.
-NOT_RUN = {
-    ("docs/training.md", "from mqe_jax.train.runner import train"): "trains for minutes or hours",
-    ("docs/training.md", "import jax"): "needs a run folder",
-}
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
 SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
 
@@ -49,31 +46,37 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
-def run_blocks(page: str) -> list[str]:
-    """The Python blocks of a page but the exceptions."""
-    return [block for block in blocks(read(page), "python") if (page, block.splitlines()[0]) not in NOT_RUN]
-
-
-@pytest.mark.parametrize("page", [name for name in NAMES if run_blocks(name)])
-def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Blocks of one page run in order in one namespace."""
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an empty folder."""
+    few: dict[str, Any] = {"num_envs": 8, "rollout_steps": 16, "total_steps": 256, "network.recurrent": False}
+    few |= {"ppo": {"minibatches": 1, "epochs": 1}, "curriculum": {"demonstrator": None, "backward": False}}
+    real = build.for_task
+    monkeypatch.setattr(build, "for_task", lambda *arguments: override(real(*arguments), few))
+    monkeypatch.setattr(QuadrupedEnv, "max_steps", 20)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("page", [name for name in NAMES if blocks(read(name), "python")])
+def test_python_blocks_run(page: str) -> None:
+    """Blocks of one page run in order in one namespace."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
     tasks = {*TASKS}
     try:
-        for block in run_blocks(page):
+        for block in blocks(read(page), "python"):
             exec(compile(block, page, "exec", dont_inherit=True), namespace)
     finally:
         for name in {*TASKS} - tasks:
             del TASKS[name]
 
 
-def test_training_from_python_has_the_settings_of_the_command() -> None:
-    """The first Python block of the page about training against the first `mqe train` with flags."""
-    namespace: dict[str, Any] = {}
-    exec(run_blocks("docs/training.md")[0], namespace)
-    command = ["go1gate", "--num-envs", "256", "--ppo.clip", "0.1"]
-    assert namespace["config"] == for_task(parse_train(command).settings, "go1gate")
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("name", ["learn", "learn_seeds", "evaluate", "render", "make_learner", "load_run"])
+def test_examples_of_docstrings_run(name: str) -> None:
+    text = re.sub("^    ", "", inspect.getdoc(getattr(mqe_jax, name)) or "", flags=re.MULTILINE)
+    (example,) = blocks(text, "python")
+    exec(example, {"mqe_jax": mqe_jax, "jax": jax})
 
 
 def commands(text: str) -> list[list[str]]:
@@ -195,6 +198,13 @@ def test_a_network_of_ones_own_is_trained() -> None:
     assert history[-1] < 0.6 * history[0]
 
 
+def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "own_loop.py"))
+    few = {"num_envs": 4, "rollout_steps": 8, "total_steps": 64, "ppo.minibatches": 1}
+    rewards = np.array(example["main"](seeds=2, updates=2, **few, curriculum={"demonstrator": None, "assistance": 0.0}))
+    assert rewards.shape == (2, 2) and np.isfinite(rewards).all() and (rewards[:, 0] != rewards[:, 1]).all()
+
+
 def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "self_play.py"))
     results = example["main"](num_envs=4, updates=3, snapshot_every=2, episodes=4)
@@ -203,7 +213,7 @@ def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
 
 
 NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
-CLIPS = {"tour": 2, "design_a_task": 1, "compare_algorithms": 0}
+CLIPS = {"quickstart": 1, "tour": 2, "design_a_task": 1, "compare_algorithms": 0}
 
 
 def run(path: Path) -> list[dict[str, Any]]:
@@ -262,5 +272,5 @@ def test_notebooks_run_whole_in_under_five_minutes(path: Path, tmp_path: Path, m
     check(outputs, path.stem)
     assert time.monotonic() - start < 300
     if path.stem == "tour":  # the team that it trains has learned
-        (wins,) = re.findall(r"against idle: win_rate (\d+)%", "".join(str(data.get("text/plain")) for data in outputs))
+        (wins,) = re.findall(r"against idle: wins (\d+)", "".join(str(data.get("text/plain")) for data in outputs))
         assert int(wins) >= 80

@@ -16,6 +16,7 @@ import pytest
 import mqe_jax
 from mqe_jax import cli, skills, zoo
 from mqe_jax.adapters.opponent import TeamEnv
+from mqe_jax.build import players
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
@@ -86,7 +87,7 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
 
 def policy_of(target: str, **options: Any) -> Any:
     """The policy of all agents of `mqe eval TARGET`."""
-    return override(Eval(target=target, impl="c"), options).environments(1)[2]
+    return players(**override(Eval(target=target, impl="c"), options).playing).policy
 
 
 def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() -> None:
@@ -299,20 +300,19 @@ def test_parameters_that_the_skill_does_not_know_are_named(params: dict[str, Any
 def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "go1gate").mkdir()
     monkeypatch.chdir(tmp_path)
-    env, _, policy, _ = Eval(target="go1gate", impl="c").environments(1)
+    env, _, policy, _ = players(**Eval(target="go1gate", impl="c").playing)
     assert env.name == "go1gate" and isinstance(policy, TrainedPolicy)
     with pytest.raises(InputError, match="go1gate"):
-        Eval(target="./go1gate", impl="c").environments(1)
+        players(**Eval(target="./go1gate", impl="c").playing)
 
 
 def test_who_acts_is_named() -> None:
     def about(**options: Any) -> dict[str, Any]:
-        return Eval(impl="c", **options).environments(1)[3]
+        return players(**Eval(impl="c", **options).playing).about
 
-    shipped = {"policy": "go1bridge", "actions": "sampled", "opponent": "go1bridge", "seed": 3}
-    assert about(target="go1bridge", seed=3) == shipped
+    assert about(target="go1bridge") == {"policy": "go1bridge", "actions": "sampled", "opponent": "go1bridge"}
     assert about(target="go1bridge", deterministic=True)["actions"] == "mean"
-    assert about(target="go1tug", policy="scripted") == {"policy": "scripted", "opponent": "idle", "seed": 0}
+    assert about(target="go1tug", policy="scripted") == {"policy": "scripted", "opponent": "idle"}
 
 
 def test_a_name_is_registered_once() -> None:

@@ -88,6 +88,12 @@ class Run:
 def load_run(folder: str | Path) -> Run:
     """Returns the run in a folder that a training or `Run.save` wrote.
 
+    Example:
+        ```python
+        mqe_jax.learn("go1gate", "demo", run_dir="runs/gate")
+        run = mqe_jax.load_run("runs/gate")
+        ```
+
     Raises:
         InputError: naming the file that is missing or damaged.
     """
@@ -115,8 +121,10 @@ def learn(
     on several devices.
 
     Example:
+        ```python
         run = mqe_jax.learn("go1gate", {"config": "demo", "total_steps": 500_000})
         run.plot()
+        ```
 
     Args:
         task: id, environment, or a batch of environments, which is trained on as it is.
@@ -152,8 +160,10 @@ def learn_seeds(
     """Trains several seeds in one program, each equivalent to a `learn` up to rounding; its arguments and errors.
 
     Example:
+        ```python
         runs = mqe_jax.learn_seeds("go1gate", "demo", seeds=range(3))
         print([run.metrics["success"][-1] for run in runs])
+        ```
 
     Args:
         task: as `learn`, and so are config, env, impl, resume and dump_diverged.

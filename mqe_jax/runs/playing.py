@@ -43,8 +43,10 @@ def evaluate(
     """Evaluates a policy over complete episodes from fresh resets, as `mqe eval`.
 
     Example:
+        ```python
         result = mqe_jax.evaluate("go1wrestling", "go1wrestling", "scripted", episodes=256)
         print(result.win)  # the rate of wins with its 95% interval
+        ```
 
     Args:
         task: id, environment, or the run folder or policy file of a trained policy, which brings its task.
@@ -107,8 +109,10 @@ def render(
     """Records an episode as a clip, which shows itself in a notebook and can be saved.
 
     Example:
+        ```python
         clip = mqe_jax.render("go1sheep-easy", seconds=5)
         clip.save("sheep.gif")
+        ```
 
     Args:
         task: as `evaluate`, and so are policy, opponent, env, impl, deterministic and seed.

@@ -1,0 +1,240 @@
+"""The Python API: `learn` is `mqe train`, `evaluate` is `mqe eval`, `render` draws; what they return."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fake_env import SMALL, FakeEnv, FakeVectorEnv
+
+import mqe_jax
+from mqe_jax import build, cli
+from mqe_jax.cli.train import parse_train
+from mqe_jax.errors import InputError
+from mqe_jax.league.sides import BothSides
+from mqe_jax.runs import playing
+from mqe_jax.settings import to_mapping
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import Rate, evaluate_batch
+from mqe_jax.train.runner import Training
+from tests.training import assert_same
+
+pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
+FEW: dict[str, Any] = {"num_envs": 4, "rollout_steps": 8, "total_steps": 64, "ppo.minibatches": 1}
+
+
+@pytest.mark.parametrize(
+    ("words", "config", "env"),
+    [
+        ("go1gate", None, {}),
+        ("go1gate --config demo", "demo", {}),
+        ("go1gate --config demo --total-steps 64", {"config": "demo", "total_steps": 64}, {}),
+        ("go1sheep-hard --algorithm mat", {"algorithm": "mat"}, {}),
+        ("go1wrestling --set episode_length=5", None, {"episode_length": 5}),
+        ("go1gate --control position --ppo.clip 0.1", {"ppo": {"clip": 0.1}}, {"control": "position"}),
+        ("go1gate --config file.yaml", Path("file.yaml"), {}),
+        ("go1tug --config paper/mappo --seed 3", TrainConfig(seed=3), {}),
+    ],
+)
+def test_settings_are_those_of_the_command(words: str, config: Any, env: dict[str, Any], tmp_path: Path) -> None:
+    Path("file.yaml").write_text("{num_envs: 8, ppo: {epochs: 2}}")  # in the empty folder of the test
+    command = parse_train(words.split())
+    expected = build.for_task(command.settings, command.target, command.overrides())
+    if isinstance(config, TrainConfig):
+        config = command.settings
+    assert build.for_task(build.settings_of(command.target, config), command.target, env) == expected
+
+
+@pytest.fixture(scope="module")
+def run(shared_programs: None) -> mqe_jax.Run:
+    """A training in memory."""
+    return mqe_jax.learn(fake(), FEW, seed=2)
+
+
+def fake() -> Any:
+    return FakeVectorEnv(FakeEnv(), 4)
+
+
+def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path: Path) -> None:
+    """The same policy and metrics; nothing is written without a folder."""
+    assert run.finished and run.env_steps == 64 and list(Path.cwd().iterdir()) == []
+    assert cli.main(["train", "fake", "--seed", "2", "--run-dir", "run", *SMALL]) == 0
+    written = mqe_jax.load_run("run")
+    assert_same(run.policy.arrays, written.policy.arrays)
+    assert run.metrics.keys() == written.metrics.keys() and len(run.metrics["success"]) == 2
+    for name in run.metrics.keys() - {"seconds", "fps"}:
+        np.testing.assert_allclose(run.metrics[name], written.metrics[name], rtol=1e-7, err_msg=name)
+
+
+def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixture[str]) -> None:
+    """The command line takes its folder too; a folder that holds a run is left alone."""
+    run.save("saved")
+    again = mqe_jax.load_run("saved")
+    assert_same(run.policy.arrays, again.policy.arrays)
+    assert again.config == run.config and again.evaluations == [] and repr(again) == repr(run)
+    np.testing.assert_allclose(again.metrics["loss/value"], run.metrics["loss/value"], rtol=1e-7)
+    with pytest.raises(InputError, match="run_dir: saved already holds a run"):
+        run.save("saved")
+    assert cli.main(["eval", "fake", "--policy", "saved", "--episodes", "2", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["policy"] == "saved"
+
+
+def test_evaluations_come_with_the_run() -> None:
+    evaluation = {"evaluation.every": 1, "evaluation.episodes": 4}
+    alone = mqe_jax.learn("fake", FEW | evaluation)
+    assert [each["env_steps"] for each in alone.evaluations] == [32, 64] and alone.absolute is not None
+    alone.save("saved")
+    written = mqe_jax.learn("fake", FEW | evaluation, run_dir="run")
+    for other in (mqe_jax.load_run("saved"), written):
+        assert (other.evaluations, other.absolute) == (alone.evaluations, alone.absolute)
+
+
+def test_an_interrupt_returns_the_run_so_far(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With a folder the run is saved there and goes on; the command, called in Python, ends."""
+    step = Training._step
+
+    def interrupt(self: Training, files: Any) -> Any:
+        if self.env_steps == 32:
+            raise KeyboardInterrupt
+        return step(self, files)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "_step", interrupt)
+        for folder in (None, "run"):
+            run = mqe_jax.learn("fake", FEW, run_dir=folder)
+            assert run.env_steps == len(run.metrics["success"]) * 32 == 32 and not run.finished
+        assert "interrupted after 32 environment steps" in capfd.readouterr().err
+        assert cli.main(["train", "fake", "--run-dir", "other", *SMALL]) == 130
+        assert not Path("other", "curve.png").exists()
+    assert len(mqe_jax.learn("fake", FEW, run_dir="run", resume=True).metrics["success"]) == 2
+
+
+def test_seeds_are_trained_in_one_program_into_their_folders() -> None:
+    runs = mqe_jax.learn_seeds("fake", FEW, seeds=(1, 3), run_dir="runs")
+    assert (
+        [run.config.seed for run in runs] == [1, 3] == [mqe_jax.load_run(f"runs/seed{n}").config.seed for n in (1, 3)]
+    )
+    alone = mqe_jax.learn("fake", FEW, seed=3)
+    for one, other in zip(jax.tree.leaves(runs[1].policy.params), jax.tree.leaves(alone.policy.params), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
+    figure = run.plot()
+    reward, rate = figure.axes
+    assert (reward.get_ylabel(), rate.get_ylabel()) == ("average step reward", "success rate (%)")
+    np.testing.assert_allclose(np.asarray(reward.lines[0].get_xdata()), run.metrics["env_steps"] / 1e6)
+    assert figure._repr_png_().startswith(b"\x89PNG")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "said"),
+    [
+        ("go1gat", {}, r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\)"),
+        (None, {}, "task: None is not allowed; it must be a task's id, an environment"),
+        ("fake", {"config": 5}, "config: 5 is not allowed; it must be a shipped name"),
+        ("fake", {"config": {"ppo.clp": 1}}, r"ppo.clp: unknown name .*did you mean 'clip'"),
+        ("fake", {"seed": -1}, "seed: -1 is not allowed"),
+        ("fake", {"resume": True}, "resume: True is not allowed; it must be false without a run_dir"),
+        (fake(), {"env": {"gate_width": 1}}, "env: .* is not allowed; it must be left out for a batch"),
+        (fake(), {"config": {"opponents": ["idle"]}}, r"opponents: \('idle',\) .* left out for a batch"),
+    ],
+)
+def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        mqe_jax.learn(task, **arguments)
+
+
+def test_an_environment_keeps_its_parameters() -> None:
+    """Those in which it differs from its task's are the run's."""
+    env = mqe_jax.make("go1gate", impl="c", control="position", gate_width=0.7, rewards={"collision": -5.0})
+    (config,), learning, evaluation = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, {"robot": "go2"})
+    assert config.env == {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}, "robot": "go2"}
+    assert to_mapping(evaluation.env.params) == to_mapping(env.params) | {"robot": "go2"}
+    assert learning.env.params.gate_width == 0.7 and learning.env.control == "position"
+    assert build.players(env, "idle").env.params == env.params
+
+
+# -- evaluation and clips ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wins", "episodes", "low", "high"), [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (81, 263, 0.2553, 0.3662)]
+)
+def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float) -> None:
+    """The last one is the example of Newcombe 1998 (Statistics in Medicine 17, 857)."""
+    np.testing.assert_allclose(Rate.of(wins / episodes, episodes), [wins / episodes, low, high], atol=5e-5)
+
+
+def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
+    """As text, in a notebook, and by the command, whose figures it has."""
+    result = mqe_jax.evaluate("fake", "forward", episodes=4)
+    assert result.success == Rate.of(1.0, 4) and result.win is None
+    assert "success_rate                 100.0% (51.0 to 100.0%)" in str(result).splitlines()
+    assert "<tr><td>success_rate</td><td>100.0% (51.0 to 100.0%)</td></tr>" in result._repr_html_()
+    for more in ([], ["--json"]):
+        assert cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more]) == 0
+    *table, line = capfd.readouterr().out.splitlines()
+    assert table == str(result).splitlines() and json.loads(line) == result.to_dict()
+
+
+def test_a_function_is_a_policy() -> None:
+    def forward(obs: Any, memory: Any, key: Any) -> Any:
+        return 0.25 * np.ones((*obs.shape[:2], 3)), memory
+
+    assert mqe_jax.evaluate("fake", forward, episodes=4).success_rate == 1.0
+    assert mqe_jax.evaluate(mqe_jax.make("go1tug", impl="c", episode_length=0.1), forward, "idle", episodes=2).draw
+
+
+def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the episodes on each."""
+    played: dict[str, Any] = {}
+
+    result = mqe_jax.evaluate("fake", "forward", episodes=2)
+
+    def measure(batch: Any, policy: Any, episodes: int, key: Any, recorder: Any) -> mqe_jax.Result:
+        played.update(batch=batch, policy=policy)
+        return result
+
+    monkeypatch.setattr(playing, "evaluate_batch", measure)
+    options: dict[str, Any] = {"impl": "c", "episodes": 6, "num_envs": 4}
+    evaluate: Any = mqe_jax.evaluate
+    about = evaluate("go1tug", "forward", "scripted", **options).about
+    assert about == {"policy": "forward", "opponent": "scripted", "sides": "both", "seed": 0}
+    assert isinstance(played["batch"], BothSides) and played["policy"].second.name == "scripted"
+    for wrong in ({"episodes": 5}, {"num_envs": 3}):
+        with pytest.raises(InputError, match=f"{next(iter(wrong))}: . is not allowed; it must be even"):
+            evaluate("go1tug", "forward", **(options | wrong))
+    evaluate("go1tug", "forward", sides="first", **options)
+    assert not isinstance(played["batch"], BothSides)
+
+
+def test_halves_of_the_environments_play_equally_many_episodes() -> None:
+    """Also where environments play unequally many."""
+
+    class Halves(FakeVectorEnv):
+        def step(self, state: Any, action: jax.Array) -> Any:
+            after = super().step(state, action)
+            return dataclasses.replace(after, metrics=after.metrics | {"success": 1.0 * (jnp.arange(4) >= 2)})
+
+    policy = mqe_jax.load_policy("idle", FakeEnv())  # pyright: ignore[reportArgumentType, reportCallIssue]
+    assert evaluate_batch(Halves(FakeEnv(), 4), policy, 6, jax.random.PRNGKey(0)).success_rate == 0.5
+
+
+def test_a_clip_shows_itself_and_is_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
+    clip = mqe_jax.render("fake", "forward", episodes=2, seconds=0.1, width=64)
+    assert len(clip.episodes) == 2 and repr(clip) == "<Clip of fake: 0.1 s, success 0>"
+    assert clip.save("clip.gif") == "matplotlib" and Path("clip.gif").stat().st_size > 500
+    page = clip._repr_html_()
+    assert page.startswith(("<video", "<img")) and ";base64," in page
+    with pytest.raises(InputError, match=r"clip.avi.*\.mp4, \.webp, \.gif, \.png"):
+        clip.save("clip.avi")
