@@ -217,7 +217,7 @@ def versus(env: VectorEnv | Wrapper, opponents: Sequence[Policy | str | Path], *
     """
     if isinstance(opponents, str) or not isinstance(opponents, Sequence):
         fail("opponents", opponents, "a list of policies")
-    return Versus(env, [load_as("opponent", each, env.env) for each in opponents], draw_reward)
+    return Versus(env, [load_as("opponents", each, env.env) for each in opponents], draw_reward)
 
 
 class Mirror(OneTeam):

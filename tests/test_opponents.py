@@ -154,7 +154,7 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
         versus(door, ["idle"] * 4).share(2)
     with pytest.raises(InputError, match="go1plane is not a match"):
         versus(matches("go1plane"), ["idle"])
-    with pytest.raises(InputError, match=r"opponent: .* was trained on go1revolvingdoor, not on go1tug"):
+    with pytest.raises(InputError, match=r"opponents: .* was trained on go1revolvingdoor, not on go1tug"):
         versus(matches("go1tug"), [policies[0]])
     env = versus(door, ["idle", policies[0]])
     with pytest.raises(InputError, match="block 0 is fixed"):

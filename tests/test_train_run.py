@@ -27,11 +27,12 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
+from mqe_jax.train.logs import read_metrics
 from mqe_jax.train.monitor import Monitor, read_evaluations, score
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import open_training, train
 from mqe_jax.train.start import check_parameters, check_same, without_environments
-from mqe_jax.viz.curves import draw_curve
+from mqe_jax.viz.curves import plot_curves, save_figure
 from tests import training as probes
 from tests.training import Probe, Traces, assert_same
 
@@ -286,7 +287,7 @@ def test_a_writer_that_fails_ends_the_training_and_names_its_file(
 
 def test_a_curve_that_cannot_be_written_is_named(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     with largest_file(1000), pytest.raises(OSError, match="File too large") as failed:
-        draw_curve([straight[0]], tmp_path / "curve.png", "probe")
+        save_figure(plot_curves([read_metrics(straight[0] / "metrics.csv")], "probe"), tmp_path / "curve.png")
     assert failed.value.filename == str(tmp_path / "curve.png")
     assert list(tmp_path.iterdir()) == []
 
