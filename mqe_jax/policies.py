@@ -141,8 +141,9 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
         raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
     if field != "policy" and isinstance(policy, TrainedPolicy) and (other := _other_commands(policy, env)):
         raise InputError(f"{field}: {source} was trained with {other}; its actions mean other commands there")
-    if not hasattr(policy, "act"):
-        return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: policy(obs, (), key)[0])
+    act: Any = policy
+    if not hasattr(act, "act"):
+        return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: act(obs, (), key)[0])
     return policy
 
 
