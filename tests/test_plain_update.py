@@ -108,8 +108,8 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         updates=jnp.int32(updates),
     )
     done: Any = random.random((T, N)) < 0.4
-    memory = made.network.initial_memory(N)
-    length = made.network.chunk_length
+    network = config.network.build(learning.env_dims(env, config))
+    memory, length = network.initial_memory(N), network.chunk_length
     first: Any = random.random((T, N)) < 0.3
     first[::length] = False  # the state of memory before a first step is zero in a rollout
     transitions = Transition(
