@@ -86,9 +86,8 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     """A state after some updates, whose statistics are not trivial, and a rollout of random numbers."""
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
     env = dataclasses.replace(env, teacher=Teacher(), show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
-    made = learning.make_ppo(env, config)
     normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
-    shapes = jax.eval_shape(made.init, jax.random.PRNGKey(0))
+    shapes = jax.eval_shape(learning.make_ppo(env, config).init, jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     size = env.observation_size, env.privileged_observation_size
     statistics = [RunningStatistics(0.3 * normal(n), normal(n) ** 2, jnp.float32(30.0)) for n in size]
@@ -126,7 +125,7 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         done=done,
     )
     state, transitions = jax.tree.map(jnp.asarray, (state, transitions))
-    return (env, made, state), transitions
+    return (env, state), transitions
 
 
 class Plain:
@@ -325,9 +324,9 @@ class Plain:
 def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_of(name)
     random = np.random.default_rng(5)
-    (env, made, state), data = drawn(random, config, updates)
+    (env, state), data = drawn(random, config, updates)
     monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, data, {}))
-    length = made.network.chunk_length
+    length = config.network.build(learning.env_dims(env, config)).chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
     monkeypatch.setattr(learning, "minibatches", lambda *_: jnp.asarray(order))
     after, metrics = jax.jit(learning.make_ppo(env, config).update)(state)
