@@ -1,4 +1,4 @@
-"""Ships the policy of a run for its task: measures it, and writes it with its card to mqe_jax/zoo.
+"""Ships the policy of a run for its task: measures it with the float16 weights that it ships, writes it with its card.
 
 `python tools/ship.py RUN --mode deterministic --command "mqe train go1gate --seed 3" --date 2026-11-27 --note NOTE`
 
@@ -7,12 +7,13 @@ scripted team end.
 """
 
 import argparse
+from tempfile import TemporaryDirectory
 
 from mqe_jax import zoo
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.match import Match
-from mqe_jax.train.policy import read_policy
+from mqe_jax.train.policy import read_policy, save_policy
 
 DIGITS = 4
 
@@ -43,8 +44,9 @@ if __name__ == "__main__":
     parser.add_argument("--gpu-minutes", type=float)
     parser.add_argument("--episodes", type=int, default=512)
     given = vars(parser.parse_args())
-    run = given.pop("run")
-    policy = read_policy(run)
-    results, endings = measure(run, policy.task, given["episodes"], given["mode"] == "deterministic")
+    policy = read_policy(given.pop("run"))
+    with TemporaryDirectory() as folder:
+        rounded = str(save_policy(folder, policy, half=True))
+        results, endings = measure(rounded, policy.task, given["episodes"], given["mode"] == "deterministic")
     version = TASKS[policy.task].version
     print(zoo.ship(policy, zoo.Card(version=version, results=results, endings=endings, **given)))
