@@ -156,6 +156,26 @@ def test_compiling_is_shown_and_does_not_count(
     assert "gate: takes about 89 minutes here" in said and "1:28:00 left" in said
 
 
+def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Which is updated in place; standard error stays empty."""
+    display = pytest.importorskip("IPython.display", reason="needs the extra notebook")
+    shown: list[str] = []
+
+    class Output:
+        def update(self, data: dict[str, str], raw: bool) -> None:
+            shown.append(data["text/plain"])
+
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr(display, "display", lambda data, **options: Output())
+    with logs.ProgressLog("gate", 100) as log:
+        with log.doing("compiling"):
+            pass
+        log.write({"env_steps": 100, "fps": 8.0, "success": 0.5})
+    assert shown[0].startswith("gate ░░░░░░░░░░ 0 of 100 steps, compiling")
+    assert shown[-1].startswith("gate ██████████ 100 of 100 steps, success 50%, 8 steps/s")
+    assert capsys.readouterr().err == ""
+
+
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before training begins."""
     find = importlib.util.find_spec

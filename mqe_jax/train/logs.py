@@ -32,6 +32,7 @@ from mqe_jax.train.config import TrainConfig
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
+_OUTPUT_SECONDS = 0.5
 
 
 class MetricsLog(Protocol):
@@ -202,7 +203,7 @@ def check_loggers(names: tuple[str, ...]) -> None:
 
 
 class ProgressLog:
-    """Progress on standard error: a live bar on a terminal, otherwise a plain line every ten seconds.
+    """Progress: a live bar on a terminal or in a notebook, otherwise a plain line on standard error every ten seconds.
 
     The time left is that of the updates to come: compiling and evaluating do not count.
     """
@@ -216,7 +217,11 @@ class ProgressLog:
         self._last_line = -math.inf
         self._open = contextlib.ExitStack()
         self._bar: Progress | None = None
+        self._output: Any = None  # of a notebook's cell
         console = Console(stderr=True)
+        if shown and console.is_jupyter:
+            display = importlib.import_module("IPython.display").display
+            self._output = display({"text/plain": title}, raw=True, display_id=True)
         if shown and console.is_terminal:
             columns = (TextColumn("{task.description}"), BarColumn(10), _Column(self._text))
             self._bar = Progress(*columns, console=console)
@@ -245,9 +250,10 @@ class ProgressLog:
         now = time.perf_counter()
         if what != self._doing:
             self._doing, self._began = what, now
-            if self._bar is None:
+            if self._bar is None and self._output is None:
                 self._print(what)
         self._active = True
+        self._refresh()
         yield
         self._active = False
         self._since += time.perf_counter() - now
@@ -270,9 +276,12 @@ class ProgressLog:
             advice = "; on a CPU, mqe train go1gate --config demo takes minutes" if slow else ""
             hours = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{minutes:.0f} minutes"
             self._print(f"takes about {hours} here{advice}")
-        if self._bar is None and (now - self._last_line >= _PLAIN_SECONDS or self._step >= self._total):
+        period = _PLAIN_SECONDS if self._output is None else _OUTPUT_SECONDS
+        if self._bar is None and (now - self._last_line >= period or self._step >= self._total):
             self._last_line = now
-            self._print(self._text())
+            if self._output is None:
+                self._print(self._text())
+            self._refresh()
 
     @property
     def _left(self) -> float:
@@ -287,6 +296,13 @@ class ProgressLog:
         if self._active:
             return f"{steps}, {self._doing} ({_clock(time.perf_counter() - self._began)})"
         return f"{steps}, {self._numbers}, {_clock(self._left)} left" if self._numbers else steps
+
+    def _refresh(self) -> None:
+        """Shows a bar and its text in a notebook."""
+        if self._output is not None:
+            done = 10 * self._step // self._total
+            bar = f"{self._title} {'█' * done}{'░' * (10 - done)} {self._text()}"
+            self._output.update({"text/plain": bar}, raw=True)
 
     def _print(self, text: str) -> None:
         if not self._silent:
