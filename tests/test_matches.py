@@ -119,6 +119,10 @@ def test_tug_observation_and_rewards() -> None:
     # From y 0.1 back to 0.06, still on robot 1's half: that counts half. On robot 0's half: it counts for robot 1.
     np.testing.assert_allclose(terms_of(env, before, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6)
     np.testing.assert_allclose(terms_of(env, before, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6)
+    # At rest it counts whole, on either half.
+    for y in (0.1, -0.1):
+        rest = tug_state(env, y)
+        np.testing.assert_allclose(terms_of(env, rest, rest)[0]["push"], [y, -y], atol=1e-6)
 
 
 def test_tug_shows_where_the_cylinder_was_before_the_step() -> None:

@@ -98,6 +98,23 @@ def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
     assert {"team0/win", "team0/loss", "success"} <= set(state.metrics) and "team1/win" not in state.metrics
 
 
+def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
+    """Not from the environments': their actions follow the state's key, which differs in every step."""
+    env = versus(door, ["random", "random"])
+    step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    state = env.reset(KEY)
+
+    def drawn(state: Any) -> np.ndarray:
+        return np.asarray(step(state, action).action[:, 1])
+
+    first = drawn(state)
+    others = dataclasses.replace(state.match, key=jax.random.split(jax.random.PRNGKey(7), 4))
+    np.testing.assert_array_equal(drawn(dataclasses.replace(state, match=others)), first)
+    changed = [drawn(dataclasses.replace(state, key=jax.random.PRNGKey(7))), drawn(step(state, action))]
+    assert all(np.all(np.any(other != first, axis=1)) for other in changed)
+    assert np.all(np.any(first[::2] != first[1::2], axis=1))  # one opponent and the other
+
+
 def test_opponents_change_at_resets(policies: list[TrainedPolicy], door: VectorEnv) -> None:
     """Old and new opponent are told apart by their actions, which are means."""
     old, new = (dataclasses.replace(policy, deterministic=True) for policy in policies)

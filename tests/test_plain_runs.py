@@ -49,10 +49,16 @@ class Fields(EnvironmentState):
 
 
 class Help:
-    """One agent in four environments; its reward is its assistance; every step is an episode, and a success."""
+    """One agent in four environments; its reward is its assistance; every step is an episode.
+
+    It is a success where the assistance is at most `needed`.
+    """
 
     name, num_envs, num_agents, action_size = "help", N, 1, 1
     observation_size, privileged_observation_size = 1, 1
+
+    def __init__(self, needed: float) -> None:
+        self.needed = needed
 
     def reset(self, key: jax.Array) -> Fields:
         return self._state(jnp.zeros(N))
@@ -61,20 +67,31 @@ class Help:
         return self._state(state.assistance)
 
     def _state(self, assistance: jax.Array) -> Fields:
-        obs, done, metrics = jnp.zeros((N, 1, 1)), jnp.ones(N, bool), {"pay": assistance, "success": jnp.ones(N)}
+        obs, done = jnp.zeros((N, 1, 1)), jnp.ones(N, bool)
+        metrics = {"pay": assistance, "success": (assistance <= self.needed).astype(jnp.float32)}
         rest = metrics, jnp.zeros(N, jnp.int32), assistance, KEY
         return Fields(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, *rest)
 
 
-def test_environments_get_the_assistance_of_the_schedule_and_of_their_success() -> None:
-    """It falls by 0.3 with every update that succeeds, from 0.8, and is annealed to 0 within 5 of 10 updates."""
+@pytest.mark.parametrize(
+    ("step", "needed", "expected"),
+    [
+        (0.3, 1.0, (0.8, 0.5, 0.2, 0.0)),  # falls by 0.3 with every update, all of which succeed
+        (0.3, -1.0, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0)),  # annealed to 0 within 5 of 10 updates, none of which succeeds
+        (0.0, 1.0, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0)),
+        (0.3, 0.5, (0.8, 0.64, 0.48, 0.18, 0.0)),  # success takes 0.3 from what it is annealed to
+    ],
+)
+def test_environments_get_the_assistance_of_the_schedule_and_of_their_success(
+    step: float, needed: float, expected: tuple[float, ...]
+) -> None:
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
-    values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5, "assistance_step": 0.3}}
-    learner = make_ppo(Help(), build(TrainConfig, {**values, "network": {"recurrent": False}}))
+    values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5, "assistance_step": step}}
+    learner = make_ppo(Help(needed), build(TrainConfig, {**values, "network": {"recurrent": False}}))
     state, update = jax.jit(learner.init)(KEY), jax.jit(learner.update)
-    for expected in (0.8, 0.5, 0.2, 0.0):
+    for assistance in expected:
         state, metrics = update(state)
-        assert float(metrics["pay"]) == pytest.approx(expected, abs=1e-6) == float(metrics["assistance"])
+        assert float(metrics["pay"]) == pytest.approx(assistance, abs=1e-6) == float(metrics["assistance"])
 
 
 def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from mqe_jax.cli import programs
 from mqe_jax.errors import InputError
 from mqe_jax.files import locked, remove_temporaries, replacing, write_atomically
 from mqe_jax.settings import override
+from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
@@ -251,6 +252,28 @@ def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path, alone: tuple[Path
     assert read_policy(folders[2]).metadata["env_steps"] == 80
     longer = [override(config, {"total_steps": 96}) for config in configs]
     assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 6  # one seed resumes separately
+
+
+def test_seeds_killed_between_two_checkpoints_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where each keeps one checkpoint, they keep the one before too, which all have."""
+    configs, folders = [seeded(seed, checkpoint__kept=1) for seed in (0, 1)], [tmp_path / "0", tmp_path / "1"]
+    save = runner.save_checkpoint
+
+    def killed(folder: Path, tree: Any, step: int, *arguments: Any) -> Path:
+        if (folder, step) == (folders[1], 48):
+            raise Stop
+        return save(folder, tree, step, *arguments)
+
+    monkeypatch.setattr(runner, "save_checkpoint", killed)
+    with pytest.raises(Stop):
+        train_seeds(PROBE, configs, folders)
+    newest = [int(list_checkpoints(folder)[-1].stem.removeprefix("step_")) for folder in folders]
+    assert newest == [48, 32]
+    monkeypatch.setattr(runner, "save_checkpoint", save)
+    states = train_seeds(PROBE, configs, folders, resume=True)
+    assert [int(state.updates) for state in states] == [5, 5]
+    for folder in folders:
+        assert [row["env_steps"] for row in rows(folder)] == ["16", "32", "48", "64", "80"]
 
 
 def test_seeds_together_are_recorded_and_learn_as_alone(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
