@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, autoreset
+from mqe_jax.precision import single
 from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy
@@ -56,12 +57,14 @@ class Demonstrated(VectorEnv):
         self.demonstrator, self.backward = demonstrator, backward
         self._guide = VectorEnv(self.env, EPISODES)
 
+    @single
     def reset(self, key: jax.Array) -> DemonstratedState:
         """Returns N initial states of the task, with the demonstrator's states, which do not depend on the key."""
         with devices.alone():
             demonstrations = self._record()
         return DemonstratedState(**vars(super().reset(key)), demonstrations=demonstrations)
 
+    @single
     def step(self, state: State, action: jax.Array) -> DemonstratedState:
         """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
         self.check_action(action)
@@ -127,7 +130,7 @@ def _phases(decided: jax.Array, done: jax.Array) -> jax.Array:
     """
     moments, stride = decided.shape[:2]
     decided, done = (x.reshape(moments * stride, -1) for x in (decided, done))
-    first = jnp.cumsum(done, axis=0) - done == 0
+    first = jnp.cumsum(done, axis=0) - done.astype(jnp.int32) == 0
     decided = jnp.where(first, decided, 0.0)
     end = jnp.argmax(decided, axis=0) + 1
     steps = stride * jnp.arange(1, moments + 1)[:, None]

@@ -16,6 +16,7 @@ from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Number
 from mqe_jax.policies import load_as
+from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
@@ -106,6 +107,7 @@ class Versus(OneTeam):
         if not self.opponents or num_envs % len(self.opponents):
             fail("opponents", len(self.opponents), f"a divisor of the environments of a process, {num_envs}")
 
+    @single
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
         key, match_key = jax.random.split(key)
@@ -118,6 +120,7 @@ class Versus(OneTeam):
         action = jnp.zeros((self.num_envs, self.inner.num_agents, self.action_size))
         return self._seen(match, action, tuple(opponents), key)
 
+    @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
         self.check_action(action)
@@ -133,7 +136,7 @@ class Versus(OneTeam):
         match = self._stepped(state, both)
         done = match.terminated | match.truncated
         ended = jnp.stack([done & (match.metrics[f"team0/{name}"] > 0) for name in OUTCOMES], axis=-1)
-        match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2])
+        match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32))
         started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
         return self._seen(match, both, started, key)
 
@@ -231,11 +234,13 @@ class Mirror(OneTeam):
         super().__init__(matches, 2 * check("env", matches, AnyBatch).num_envs)
         self.privileged_observation_size += 1
 
+    @single
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments."""
         action = jnp.zeros((self.inner.num_envs, self.inner.num_agents, self.action_size))
         return self._seen(self.inner.reset(key), action)
 
+    @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
         self.check_action(action)
@@ -254,7 +259,7 @@ class Mirror(OneTeam):
 
         metrics = {name: twice(value) for name, value in match.metrics.items() if not name.startswith("team1/")}
         for name in ("diverged", "overflow"):
-            metrics[name] = metrics[name] * (jnp.arange(self.num_envs) % 2 == 0)
+            metrics[name] = jnp.where(jnp.arange(self.num_envs) % 2 == 0, metrics[name], 0.0)
         return TeamState(
             match=match,
             action=action,

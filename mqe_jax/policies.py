@@ -16,6 +16,7 @@ from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
+from mqe_jax.precision import single
 from mqe_jax.settings import PathText, check, checked
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
@@ -45,6 +46,7 @@ class SimplePolicy:
         """Returns an empty recurrent state."""
         return ()
 
+    @single
     def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
         return self.plan(obs, key), memory

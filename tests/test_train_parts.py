@@ -78,9 +78,9 @@ def test_schedules_by_hand() -> None:
 def test_the_assistance_follows_success_below_its_annealed_value() -> None:
     config = TrainConfig(curriculum=Curriculum(assistance=0.8, assistance_step=0.1))
     fixed = TrainConfig(curriculum=Curriculum(assistance=0.8))
-    rows = (0.9, 0.5, 0.4), (0.5, 0.5, 0.5), (0.1, 0.5, 0.6), (math.nan, 0.5, 0.5), (1.0, 0.05, 0.0), (0.0, 0.75, 0.8)
-    for success, before, after in rows:
-        now = jnp.float32(before), jnp.float32(success)
+    rows = (0.9, 0.5, 0.4), (0.5, 0.5, 0.5), (0.1, 0.5, 0.6), (1.0, 0.05, 0.0), (0.0, 0.75, 0.8)
+    for success, before, after, ended in (*((*row, 2) for row in rows), (0.0, 0.5, 0.5, 0)):
+        now = jnp.float32(before), jnp.float32(success), jnp.float32(ended)
         assert float(next_assistance(config, *now)) == pytest.approx(after)
         assert float(next_assistance(fixed, *now)) == pytest.approx(0.8)
 

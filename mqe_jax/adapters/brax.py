@@ -23,6 +23,7 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
+from mqe_jax.precision import single
 
 try:
     with quietly():
@@ -63,6 +64,7 @@ class Env(BraxEnv):
         self.env = task_env(task, **overrides)
         self.episode_length = self.env.max_steps
 
+    @single
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode."""
         state = self.env.reset(rng)
@@ -72,6 +74,7 @@ class Env(BraxEnv):
         zero = jnp.zeros(())
         return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=state.metrics, info=info)
 
+    @single
     def step(self, state: State, action: jax.Array) -> State:
         """Advances by one environment step; raises an InputError for an action of another size."""
         if jnp.size(action) != self.action_size:
@@ -113,6 +116,12 @@ class AutoReset(Wrapper):
     `info["truncation"]` and `info[FINAL_OBS]` belong to the step, `obs` and `pipeline_state` to the new episode.
     """
 
+    @single
+    def reset(self, rng: jax.Array) -> State:
+        """Starts an episode in each environment."""
+        return self.env.reset(rng)
+
+    @single
     def step(self, state: State, action: jax.Array) -> State:
         """Steps the batch, then resets the environments whose episodes ended."""
         info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}

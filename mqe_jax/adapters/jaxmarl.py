@@ -20,6 +20,7 @@ from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
+from mqe_jax.precision import single
 
 try:
     with quietly():
@@ -91,12 +92,14 @@ class Env(MultiAgentEnv):
         return {f"team_{i}": [self.agents[j] for j in team] for i, team in enumerate(self.env.teams)}
 
     @functools.partial(jax.jit, static_argnums=0)
+    @single
     def reset(self, key: jax.Array) -> tuple[Arrays, State]:
         """Starts an episode."""
         state = self.env.reset(key)
         return self.get_obs(state), state
 
     @functools.partial(jax.jit, static_argnums=0)
+    @single
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None = None
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
@@ -113,6 +116,7 @@ class Env(MultiAgentEnv):
             after = select(self.env, dones["__all__"], reset_state, after, kept=("final_obs",))
         return self.get_obs(after), after, rewards, dones, infos
 
+    @single
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:

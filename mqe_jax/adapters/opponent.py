@@ -16,6 +16,7 @@ import numpy as np
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
 from mqe_jax.policies import SimplePolicy, load_as
+from mqe_jax.precision import single
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.types import Memory
 
@@ -105,12 +106,14 @@ class TeamEnv:
         larger._source = self._source
         return larger
 
+    @single
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
         """Returns a randomised initial state; see `QuadrupedEnv.reset`."""
         state = self.match.reset(key, assistance)
         memory = self.opponent.initial_memory(1)
         return self._seen(TeamState(**vars(state), rival_obs=state.obs, rival_memory=memory))
 
+    @single
     def step(self, state: State, action: jax.Array) -> TeamState:
         """Advances by one environment step with the actions of team 0 (T, action_size); the opponent acts for team 1.
 

@@ -84,11 +84,15 @@ def _run(command: Any) -> None:
     from mqe_jax.cli import programs
     from mqe_jax.cli.options import standard_output
 
+    run = command.run
     if not getattr(command, "light", False):
         programs.import_mujoco()
         programs.write_whole()
+        from mqe_jax.precision import single  # imports JAX
+
+        run = single(run)
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:
-        result = command.run()
+        result = run()
         if as_json and result is not None:
             print(json.dumps(result), file=out, flush=True)

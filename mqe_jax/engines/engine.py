@@ -144,7 +144,8 @@ class Engine(abc.ABC):
         if xfrc_applied is not None:
             data = data.replace(xfrc_applied=xfrc_applied.astype(jnp.float32))
         substeps = self.num_substeps if num_substeps is None else num_substeps
-        return self.advance(data, dict(fields or {}), xfrc_applied is not None, substeps)
+        with jax.numpy_dtype_promotion("standard"):  # MJX mixes dtypes
+            return self.advance(data, dict(fields or {}), xfrc_applied is not None, substeps)
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
         """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
@@ -154,5 +155,5 @@ class Engine(abc.ABC):
     @functools.cached_property
     def _template(self) -> mjx.Data:
         """Template of `init`, created on first use: importing MJX takes a second, which `mqe tasks` avoids."""
-        with jax.ensure_compile_time_eval():
+        with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             return self.blank()

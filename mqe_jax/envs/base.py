@@ -31,6 +31,7 @@ from mqe_jax.envs.state import ENDINGS, Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments
+from mqe_jax.precision import single
 from mqe_jax.robots.index import RobotState, placed, read_robots
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 class QuadrupedEnv(Task[S, P]):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
+    @single
     def __init__(
         self, params: P | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
     ) -> None:
@@ -190,6 +192,7 @@ class QuadrupedEnv(Task[S, P]):
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
+    @single
     @checked(key=RandomKey)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns a randomised initial state; runs no forward pass of the physics.
@@ -235,6 +238,7 @@ class QuadrupedEnv(Task[S, P]):
         state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
 
+    @single
     @jax.named_scope("task")
     def step(self, state: State[S], action: jax.Array) -> State[S]:
         """Advances one environment by one environment step.
@@ -249,7 +253,7 @@ class QuadrupedEnv(Task[S, P]):
         """
         action = self._checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
-        action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0).astype(jnp.float32)
+        action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
         action = self.unmirror_action(jnp.where((state.step < state.frozen_steps)[:, None], 0.0, action))
         key, push_key, noise_key, npc_key = jax.random.split(state.key, 4)
 

@@ -75,4 +75,4 @@ class Go1Plane(QuadrupedEnv[None, PlaneParams]):
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: no robot has fallen."""
-        return {"success": 1.0 - failed}
+        return {"success": 1.0 - jnp.asarray(failed, jnp.float32)}

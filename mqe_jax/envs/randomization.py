@@ -88,7 +88,7 @@ class Randomizer:
 
         def uniform(key: jax.Array, span: Range | None, shape: tuple[int, ...], default: float) -> jax.Array:
             if span is None:
-                return jnp.full(shape, default)
+                return jnp.full(shape, default, jnp.float32)
             return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
 
         return RandomizedParams(

@@ -48,7 +48,8 @@ def weigh(
 
 def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
     """Returns the terms, those of weight 0 in the record `weights` times a factor ()."""
-    return {name: term if getattr(weights, name) else factor * term for name, term in terms.items()}
+    as_float = lambda term: jnp.asarray(term, jnp.float32)  # noqa: E731
+    return {name: term if getattr(weights, name) else factor * as_float(term) for name, term in terms.items()}
 
 
 def crowding(position: jax.Array, within: float = 0.5) -> jax.Array:

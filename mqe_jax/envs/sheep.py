@@ -188,7 +188,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
             "success": passed,
             "progress": jnp.sum(self.sheep(after.state.data)[:, 0] - self.sheep(before.state.data)[:, 0]),
             "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-way / 2.0))),
-            "crossing": passed - jnp.sum(through_before),
+            "crossing": passed - jnp.sum(through_before).astype(jnp.float32),
             "gathering": jnp.sum(way_before) - jnp.sum(way),
             "failure": collision | jnp.any(self.fallen(after.robots)),
         }

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from mqe_jax.envs.autoreset import Batch
 from mqe_jax.envs.state import EnvironmentState
+from mqe_jax.precision import single
 from mqe_jax.train import devices
 
 
@@ -49,11 +50,13 @@ class Outer(Batch):
 class Wrapper(Outer):
     """A batch of environments around another; subclasses change what is seen."""
 
+    @single
     def reset(self, key: jax.Array) -> WrappedState:
         """Returns the initial states of all environments."""
         inner = self.inner.reset(key)
         return self._state(inner, jnp.zeros((self.num_envs, self.num_agents, self.action_size)), inner.step)
 
+    @single
     def step(self, state: WrappedState, action: jax.Array) -> WrappedState:
         """Advances all environments by one step with actions (N, A, action_size); errors as of `VectorEnv`."""
         self.check_action(action)

@@ -19,6 +19,7 @@ from mqe_jax.league import pool
 from mqe_jax.league.pool import Pool
 from mqe_jax.opponents import OUTCOMES, Versus, exchanged, versus
 from mqe_jax.policies import load_as
+from mqe_jax.precision import single
 from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.config import MOVING, TrainConfig
@@ -56,6 +57,7 @@ class LeagueState(NamedTuple):
 class League(Versus):
     """`Versus` whose blocks also play the newest policy and members of a pool; a learner hook."""
 
+    @single
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig) -> None:
         """Creates the matches of a training run; `opponents` are those of `TrainConfig.opponents`."""
         dims = env_dims(versus(matches, ["idle"]), config)

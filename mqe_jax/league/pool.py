@@ -43,7 +43,7 @@ def win_rate(pool: Pool) -> jax.Array:
 def mean_win_rate(pool: Pool) -> jax.Array:
     """Returns the mean win rate over the members ()."""
     present = pool.born >= 0
-    return jnp.sum(jnp.where(present, win_rate(pool), 0.0)) / jnp.sum(present)
+    return jnp.sum(jnp.where(present, win_rate(pool), 0.0)) / jnp.sum(present.astype(jnp.float32))
 
 
 def record(pool: Pool, member: jax.Array, score: jax.Array, games: jax.Array) -> Pool:

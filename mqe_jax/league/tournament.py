@@ -18,6 +18,7 @@ from mqe_jax.envs import VectorEnv
 from mqe_jax.files import replacing, write_atomically
 from mqe_jax.literal import to_label
 from mqe_jax.opponents import OUTCOMES, Versus
+from mqe_jax.precision import single
 from mqe_jax.settings import checked
 from mqe_jax.train.policy import Policy
 from mqe_jax.train.types import AnyBatch, RandomKey
@@ -39,6 +40,7 @@ class Ratings(NamedTuple):
     high: Array
 
 
+@single
 @checked(matches=AnyBatch, key=RandomKey)
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `OUTCOMES`.
@@ -68,6 +70,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
     return np.asarray(run(key)).reshape(-1, len(opponents), 3).sum(axis=0)
 
 
+@single
 @checked(matches=AnyBatch, policies=Mapping, key=RandomKey)
 def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `OUTCOMES`."""

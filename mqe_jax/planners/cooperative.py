@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.planners import Observation, go_to, pose
 
@@ -49,7 +50,7 @@ def plan_seesaw(obs: Observation) -> jax.Array:
 
 
 # Sheep Dog: drive one sheep from behind, or gather a flock towards the gate.
-_SIDE = jnp.array([-1.0, 1.0])  # side of the sheep's path on which each robot walks
+_SIDE = np.array([-1.0, 1.0], np.float32)  # side of the sheep's path on which each robot walks
 
 
 def plan_sheep_easy(obs: Observation) -> jax.Array:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.planners import Observation, go_to
 
-_GOAL_AIMS = jnp.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]])  # m, points in the goal
-_GOAL = jnp.array([12.0, 0.0])  # m
+_GOAL_AIMS = np.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]], np.float32)  # m, points in the goal
+_GOAL = np.array([12.0, 0.0], np.float32)  # m
 # Against the defender: the ball passes it on the flank at this point (x, distance from the centre line), m. On the
 # straight line to the goal it touches the defender and is deflected beyond the post.
 _FLANK = (10.0, 1.5)
-_INNER_AIMS = jnp.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]])  # m, points in the goal further from the posts
+_INNER_AIMS = np.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]], np.float32)  # m, further from the posts
 _TURN_IN = 9.4  # m, x of the ball from which it is pushed towards the goal
 _BOTH = 11.2  # m, x of the ball from which both robots attack: a first attack that failed leaves it at the goal line
 _LEAD = 0.3  # s, over which the ball's motion is predicted
@@ -64,7 +65,7 @@ def _play(own: jax.Array, teammate: jax.Array, opponents: jax.Array, ball: jax.A
 
 
 def _attack(
-    own: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array, aims: jax.Array
+    own: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array, aims: jax.Array | np.ndarray
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the goal position of an attacker (2,), m, and the unit vector from the ball to the chosen aim (2,).
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.planners import GAIN, Observation, go_to, pose
 
@@ -41,7 +42,7 @@ def plan_revolving_door(obs: Observation) -> jax.Array:
 
 
 # Sumo Wrestling: push the opponent out of the ring sideways, to avoid slipping past it.
-_CENTER = jnp.array([3.1, 0.0])  # m, of the ring
+_CENTER = np.array([3.1, 0.0], np.float32)  # m, of the ring
 _AHEAD = 0.05  # m, forward offset of the contact point (the side between the legs) from the trunk's centre
 _STAND_OFF = 0.65  # m, distance from the opponent until the robot is side on
 _EDGE = (1.5, 1.64)  # m, range of the distance from the centre at which the robot turns back; grows with the opponent's

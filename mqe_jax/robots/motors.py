@@ -149,7 +149,7 @@ class Motors:
         reach = (pace + self._kick(xp, effort)) / self.speed
         if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
             return np.zeros_like(pace)
-        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH)
+        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH).astype(np.float32)
         if self._steep.any():
             line = self._line * (self.speed + xp.where(against, pace, -pace))
             share = xp.minimum(effort / xp.maximum(line, ROUNDING), 1.0)  # of the line's torque

@@ -17,6 +17,7 @@ from safetensors.numpy import save
 from mqe_jax import limits
 from mqe_jax.errors import InputError, brief
 from mqe_jax.files import check_file, make_folder, parse_json, parsing, write_atomically
+from mqe_jax.train.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
 VERSION = 3
@@ -67,7 +68,7 @@ def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind:
     The same content gives the same bytes: safetensors writes several entries of metadata in random order, so that
     there is one.
     """
-    named, _ = _flatten(jax.device_get(tree))
+    named, _ = _flatten(jax.device_get(raw_keys(tree)))
     # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
     arrays = {name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()}
     text = json.dumps(dict(metadata), sort_keys=True)
@@ -140,7 +141,7 @@ def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False,
     for name in arrays:
         if name not in expected:
             raise InputError(f"{path}: unexpected entry {name}, not defined by the current settings")
-    for name, leaf in expected.items():
+    for name, leaf in _flatten(jax.eval_shape(raw_keys, template))[0].items():
         found = arrays[name]
         if tuple(found.shape) != tuple(leaf.shape):
             raise InputError(f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed")
@@ -149,7 +150,11 @@ def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False,
         elif found.dtype != leaf.dtype:
             raise InputError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
         _check_range(path, part + name, arrays[name])
-    leaves = [jax.device_put(arrays[name]) for name in expected]
+    put = {name: jax.device_put(arrays[name]) for name in expected}
+    leaves = [
+        jax.random.wrap_key_data(put[name], impl=leaf.dtype) if is_typed_key(leaf) else put[name]
+        for name, leaf in expected.items()
+    ]
     return Checkpoint(jax.tree_util.tree_unflatten(structure, leaves), metadata)
 
 
@@ -190,7 +195,7 @@ def latest(run_dir: str | Path) -> Path | None:
 
 def nonfinite(tree: Any) -> list[str]:
     """Returns the path names of the leaves that hold NaN or infinite numbers."""
-    return [name for name, leaf in _flatten(jax.device_get(tree))[0].items() if not np.all(np.isfinite(leaf))]
+    return [name for name, leaf in _flatten(jax.device_get(raw_keys(tree)))[0].items() if not np.all(np.isfinite(leaf))]
 
 
 def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:

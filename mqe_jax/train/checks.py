@@ -8,12 +8,14 @@ import jax
 
 from mqe_jax.errors import InputError
 from mqe_jax.memory import check_memory
+from mqe_jax.precision import single
 from mqe_jax.settings import fail
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import Network
 from mqe_jax.train.types import VectorEnv, teams_of
 
 
+@single
 def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
     if len(teams_of(env)) > 1:

@@ -18,6 +18,7 @@ import numpy as np
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.literal import line, to_html
+from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.types import (
     AnyBatch,
@@ -254,6 +255,7 @@ class Evaluator:
         self._begin = jax.jit(jax.vmap(lambda key: _begin(env, jax.random.split(key)[0], memory)))
         self._run = jax.jit(run)
 
+    @single
     def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[Result]:
         """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate_batch`."""
         episodes = check("episodes", episodes, Episodes)
@@ -306,8 +308,8 @@ def _run_block(
             _Progress(
                 env_state=state,
                 memory=where_rows(done, initial_memory, memory),
-                finished=p.finished + (counted & done),
-                steps=p.steps + counted,
+                finished=p.finished + (counted & done).astype(jnp.int32),
+                steps=p.steps + counted.astype(jnp.int32),
                 returns=p.returns + jnp.where(counted, jnp.mean(state.reward[:, own], axis=-1), 0.0),
                 step_sums=step_sums,
                 end_sums=end_sums,

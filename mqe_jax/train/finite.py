@@ -11,14 +11,14 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import NonFiniteError
 from mqe_jax.train.checkpoint import latest, nonfinite
-from mqe_jax.train.types import PyTree
+from mqe_jax.train.types import PyTree, raw_keys
 
 _METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
 
 
 def all_finite(tree: PyTree) -> jax.Array:
     """Returns whether all numbers of a pytree are finite (), computed on the device."""
-    arrays = jax.tree.leaves(tree)
+    arrays = jax.tree.leaves(raw_keys(tree))
     return _finite([x for x in arrays if x.size])  # jaxlib cannot compile empty ones of several processes
 
 

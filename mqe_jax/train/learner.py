@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.precision import single
 from mqe_jax.train import devices
 from mqe_jax.train.checks import check_divisible, check_environment
 from mqe_jax.train.config import TrainConfig
@@ -56,7 +57,7 @@ class TrainState:
     """Assistance of the next update () float32, unless its annealed value is below."""
     rollout: RolloutState
     key: jax.Array
-    """Raw uint32 random key."""
+    """Random key."""
     updates: jax.Array
     """Updates done () int32."""
     extra: PyTree = ()
@@ -97,6 +98,7 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
     hook: LearnerHook | None = getattr(env, "learner_hook", None)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
+    @single
     def init(key: jax.Array) -> TrainState:
         params_key, env_key, stagger_key, key = jax.random.split(key, 4)
         env_state = env.reset(env_key)
@@ -126,6 +128,7 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
         )
         return state if hook is None else hook.seated(dataclasses.replace(state, extra=hook.begin(state)))
 
+    @single
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
         now = scheduled(config, state.updates)
@@ -161,7 +164,9 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
             obs_normalizer=obs_normalizer,
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
-            assistance=next_assistance(config, now.assistance, metrics.get("success", jnp.float32(jnp.nan))),
+            assistance=next_assistance(
+                config, now.assistance, metrics.get("success", jnp.float32(0.5)), metrics["episodes"]
+            ),
             rollout=rollout_state,
             key=key,
             updates=state.updates + 1,
@@ -233,7 +238,7 @@ def _prepare(
         reward,
         value,
         next_value,
-        transitions.terminated * (1.0 - now.failure_bootstrap),
+        transitions.terminated.astype(jnp.float32) * (1.0 - now.failure_bootstrap),
         transitions.done,
         gamma=config.ppo.gamma,
         gae_lambda=config.ppo.gae_lambda,

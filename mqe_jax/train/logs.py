@@ -29,6 +29,7 @@ from mqe_jax import interrupts
 from mqe_jax.errors import InputError
 from mqe_jax.files import append, make_folder, parsing, read_rows, write_atomically
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.types import is_per_episode
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
@@ -329,7 +330,10 @@ def _clock(seconds: float) -> str:
 def row_of(
     updates: int, metrics: Mapping[str, Any], config: TrainConfig, start_time: float, update_began: float
 ) -> dict[str, float]:
-    """Returns a row of metrics.csv: steps and times first, then the update's metrics by name."""
+    """Returns a row of metrics.csv: steps and times first, then the update's metrics by name.
+
+    Means over episodes are NaN where none has ended.
+    """
     now = time.perf_counter()
     row: dict[str, float] = {
         "env_steps": updates * config.steps_per_update,
@@ -337,5 +341,7 @@ def row_of(
         "seconds": now - start_time,
         "fps": config.steps_per_update / (now - update_began),
     }
-    row.update({name: float(value) for name, value in sorted(metrics.items())})
+    none = not metrics["episodes"]
+    values = {name: math.nan if none and is_per_episode(name) else float(x) for name, x in sorted(metrics.items())}
+    row.update(values)
     return row

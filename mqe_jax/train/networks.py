@@ -15,6 +15,7 @@ chunks of L steps.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, dataclass_transform
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 
 from mqe_jax.errors import nearest
 from mqe_jax.limits import NonNegativeInt, PositiveInt
+from mqe_jax.precision import single
 from mqe_jax.settings import build, fail, record
 from mqe_jax.train import nn
 from mqe_jax.train.types import Memory, NetworkMemory, Params, where_rows
@@ -120,9 +122,19 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings record (see `mqe_jax.settings.record`) and registers it."""
+    """Makes a class a settings record (see `mqe_jax.settings.record`) and registers it.
+
+    The functions of its network compute in single precision.
+    """
 
     def register(cls: type[Any]) -> type[Any]:
+        build_own = cls.build
+
+        @functools.wraps(build_own)
+        def build_single(self: Any, dims: EnvDims) -> Network:
+            return Network._make(single(part) if callable(part) else part for part in build_own(self, dims))
+
+        cls.build = build_single
         cls.__annotations__ = {"name": Literal[name], **cls.__annotations__}
         cls.name = name
         NETWORKS[name] = record(cls)

@@ -14,6 +14,7 @@ from annotated_types import Ge
 
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import make_folder
+from mqe_jax.precision import single
 from mqe_jax.settings import PathText, build, check, to_mapping
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
@@ -115,6 +116,7 @@ class TrainedPolicy:
         """
         return self.act_with(self.arrays, obs, memory, key)
 
+    @single
     def act_with(
         self, arrays: PolicyArrays, obs: Any, memory: Memory, key: jax.Array | None = None
     ) -> tuple[jax.Array, Memory]:
@@ -173,6 +175,7 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
     return path
 
 
+@single
 def read_policy(run: str | Path) -> TrainedPolicy:
     """Reads the policy of a run folder, or a policy file; parameters stored as float16 become float32.
 

@@ -11,7 +11,7 @@ from mqe_jax.train import devices
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Batch, NetworkMemory, Params, TraceStep, Transition, VectorEnv, is_outcome
+from mqe_jax.train.types import Batch, NetworkMemory, Params, TraceStep, Transition, VectorEnv, is_per_episode
 
 
 class RolloutState(NamedTuple):
@@ -59,9 +59,8 @@ def rollout(
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
     The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
-    steps and environments, but outcomes (see `is_outcome`), `episode_length` and `episode_return` are means over ended
-    episodes (NaN without any), and `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold
-    `trace`, a `Trace` of all steps.
+    steps and environments, but those that are `is_per_episode` are means over ended episodes (0 without any), and
+    `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold `trace`, a `Trace` of all steps.
     """
 
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
@@ -108,14 +107,10 @@ def rollout(
     return state, transitions, metrics if trace_step is None else {**metrics, "trace": trace}
 
 
-def _per_episode(name: str) -> bool:
-    return is_outcome(name) or name in ("episode_length", "episode_return")
-
-
 def _sums(metrics: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array]:
     """Returns the sums over environments of one step: metrics (N,) -> ()."""
     sums = {
-        name: jnp.sum(jnp.where(done, value, 0.0) if _per_episode(name) else value) for name, value in metrics.items()
+        name: jnp.sum(jnp.where(done, value, 0.0) if is_per_episode(name) else value) for name, value in metrics.items()
     }
     return {**sums, "episodes": jnp.sum(done.astype(jnp.float32))}
 
@@ -127,8 +122,8 @@ def _means(totals: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
     for name, total in totals.items():
         if name in ("episodes", "diverged", "overflow"):
             means[name] = total
-        elif _per_episode(name):
-            means[name] = jnp.where(episodes > 0, total / jnp.maximum(episodes, 1.0), jnp.nan)
+        elif is_per_episode(name):
+            means[name] = total / jnp.maximum(episodes, 1.0)
         else:
             means[name] = total / samples
     return means

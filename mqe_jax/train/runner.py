@@ -26,7 +26,7 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
-from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, join_traces
+from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, generator, join_traces
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
@@ -287,6 +287,7 @@ class Training:
             kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
             for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
                 metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
+                metadata["generator"] = generator()
                 metadata["environments"] = config.checkpoint.environments
                 if config.checkpoint.environments:
                     tree = self._processes.join(without_shared(state, self._seeds.shared))

@@ -61,13 +61,14 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
     )
 
 
-def next_assistance(config: TrainConfig, assistance: jax.Array, success: jax.Array) -> jax.Array:
+def next_assistance(config: TrainConfig, assistance: jax.Array, success: jax.Array, episodes: jax.Array) -> jax.Array:
     """Returns the assistance () after an update, before annealing, by `curriculum.assistance_step`.
 
-    `success` is the rate of the episodes that ended in the update (); NaN without any, which leaves the assistance.
+    `success` is the rate of the `episodes` that ended in the update (); without any, the assistance stays.
     """
     curriculum = config.curriculum
     if not curriculum.assistance_step:
         return jnp.float32(curriculum.assistance)
-    up = (success < _FAILING).astype(jnp.float32) - (success > _SUCCEEDING)
+    up = (success < _FAILING).astype(jnp.float32) - (success > _SUCCEEDING).astype(jnp.float32)
+    up = jnp.where(episodes > 0, up, 0.0)
     return jnp.clip(assistance + curriculum.assistance_step * up, 0.0, curriculum.assistance)

@@ -19,9 +19,8 @@ class Seeds:
     """S states of `init(key)`, with a leading axis S on all leaves but the shared ones."""
 
     def __init__(self, init: Callable[[jax.Array], PyTree], count: int) -> None:
-        key = jax.ShapeDtypeStruct((2,), jnp.uint32)
-        keys = jax.ShapeDtypeStruct((2, 2), jnp.uint32)
-        alone, batched = jax.eval_shape(init, key), jax.eval_shape(jax.vmap(init), keys)
+        key = jax.random.PRNGKey(0)
+        alone, batched = jax.eval_shape(init, key), jax.eval_shape(jax.vmap(init), jnp.stack([key, key]))
         self.count = count
         self.shared = jax.tree.map(lambda one, many: one.shape == many.shape, alone, batched)
         """Whether each leaf of a state is unbatched under `vmap`."""

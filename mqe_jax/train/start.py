@@ -20,7 +20,7 @@ from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_ppo
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv
+from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv, generator
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 _MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
@@ -28,7 +28,7 @@ _MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "l
 
 
 def initial_key(config: TrainConfig) -> jax.Array:
-    """Returns the initial random key (raw uint32) of a training run."""
+    """Returns the initial random key of a training run."""
     return jax.random.PRNGKey(config.seed)
 
 
@@ -71,6 +71,10 @@ def first_state(
     metadata = read_metadata(checkpoint, kind="checkpoint")
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
+    if (theirs := metadata.get("generator", generator())) != generator():
+        fail(
+            "jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {checkpoint.parent.parent}"
+        )
     before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
     if not isinstance(before, dict) or not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")

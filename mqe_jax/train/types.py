@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -21,9 +22,23 @@ Memory = Any
 
 def _key(value: Any) -> Any:
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", float)
-    if (shape, dtype) != ((2,), jnp.uint32) and not (shape == () and jnp.issubdtype(dtype, jax.dtypes.prng_key)):
-        raise ValueError("a random key, such as jax.random.PRNGKey(0)")
+    raw = _raw_key(generator())
+    if (shape, dtype) != (raw.shape, raw.dtype) and not (shape == () and jnp.issubdtype(dtype, jax.dtypes.prng_key)):
+        raise ValueError(
+            f"a random key, such as jax.random.PRNGKey(0); a raw one of {generator()} is {raw.shape} uint32"
+        )
     return value
+
+
+def generator() -> str:
+    """Returns the name of JAX's generator of random numbers, `jax_default_prng_impl`."""
+    return jax.config.jax_default_prng_impl  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@functools.cache
+def _raw_key(implementation: str) -> Any:
+    """Returns shape and dtype of the raw keys of one of JAX's generators."""
+    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0, impl=implementation)))
 
 
 def _environment(value: Any) -> Any:
@@ -156,6 +171,16 @@ def replace_fields(state: Any, **fields: jax.Array) -> Any:
     raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
 
 
+def raw_keys(tree: PyTree) -> PyTree:
+    """Returns a pytree with its typed random keys as numbers, which can be saved."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if is_typed_key(x) else x, tree)
+
+
+def is_typed_key(x: Any) -> bool:
+    """Returns whether an array is a typed random key."""
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
 def teams_of(env: VectorEnv) -> Teams:
     """Returns the environment's teams; by default a single team of all agents."""
     return tuple(map(tuple, getattr(env, "teams", (range(env.num_agents),))))
@@ -165,6 +190,11 @@ def is_outcome(metric: str) -> bool:
     """Returns whether a metric is an episode outcome, read at its last step: `success`, `team0/win`, `ending/fall`."""
     reward = metric.removeprefix("team1/").startswith(("reward/", "average_step_reward"))
     return metric.startswith(("success", "team", "ending/")) and not reward
+
+
+def is_per_episode(metric: str) -> bool:
+    """Returns whether a training metric is a mean over ended episodes; it is unknown where none ended."""
+    return is_outcome(metric) or metric in ("episode_length", "episode_return")
 
 
 class NetworkMemory(NamedTuple):

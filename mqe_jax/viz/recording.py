@@ -9,6 +9,7 @@ import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
+from mqe_jax.precision import single
 from mqe_jax.settings import checked, fail
 from mqe_jax.train.evaluate import Act, acting
 from mqe_jax.train.policy import Policy
@@ -43,6 +44,7 @@ class Episode:
         return dataclasses.replace(self, **poses, dt=self.dt * (frames.step or 1))
 
 
+@single
 @checked(policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
 def record(
     env: QuadrupedEnv, policy: Policy | Act, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0

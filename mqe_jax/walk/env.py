@@ -20,6 +20,7 @@ import numpy as np
 from mqe_jax import engines, walk_policy
 from mqe_jax.actuators import Actuators
 from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
+from mqe_jax.precision import single
 from mqe_jax.robots.index import Proprioception, RobotState, foot_positions, read_robots
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
@@ -107,6 +108,7 @@ class WalkEnv:
 
     # -- reset and step -----------------------------------------------------------------------------------------
 
+    @single
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0, spec: EpisodeSpec | None = None) -> WalkState:
         """Returns the initial state of an episode; samples a spec if none is given."""
         next_key, spec_key, random_key, pose_key, noise_key = jax.random.split(key, 5)
@@ -161,6 +163,7 @@ class WalkEnv:
         )
         return self._observed(state, noise_key)
 
+    @single
     def step(self, state: WalkState, action: jax.Array) -> WalkState:
         """Advances by one policy step with an action (1, 12)."""
         task, index = self.task, self.index

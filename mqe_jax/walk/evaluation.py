@@ -14,6 +14,7 @@ import numpy as np
 
 from mqe_jax import walk_policy
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.precision import single
 from mqe_jax.robots.index import Proprioception, foot_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
@@ -123,6 +124,7 @@ def sample_specs(env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int
     return spec, commands
 
 
+@single
 def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, float]:
     """Runs one scenario and returns its metrics.
 

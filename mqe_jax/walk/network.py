@@ -177,7 +177,7 @@ def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.nda
     rows = jnp.arange(steps)[:, None] + kept
     episode = jnp.cumsum(is_first, axis=0)
     of_row = jnp.concatenate([jnp.zeros((len(before), count), episode.dtype), episode])
-    alive = of_row[rows] == episode[:, None]
+    alive = (of_row[rows] == episode[:, None]).astype(obs.dtype)
     return jnp.swapaxes(jnp.concatenate([before, obs])[rows] * alive[..., None], 1, 2)
 
 

@@ -137,7 +137,7 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
         "raibert": jnp.sum(jnp.square(feet_heading - place)),
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
-        "foot_slip": jnp.sum(on_ground * jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1)),
+        "foot_slip": jnp.sum(jnp.where(on_ground, jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1), 0.0)),
         "smoothness": jnp.sum(jnp.square(inputs.target - inputs.previous_target)),
         "second_smoothness": jnp.sum(jnp.square(inputs.target - 2 * inputs.previous_target + inputs.earlier_target)),
         "torque": jnp.sum(jnp.square(torque)),

@@ -1,0 +1,26 @@
+"""Single precision, whatever `jax_enable_x64` is."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def single(function: Callable[P, R]) -> Callable[P, R]:
+    """Makes a function compute in float32 and int32, also where it is traced by a caller with `jax_enable_x64`.
+
+    The function and all that it calls, such as a task or an engine of one's own, need no dtype in each `jnp.zeros`.
+    """
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        with jax.enable_x64(False):
+            return function(*args, **kwargs)
+
+    return call

@@ -1,0 +1,170 @@
+"""JAX's switches: `jax_enable_x64`, `jax_default_prng_impl`, `jax_debug_nans`, `jax_numpy_dtype_promotion`."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_train_run import settings
+
+from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.errors import InputError
+from mqe_jax.league.league import League
+from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.settings import build
+from mqe_jax.train.checkpoint import load_tree, save_tree
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import evaluate_batch
+from mqe_jax.train.learner import make_ppo
+from mqe_jax.train.policy import read_policy
+from mqe_jax.train.runner import train, train_seeds
+from tests import training as probes
+from tests.test_opponents import matches
+from tests.training import Probe, content, differences
+
+PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4, max_episode_steps=6)  # none ends at first
+
+
+@contextlib.contextmanager
+def strict_x64() -> Iterator[None]:
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@contextlib.contextmanager
+def strict_nans() -> Iterator[None]:
+    with jax.debug_nans(True), jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+def kinds(tree: Any) -> list[tuple[Any, ...]]:
+    return [(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(tree)]
+
+
+# -- 64 bits, and no implicit promotion --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("control", ["command", "torque"])
+def test_the_loops_of_jax_step_every_task(task: str, control: str) -> None:
+    with jax.enable_x64(False):
+        env = make(task, impl="c", control=control, num_envs=2)
+        plain = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+
+    def loops(key: jax.Array, action: jax.Array) -> Any:
+        first = env.reset(key)
+        state, _ = jax.lax.scan(lambda state, _: (env.step(state, action), None), first, None, length=2)
+        state = jax.lax.cond(state.terminated, lambda state: env.step(state, action), lambda state: state, state)
+        return first, jax.lax.while_loop(lambda state: state.terminated, lambda state: env.step(state, action), state)
+
+    with strict_x64():
+        first, last = jax.eval_shape(loops, jax.random.PRNGKey(0), jnp.zeros((env.num_agents, env.action_size)))
+    assert kinds(first) == kinds(last) == kinds(plain)
+
+
+@pytest.mark.parametrize(
+    ("task", "name"), [*((x, x) for x in TASKS if x != "go1plane"), *((x, "scripted") for x in PLANNERS)]
+)
+def test_policies_act_in_single_precision(task: str, name: str) -> None:
+    with strict_x64():
+        env = make(task, impl="c", num_envs=2)
+        policy = load_policy(name, env)
+        policy = all_agents(env, policy, policy if len(env.teams) > 1 else None)
+        obs = jax.ShapeDtypeStruct((2, env.num_agents, env.observation_size), jnp.float32)
+        act = lambda obs: policy.act(obs, policy.initial_memory(2), jax.random.PRNGKey(0))  # noqa: E731
+        assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(act, obs))} == {jnp.dtype(jnp.float32)}
+
+
+def test_a_league_trains_in_single_precision() -> None:
+    sources = ("newest", "older", "uniform", "idle")
+    values = {"num_envs": 4, "rollout_steps": 4, "total_steps": 64, "league": {"members": 4}, "opponents": sources}
+    with strict_x64():
+        config = build(TrainConfig, values)
+        learner = make_ppo(League(matches(), sources, config), config)
+        state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
+        assert kinds(jax.eval_shape(learner.update, state)[0]) == kinds(state)
+
+
+# -- a whole training --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ppo__ratio": "joint", "ppo__value": "joint"},  # with recurrent networks
+        {"network": {"name": "mat", "width": 8}},
+    ],
+)
+def test_networks_train_with_all_switches(changes: dict[str, Any], tmp_path: Path) -> None:
+    config = settings(rollout_steps=2, total_steps=16, **changes)
+    with strict_x64(), jax.debug_nans(True):
+        train(PROBE, config, tmp_path / "run")
+    assert "nan" in content(tmp_path / "run")["success"]
+
+
+def test_switches_do_not_change_a_training(tmp_path: Path) -> None:
+    config = settings(rollout_steps=2, total_steps=32, network__recurrent=False, ppo__advantage_clip=3.0)
+    switches: dict[str, Callable[[], Any]] = {
+        "plain": contextlib.nullcontext,
+        "strict": strict_nans,
+        "typed keys": lambda: jax.enable_custom_prng(True),
+        "x64": lambda: jax.enable_x64(True),
+    }
+    results = {}
+    for name, switch in switches.items():
+        with switch():
+            train(PROBE, config, tmp_path / name)
+            result = evaluate_batch(PROBE, read_policy(tmp_path / name), 4, jax.random.PRNGKey(0))
+        results[name] = {key: value for key, value in result.to_dict().items() if isinstance(value, float)}
+    plain = content(tmp_path / "plain")
+    for name in ("strict", "typed keys"):
+        assert not differences(plain, content(tmp_path / name)) and results[name] == results["plain"], name
+    for name, values in content(tmp_path / "x64").items():  # loops are counted in 64 bits, which XLA fuses otherwise
+        assert values.dtype == plain[name].dtype
+        if values.dtype == np.float32:
+            np.testing.assert_allclose(values, plain[name], rtol=1e-3, atol=1e-5, err_msg=name)
+    assert results["x64"] == pytest.approx(results["plain"], rel=1e-3)
+
+
+# -- random keys -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("generator", ["rbg", "unsafe_rbg"])
+def test_a_training_resumes_with_another_generator(generator: str, tmp_path: Path) -> None:
+    config, states = settings(network__recurrent=False), []
+    with jax.default_prng_impl(generator):
+        train(PROBE, config, tmp_path / "whole")
+        count = lambda state, row: states.append(state)  # noqa: E731
+        train_seeds(PROBE, [config], [tmp_path / "half"], on_update=count, stop=lambda: len(states) == 2)
+        train(PROBE, config, tmp_path / "half", resume=True)
+    assert not differences(content(tmp_path / "whole"), content(tmp_path / "half"))
+    for other in {"rbg", "unsafe_rbg", "threefry2x32"} - {generator}:
+        with jax.default_prng_impl(other), pytest.raises(InputError, match=f"jax_default_prng_impl.*{generator}"):
+            train(PROBE, config, tmp_path / "half", resume=True)
+
+
+@pytest.mark.parametrize("generator", ["threefry2x32", "rbg", "unsafe_rbg"])
+def test_environments_take_raw_and_typed_keys_of_every_generator(generator: str) -> None:
+    env = make("go1plane", impl="c", control="position", num_envs=2)
+    batch = VectorEnv(env, 2)
+    for key in (jax.random.key(0, impl=generator), jax.random.PRNGKey(0, impl=generator)):
+        with jax.default_prng_impl(generator):
+            state = jax.eval_shape(batch.reset, key)
+            after = jax.eval_shape(batch.step, state, jnp.zeros((2, env.num_agents, env.action_size)))
+        assert state.key.dtype == after.key.dtype == key.dtype
+    with jax.default_prng_impl("rbg"), pytest.raises(InputError, match=r"key: .* a raw one of rbg is \(4,\) uint32"):
+        env.reset(jnp.zeros(2, jnp.uint32))
+
+
+def test_typed_keys_are_saved(tmp_path: Path) -> None:
+    tree = {"key": jax.random.key(3, impl="rbg"), "keys": jax.random.split(jax.random.key(4), 2), "x": jnp.ones(2)}
+    save_tree(tmp_path / "file", tree, {}, kind="checkpoint")
+    loaded = load_tree(tmp_path / "file", jax.eval_shape(lambda: tree), kind="checkpoint").tree
+    for name, key in tree.items():
+        assert loaded[name].dtype == key.dtype and (jnp.asarray(loaded[name] == key)).all()
