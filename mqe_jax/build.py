@@ -21,7 +21,7 @@ from mqe_jax.league.sides import BothSides
 from mqe_jax.literal import echo
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_as, load_policy
-from mqe_jax.settings import Parameters, check, differences, fail, joined, load_yaml, override
+from mqe_jax.settings import Parameters, PathText, check, differences, fail, joined, load_yaml, override
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
 from mqe_jax.train.evaluate import Act
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
@@ -322,7 +322,7 @@ def named_config(name: str, task: str) -> TrainConfig:
     """Returns the settings of a file, or of a shipped name; `league` has changes of some tasks."""
     shipped = ["demo", "league"]
     shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
-    path, allowed = Path(name), f"a YAML file, or one of {', '.join(shipped)}"
+    path, allowed = Path(check("config", name, PathText)), f"a YAML file, or one of {', '.join(shipped)}"
     if name == "demo":
         path = CONFIG_FOLDER / "demo.yaml"
     elif name in shipped:

@@ -100,7 +100,17 @@ def _path(value: Any) -> Any:
         raise ValueError(f"a path, or a text that is not empty, {TEXT}")
     if any(len(os.fsencode(part)) > limits.FILE_NAME for part in Path(value).parts):
         raise ValueError(f"a path whose parts have at most {limits.FILE_NAME} bytes")
-    return value
+    return _expanded(value)
+
+
+def _expanded(value: Any) -> Any:
+    """Returns a text or path with the home folder in place of a `~` at its beginning."""
+    if not isinstance(value, str | Path) or not str(value).startswith("~"):
+        return value
+    expanded = os.path.expanduser(str(value))
+    if str(value).split("/")[0] == "~" and expanded == str(value):
+        raise ValueError("a path without ~, for there is no home folder")
+    return type(value)(expanded)
 
 
 PathText = Annotated[Any, pydantic.AfterValidator(_path)]
@@ -300,7 +310,7 @@ def _number(kind: type, value: Any) -> Any:
 def _text(value: Any) -> Any:
     if isinstance(value, bytes | bytearray) or (isinstance(value, str | Path) and not is_text(str(value))):
         raise ValueError(f"a text, {TEXT}")
-    return value
+    return _expanded(value)
 
 
 def _boolean(value: Any) -> bool:

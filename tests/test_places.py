@@ -11,6 +11,14 @@ from typing import Any
 import pytest
 from fake_env import SMALL
 
+from mqe_jax import zoo
+from mqe_jax.build import named_config
+from mqe_jax.cli.arguments import parse
+from mqe_jax.envs import TASKS
+from mqe_jax.errors import InputError
+from mqe_jax.policies import load_policy
+from mqe_jax.train.policy import save_policy
+
 TESTS = Path(__file__).parent
 NO_POSIX = """
 import os, signal, sys
@@ -83,3 +91,29 @@ def test_only_drawing_needs_a_gl_library(gl: str, bad: list[str], tmp_path: Path
     before, after = run(code, tmp_path, env={**os.environ, "MUJOCO_GL": gl}).stderr.split("drawn\n")
     assert "GL" not in before and len([line for line in after.splitlines() if "GL" in line]) == 1
     assert (tmp_path / "clip.png").stat().st_size
+
+
+def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In flags, which a shell leaves as they are after `=`, in settings and in Python."""
+    home, work = tmp_path / "home", tmp_path / "work"
+    for folder in (home, work):
+        folder.mkdir()
+    monkeypatch.chdir(work)
+    monkeypatch.setenv("HOME", str(home))
+    (home / "c.yaml").write_text("start: ~/start\nopponents: [idle, ~/other]\nenv: {skill_weights: ~/walk}\n")
+    config = named_config("~/c.yaml", "go1tug")
+    assert config.start == f"{home}/start" and config.opponents == ("idle", f"{home}/other")
+    assert TASKS["go1tug"].Params(**config.env).skill_weights == f"{home}/walk"
+    words = ["--run-dir=~/run", "--config=~/c.yaml", "--dump-diverged=~/dumps"]
+    command = parse(["train", "go1tug", *words])
+    assert (command.run_dir, command.settings.start) == (home / "run", f"{home}/start")
+    assert command.dump_diverged == home / "dumps"
+    assert parse(["render", "~/run", "-o", "~/a.png"]).target == f"{home}/run"
+    policy = zoo.load("go1gate")
+    save_policy("~/policies", policy, "gate.safetensors")
+    assert load_policy("~/policies/gate.safetensors").task == "go1gate"
+    assert list(work.iterdir()) == []
+    monkeypatch.delenv("HOME")
+    monkeypatch.setitem(sys.modules, "pwd", None)
+    with pytest.raises(InputError, match="source: '~/policies' is not allowed; it must be a path without ~"):
+        load_policy("~/policies")

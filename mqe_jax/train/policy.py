@@ -162,7 +162,7 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
     Raises:
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
-    path = Path(run_dir) / name
+    path = Path(check("run_dir", run_dir, PathText)) / name
     params = policy.params
     if half:
         params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)

@@ -92,9 +92,9 @@ def open_training(
 ) -> Iterator[Training]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
-    for config, run_dir in zip(configs, run_dirs, strict=True):
+    for config, _ in zip(configs, run_dirs, strict=True):
         check("config", config, TrainConfig)
-        check("run_dir", run_dir, PathText | None)
+    run_dirs = [check("run_dir", run_dir, PathText | None) for run_dir in run_dirs]
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
     if configs[0].evaluation.every is not None and eval_env is None:
