@@ -4,6 +4,8 @@ import contextlib
 import dataclasses
 import functools
 import http.server
+import io
+import itertools
 import json
 import os
 import shutil
@@ -44,7 +46,9 @@ def write(task: str, folder: Path) -> SimpleNamespace:
     (entry,) = entries([task])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(site, "add_libraries", lambda folder, source: None)
-        assert cli.main(["play-site", task, "-o", str(folder)]) == 0
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            assert cli.main(["play-site", task, "-o", str(folder)]) == 0
+        assert f"mqe: exporting {task}, 1 of 1" in said.getvalue()
     own = folder / "tasks" / task
     settings = json.loads((own / "scene.json").read_text())
     return SimpleNamespace(entry=entry, env=entry.env, own=own, settings=settings, folder=folder)
@@ -249,12 +253,12 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
 
 
 @contextlib.contextmanager
-def opened(folder: Path, query: str, width: int = 1280, height: int = 720) -> Iterator[Any]:
+def opened(folder: Path, query: str, width: int = 1280, height: int = 800, *, touch: bool = False) -> Iterator[Any]:
     """Serves a folder and opens its page in Chromium; asserts that nothing was reported to its console as an error."""
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        with open_page(width, height) as tab:
+        with open_page(width, height, touch=touch) as tab:
             errors: list[str] = []
             tab.on("pageerror", lambda error: errors.append(str(error)))
             tab.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
@@ -286,6 +290,36 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         tab.wait_for_function("document.querySelector('#pause').textContent === 'Continue'")
 
 
+DRIVEN = "document.querySelector('#drive').value === '0'"
+
+
+def test_the_page_says_what_to_do_and_its_button_drives(page: Path) -> None:
+    """From the start of an episode, behind and above the robot; the dots have names."""
+    with opened(page, "seed=3") as tab:
+        assert tab.locator("#aim").inner_text() == "Drive the sheep through the gate."
+        assert tab.locator("#free").inner_text() == "W: take over" and not tab.locator("#walk").is_visible()
+        assert tab.locator(".who").all_inner_texts() == ["robot 1", "robot 2"]
+        tab.locator("#take").click()
+        tab.wait_for_function(DRIVEN)
+        tab.wait_for_function("document.querySelector('.who').innerText === 'robot 1 (you)'")
+        assert "sidestep" in tab.locator("#driving").inner_text() and tab.locator("#view").input_value() == "0"
+        photograph(tab, "desktop")
+        tab.locator("#take").click()
+        tab.wait_for_function("document.querySelector('#drive').value === ''")
+
+
+def test_a_pad_drives_on_a_touch_screen(page: Path) -> None:
+    """Both pads and the button are there before anything is touched, and do not cover each other."""
+    with opened(page, "seed=3", 390, 844, touch=True) as tab:
+        boxes = [tab.locator(name).bounding_box() for name in ("#bar", "#guide", "#walk")]
+        assert all(one["y"] + one["height"] <= other["y"] for one, other in itertools.pairwise(boxes))
+        assert tab.locator("#turn").is_visible() and not tab.locator("#free").is_visible()
+        assert tab.evaluate("document.documentElement.scrollWidth") == 390
+        tab.locator("#walk").tap()
+        tab.wait_for_function(DRIVEN)
+        photograph(tab, "phone")
+
+
 @pytest.mark.soak
 def test_keys_win_or_lose_a_match_and_every_task_loads(tmp_path: Path) -> None:
     """In sumo a robot driven straight on meets the shipped policy; the other tasks are chosen one after another."""
@@ -295,7 +329,7 @@ def test_keys_win_or_lose_a_match_and_every_task_loads(tmp_path: Path) -> None:
         tab.set_default_timeout(120_000)
         tab.keyboard.down("w")
         tab.wait_for_function("!document.querySelector('#result').hidden")
-        assert "wins" in tab.locator("#result").inner_text() or "Draw" in tab.locator("#result").inner_text()
+        assert tab.locator("#result").inner_text().startswith(("You win", "You lose", "Draw"))
         assert float(tab.evaluate("document.body.dataset.rate")) > 5
         photograph(tab, "sumo-result")
         tab.keyboard.up("w")

@@ -155,13 +155,13 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 
 @contextlib.contextmanager
-def open_page(width: int, height: int) -> Iterator[Any]:
-    """Opens an empty page of width x height pixels; without Chromium or playwright the test is skipped."""
+def open_page(width: int, height: int, *, touch: bool = False) -> Iterator[Any]:
+    """Opens an empty page of width x height pixels, of a phone with `touch`; skips without Chromium or playwright."""
     program = os.environ.get("MQE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip("no Chromium here (tools/install.sh chromium installs Debian's)")
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=FLAGS)
-        yield browser.new_page(viewport={"width": width, "height": height})
+        yield browser.new_page(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
         browser.close()

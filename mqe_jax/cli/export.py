@@ -75,7 +75,7 @@ class PlaySite:
         from mqe_jax.export.site import write_site
 
         check_folder(self.output, "output")
-        found = write_site(self.runs, self.output, self.libraries)
+        found = write_site(self.runs, self.output, self.libraries, lambda text: echo(f"mqe: {text}"))
         size = sum(file.stat().st_size for file in self.output.rglob("*") if file.is_file())
         echo(f"mqe: wrote {self.output}, {size / 1e6:.0f} MB: {', '.join(entry.name for entry in found)}")
         if not self.json:

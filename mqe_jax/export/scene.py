@@ -27,7 +27,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
 
     | entry | content |
     |---|---|
-    | `task`, `title`, `robot`, `mujoco` | names; version that wrote the scene |
+    | `task`, `title`, `aim`, `robot`, `mujoco` | names; what a team has to do; version that wrote the scene |
     | `dt`, `substeps`, `max_steps` | environment step, physics steps in it, environment steps until the time limit |
     | `teams`, `commands` | agents of each team; names of the action's commands, in order |
     | `robots` | of each of the R robots, colour and addresses in qpos, qvel and ctrl as in `RobotIndex` |
@@ -41,6 +41,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     return {
         "task": env.name,
         "title": env.title,
+        "aim": env.aim,
         "robot": env.robot.name,
         "mujoco": mujoco.__version__,
         "dt": env.dt,

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,20 +82,25 @@ class Entry:
         write_atomically(own / "scene.json", json.dumps(settings).encode())
 
 
-def write_site(sources: Sequence[str], folder: Path, libraries: Path | None = None) -> list[Entry]:
+def write_site(
+    sources: Sequence[str], folder: Path, libraries: Path | None = None, say: Callable[[str], None] = lambda text: None
+) -> list[Entry]:
     """Writes the page with its tasks and libraries into a folder; returns the tasks.
 
     Args:
         sources: tasks, run folders and policy files; all tasks that have a policy if empty.
         folder: new or existing.
         libraries: folder of the browser libraries' files; fetched with npm if None.
+        say: receives what is done next, in a line.
 
     Raises:
         InputError: for a source that is none of these, a task or policy that cannot be exported, or without libraries.
     """
     found = entries(sources)
+    say("adding the browser libraries")
     add_libraries(folder / "lib", libraries)
-    for entry in found:
+    for number, entry in enumerate(found, 1):
+        say(f"exporting {entry.name}, {number} of {len(found)}")
         entry.write(folder)
     for file in PAGE.iterdir():
         write_atomically(folder / file.name, file.read_bytes())

@@ -4,10 +4,11 @@ import { OrbitControls } from './lib/OrbitControls.js';
 
 const BESIDE = [-0.45, -1, 0.9]; // direction of the camera from its target, with the x axis to the right
 const BEHIND_START = [-1, -0.25, 0.9]; // with the x axis upwards
-const [BACK, ABOVE, AHEAD] = [2.4, 1.3, 0.8]; // m, of the camera from the robot that it follows, and its target
-const SMOOTH = 0.12; // s, time constant of the camera that follows a robot
+const STEEP = 1.2; // m above the robot that it follows per m behind it, so that no robot hides its ball
+const [AHEAD, AROUND] = [2.5, 4]; // m from that robot: in front, and of others, within which the picture has them
+const [SMOOTH, TURN] = [0.12, 0.3]; // s, of the camera that follows a robot
 const [MOVE, RETREAT, APPROACH] = [0.3, 0.2, 1.5]; // s, of the camera that shows the action
-const NEAREST = 2.5; // m, its distance at least
+const NEAREST = 2.5; // m, their distance at least
 const ROBOT = 0.42; // m, radius about a trunk that the picture contains
 const NEAR_GOAL = 3; // m from the goal next to the objects within which points belong to that goal
 const ROOM = 1.07; // factor of the distance at which the points would reach the picture's edges
@@ -50,11 +51,12 @@ export class Camera {
     this.jumps = true;
   }
 
-  /** Fits the picture to the part of the canvas below the bar, of which an opened menu is no part. */
-  resize(width, height, covered) {
-    const bar = Math.min(covered, height / 4);
-    this.lens.aspect = width / (height - bar);
-    this.lens.setViewOffset(width, height - bar, 0, -bar, width, height);
+  /** Fits the picture to the part of the canvas that is not covered by controls; an opened menu is none of them. */
+  resize(width, height, above, below) {
+    const bar = Math.min(above, height / 4);
+    const free = height - bar - Math.min(below, height / 2);
+    this.lens.aspect = width / free;
+    this.lens.setViewOffset(width, free, 0, -bar, width, height);
     if (!/\d/.test(this.view)) this.look(this.view);
   }
 
@@ -62,7 +64,7 @@ export class Camera {
   update(data, seconds) {
     const share = (time) => (this.jumps ? 1 : 1 - Math.exp(-seconds / time));
     if (this.view === '') this.showAction(data, share);
-    else if (this.view !== 'scene') this.chase(data.qpos, share(SMOOTH));
+    else if (this.view !== 'scene') this.chase(data, share);
     else if (this.fresh) this.showScene(data);
     this.fresh = this.jumps = false;
     this.controls.update();
@@ -71,15 +73,14 @@ export class Camera {
   /** Keeps robots, objects and the goal in the picture. */
   showAction({ xpos, site_xpos }, share) {
     const { controls, lens } = this;
-    const objects = this.objects.map(([body, radius]) => [point(xpos, body), radius]);
+    const objects = this.objectSpheres(xpos);
     const goals = nextTo(this.sites.map((site) => point(site_xpos, site)), objects).map((place) => [place, 0]);
     const spheres = [...this.robots.map((body) => [point(xpos, body), ROBOT]), ...objects, ...goals];
     const offset = lens.position.clone().sub(controls.target);
     const direction = this.fresh ? this.direction() : offset.clone().normalize();
     const zoom = this.fresh ? 1 : offset.length() / this.distance; // the reader's
     const [target, needed] = this.fitted(spheres, direction);
-    const change = Math.max(NEAREST, needed) - (this.distance ?? 0);
-    this.distance = (this.distance ?? 0) + change * share(change > 0 ? RETREAT : APPROACH);
+    this.approach(needed, share);
     this.place(controls.target.clone().lerp(target, share(MOVE)), direction, zoom * this.distance);
   }
 
@@ -102,13 +103,29 @@ export class Camera {
     this.place(target, direction, distance);
   }
 
-  /** Stays behind the robot that it follows. */
-  chase(qpos, share) {
+  /** Stays behind and above the robot that it follows, with objects and robots around it in the picture. */
+  chase({ qpos, xpos }, share) {
     const [x, y, z, w, i, j, k] = this.addresses[this.view].map((address) => qpos[address]);
     const yaw = Math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k));
-    const [forward, left] = [Math.cos(yaw), Math.sin(yaw)];
-    this.lens.position.lerp(new three.Vector3(x - BACK * forward, y - BACK * left, z + ABOVE), share);
-    this.controls.target.lerp(new three.Vector3(x + AHEAD * forward, y + AHEAD * left, z), share);
+    const own = new three.Vector3(x, y, z);
+    const forward = new three.Vector3(Math.cos(yaw), Math.sin(yaw), 0);
+    const others = [...this.robots.map((body) => [point(xpos, body), ROBOT]), ...this.objectSpheres(xpos)];
+    const near = others.filter(([place, radius]) => place.distanceTo(own) - radius < AROUND);
+    this.heading = this.jumps ? forward : this.heading.lerp(forward, share(TURN));
+    const direction = new three.Vector3(-this.heading.x, -this.heading.y, STEEP).normalize();
+    const [target, needed] = this.fitted([[own.clone().addScaledVector(forward, AHEAD), 0], ...near], direction);
+    this.approach(needed, share);
+    this.place(this.controls.target.clone().lerp(target, share(SMOOTH)), direction, this.distance);
+  }
+
+  /** Changes the distance smoothly to one that is needed, outwards faster than inwards. */
+  approach(needed, share) {
+    const change = Math.max(NEAREST, needed) - (this.distance ?? 0);
+    this.distance = (this.distance ?? 0) + change * share(change > 0 ? RETREAT : APPROACH);
+  }
+
+  objectSpheres(xpos) {
+    return this.objects.map(([body, radius]) => [point(xpos, body), radius]);
   }
 
   /** The direction from the target to the camera in which the longer side of the track is along that of the picture. */

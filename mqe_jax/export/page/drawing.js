@@ -150,8 +150,8 @@ export class Drawing {
     return geometry.setAttribute('color', new three.BufferAttribute(colors, 3));
   }
 
-  /** Draws the bodies where `data` has them, on a canvas whose upper part is covered by a bar, pixels. */
-  draw(data, seconds, bar) {
+  /** Draws the bodies where `data` has them, on a canvas of which `top` and `bottom` pixels are covered. */
+  draw(data, seconds, top, bottom) {
     const { xpos, xquat } = data;
     this.bodies.forEach((group, body) => {
       group.position.set(xpos[3 * body], xpos[3 * body + 1], xpos[3 * body + 2]);
@@ -159,10 +159,11 @@ export class Drawing {
       group.quaternion.set(x, y, z, w);
     });
     const { clientWidth: width, clientHeight: height } = this.renderer.domElement;
-    if (`${width} ${height} ${bar}` !== this.size) {
-      this.size = `${width} ${height} ${bar}`;
+    const size = `${width} ${height} ${top} ${bottom}`;
+    if (size !== this.size) {
+      this.size = size;
       this.renderer.setSize(width, height, false);
-      this.camera.resize(width, height, bar);
+      this.camera.resize(width, height, top, bottom);
     }
     this.camera.update(data, seconds);
     this.renderer.render(this.scene, this.camera.lens);

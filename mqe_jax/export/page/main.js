@@ -25,6 +25,7 @@ const page = {
   scores: { episodes: 0, success: 0, wins: [0, 0] },
 };
 let site, episode, drawing, controls;
+let shown = ''; // the score that is written
 
 const later = (work) => page.asked.push(work);
 
@@ -76,9 +77,7 @@ async function load(name, chosen) {
   if (page.view !== 'scene' && !(Number(page.view) < robots.length)) page.view = '';
   fill(element('drive'), [['', 'nobody'], ...agents], page.drive);
   fill(element('view'), [['', 'action'], ['scene', 'whole scene'], ...robots], page.view);
-  element('robots').replaceChildren(
-    ...robots.flatMap(([i, text]) => [dot(Number(i)), make('small', { textContent: `${text.slice(6)} ` })]),
-  );
+  element('aim').textContent = settings.aim;
   element('teams').replaceChildren(...settings.teams.map((_, team) => teamChoice(team)));
   setDrive(page.drive);
   setView(page.view);
@@ -130,8 +129,26 @@ function setDrive(robot) {
   element('drive').value = robot;
   episode.driven.fill(0);
   if (robot !== '') episode.driven[Number(robot)] = 1;
-  const touch = matchMedia('(pointer: coarse), (max-width: 719px)').matches;
-  for (const id of ['walk', 'turn']) element(id).hidden = robot === '' || !touch;
+  const touch = matchMedia('(pointer: coarse)').matches;
+  for (const id of ['walk', 'turn']) element(id).hidden = !touch;
+  const one = robotToDrive();
+  element('take').replaceChildren(...(robot === '' ? ['Drive ', dot(Number(one)), `robot ${Number(one) + 1}`] : ['Stop driving']));
+  element('free').hidden = robot !== '' || touch;
+  element('driving').hidden = robot === '' || touch;
+  element('guide').hidden = false;
+  shown = '';
+}
+
+/** The robot that the camera follows, if the reader can drive it, else the first. */
+const robotToDrive = () => (/\d/.test(page.view) && Number(page.view) < episode.driven.length ? page.view : '0');
+
+/** Lets the reader drive the robot of the button from the start of an episode, or gives the robot back. */
+function driveOrStop() {
+  const robot = page.drive === '' ? robotToDrive() : '';
+  setDrive(robot);
+  setView(robot);
+  if (robot !== '') later(start);
+  remember();
 }
 
 function setView(view) {
@@ -143,8 +160,7 @@ function setView(view) {
 /** The first key or touch that drives takes over the first robot, or the one that the camera follows. */
 function takeOver() {
   if (page.drive !== '' || !episode) return;
-  const followed = /\d/.test(page.view) && Number(page.view) < episode.driven.length;
-  const robot = followed ? page.view : '0';
+  const robot = robotToDrive();
   setDrive(robot);
   setView(robot);
   remember();
@@ -161,8 +177,8 @@ function finish() {
     const winner = settings.teams.findIndex((_, team) => outcome[`team${team}/win`] > 0.5);
     if (winner >= 0) scores.wins[winner] += 1;
     const [marks, name] = winner < 0 ? [[], ''] : [settings.teams[winner].map(dot), `Team ${winner + 1} wins`];
-    const own = winner >= 0 && page.drive !== '' && settings.teams[winner].includes(Number(page.drive));
-    said.replaceChildren(...marks, (own ? 'You win' : name || 'Draw') + reason);
+    const own = winner >= 0 && page.drive !== '' && (isOwn(settings.teams[winner]) ? 'You win' : 'You lose');
+    said.replaceChildren(...marks, (own || name || 'Draw') + reason);
   } else {
     const { success } = outcome;
     scores.success += success;
@@ -173,20 +189,31 @@ function finish() {
   page.wait = PAUSE_AFTER;
 }
 
-/** Writes clock and score. */
+const isOwn = (team) => page.drive !== '' && team.includes(Number(page.drive));
+
+/** Writes the clock, and who is who with the score. */
 function show() {
   const { settings, steps, outcome } = episode;
   const limit = settings.max_steps * settings.dt;
   element('clock').textContent = `${(steps * settings.dt).toFixed(1)} / ${limit.toFixed(0)} s`;
   const { episodes, success, wins } = page.scores;
-  if (isMatch()) {
-    const marks = settings.teams.map((team) => dot(team[0]));
-    element('score').replaceChildren(marks[0], `${wins[0]} : ${wins[1]} `, marks[1]);
-  } else {
-    const percent = (share) => `${Math.round(100 * share)}%`;
-    const mean = episodes ? `, mean of ${episodes}: ${percent(success / episodes)}` : '';
-    element('score').textContent = `success ${percent(outcome.success)}${mean}`;
-  }
+  const percent = (share) => `${Math.round(100 * share)}%`;
+  const mean = episodes ? `, mean of ${episodes}: ${percent(success / episodes)}` : '';
+  const score = isMatch() ? `${wins[0]} : ${wins[1]}` : `success ${percent(outcome.success)}${mean}`;
+  if (score === shown) return;
+  shown = score;
+  const named = (robots, name) => {
+    const label = make('span', { className: 'who' });
+    label.append(...robots.map(dot), isOwn(robots) ? `${name} (you)` : name);
+    return label;
+  };
+  const { teams, robots } = settings;
+  const agents = teams.flat();
+  const scripted = robots.map((_, i) => i).slice(agents.length);
+  const sides = isMatch()
+    ? teams.map((team, i) => named(team, `team ${i + 1}`))
+    : [...agents.map((i) => named([i], `robot ${i + 1}`)), ...scripted.map((i) => named([i], 'scripted'))];
+  element('score').replaceChildren(...(isMatch() ? [sides[0], score, sides[1]] : [...sides, score]));
 }
 
 /** Draws with the detail that the page asks for; `low` replaces the canvas, since a context keeps its settings. */
@@ -239,6 +266,13 @@ async function simulate(passed) {
   return steps;
 }
 
+/** Heights of the upper and the lower part of the canvas that controls cover, pixels. */
+function covered() {
+  const controls = ['guide', 'walk'].map(element).filter(({ hidden }) => !hidden);
+  const top = Math.min(innerHeight, ...controls.map((item) => item.offsetTop));
+  return [element('bar').offsetHeight, innerHeight - top];
+}
+
 function play() {
   const meter = new Meter();
   let [last, drawn] = [performance.now(), 0];
@@ -255,7 +289,7 @@ function play() {
     }
     const behind = page.due >= episode.settings.dt && episode.result === null;
     if (!behind || now - drawn > LONGEST_SKIP) {
-      drawing.draw(episode.physics.data, (now - drawn) / 1000, element('bar').offsetHeight);
+      drawing.draw(episode.physics.data, (now - drawn) / 1000, ...covered());
       show();
       drawn = now;
       meter.frames += 1;
@@ -278,6 +312,8 @@ function setSpeed(speed) {
 }
 
 function listen() {
+  for (const button of document.querySelectorAll('button')) button.addEventListener('click', () => button.blur()); // keys drive
+  element('take').addEventListener('click', driveOrStop);
   element('pause').addEventListener('click', pause);
   element('restart').addEventListener('click', () => later(start));
   element('next').addEventListener('click', () => later(advance));
