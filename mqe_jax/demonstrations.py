@@ -15,10 +15,10 @@ from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, autoreset
 from mqe_jax.precision import single
-from mqe_jax.settings import fail
+from mqe_jax.settings import checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import PyTree, where_rows
+from mqe_jax.train.types import AnyPolicy, PyTree, where_rows
 
 EPISODES = 128
 """Environments in which the demonstrator acts."""
@@ -47,11 +47,15 @@ class Demonstrated(VectorEnv):
     demonstrator. The states are the same in all runs of a task.
     """
 
+    @checked(demonstrator=AnyPolicy, backward=bool)
     def __init__(
         self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1, *, backward: bool = False
     ) -> None:
         """Creates the batch; `demonstrator` acts for all agents, `num_envs` and `copies` are those of `VectorEnv`."""
         super().__init__(env, num_envs, copies)
+        if (demonstrator.task, demonstrator.agents) != (env.name, env.num_agents):
+            given = f"one of {demonstrator.agents} agents on {demonstrator.task}"
+            fail("demonstrator", given, f"one of all {env.num_agents} agents on {env.name}")
         if self.max_episode_steps < MOMENTS:
             fail("episode_length", env.params.episode_length, f"at least {MOMENTS} steps with a demonstrator")
         self.demonstrator, self.backward = demonstrator, backward
@@ -67,8 +71,8 @@ class Demonstrated(VectorEnv):
     @single
     def step(self, state: State, action: jax.Array) -> DemonstratedState:
         """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
-        self.check_action(action)
-        assert isinstance(state, DemonstratedState), "a state of this batch"
+        self.check_step(state, action, DemonstratedState)
+        assert isinstance(state, DemonstratedState)
         demonstrations = state.demonstrations
         fields = {name: x for name, x in demonstrations.items() if name != "phase"}
 

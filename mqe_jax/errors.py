@@ -36,12 +36,12 @@ def one_line(error: BaseException) -> str:
 
 
 def shown(value: object) -> str:
-    """Returns a value as it is shown in a message: its `repr`, shortened."""
+    """Returns a value as it is shown in a message: its `repr`, shortened, on one line."""
     try:
         text = _REPR.repr(value)
     except Exception:  # a `repr` of whoever made the value, or an integer of thousands of digits
         text = f"<{type(value).__name__}>"
-    return brief(text)
+    return brief(" ".join(text.split()))
 
 
 def brief(text: str) -> str:

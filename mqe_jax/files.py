@@ -92,10 +92,10 @@ def _without_links(path: str, flags: int) -> int:
 
 
 def make_folder(path: Path) -> None:
-    """Creates a folder and those around it, where there is none; an OSError names it."""
+    """Creates a folder, where there is none, in one that exists; an OSError names it."""
     check_locks(path)
     with naming(path):
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(exist_ok=True)
 
 
 def check_locks(path: Path) -> None:

@@ -14,13 +14,13 @@ from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.errors import InputError
-from mqe_jax.limits import Number
-from mqe_jax.policies import load_as
+from mqe_jax.limits import NonNegativeInt, Number
+from mqe_jax.policies import check_policy, load_as
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
-from mqe_jax.train.types import AnyBatch, Memory, PyTree, where_rows
+from mqe_jax.train.types import AnyBatch, AnyPolicy, Memory, PyTree, RandomKey, where_rows
 
 OUTCOMES = ("win", "draw", "loss")
 """Outcomes of an episode for team 0, in the order of `Opponent.outcomes`."""
@@ -85,13 +85,12 @@ class Versus(OneTeam):
     opponents: tuple[Policy, ...]
     """Opponent of each block at the start."""
 
+    @checked(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
         super().__init__(matches, matches.num_envs)
         self.draw_reward = draw_reward
         for policy in opponents:
-            if (policy.agents, policy.task) != (self.num_agents, self.name):
-                given = f"a policy of {policy.agents} agents on {policy.task}"
-                raise InputError(f"opponents: {given}; {self.name} needs one of {self.num_agents}")
+            check_policy(policy, matches, "an opponent")
         self.opponents = tuple(opponents)
         self._check_blocks(self.num_envs)
 
@@ -108,6 +107,7 @@ class Versus(OneTeam):
             fail("opponents", len(self.opponents), f"a divisor of the environments of a process, {num_envs}")
 
     @single
+    @checked(key=RandomKey)
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
         key, match_key = jax.random.split(key)
@@ -123,12 +123,14 @@ class Versus(OneTeam):
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
-        self.check_action(action)
+        self.check_step(state, action, TeamState)
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
         others, opponents = [], []
         for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
             obs = state.match.obs[self._block(i), self.num_agents :]
             other, memory = _act(policy, opponent, obs, keys[i])
+            if jnp.shape(other) != (shape := (self._size, self.num_agents, self.action_size)):
+                fail("opponents", f"one that returns actions {jnp.shape(other)}", f"one that returns {shape}")
             others.append(jnp.asarray(other, jnp.float32))
             opponents.append(dataclasses.replace(opponent, memory=memory))
         theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
@@ -140,6 +142,7 @@ class Versus(OneTeam):
         started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
         return self._seen(match, both, started, key)
 
+    @checked(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
         """Returns the state with another opponent in a block.
 
@@ -156,6 +159,8 @@ class Versus(OneTeam):
         Raises:
             InputError: for a block whose opponent is not a trained policy, or a policy of another architecture.
         """
+        if not block < len(self.opponents) == len(state.opponents):
+            fail("block", block, f"one of the {len(self.opponents)} blocks of this batch and the state")
         first, opponent = self.opponents[block], state.opponents[block]
         if not isinstance(first, TrainedPolicy):
             raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
@@ -204,7 +209,12 @@ class Versus(OneTeam):
 
 
 @checked(env=AnyBatch, draw_reward=Number)
-def versus(env: VectorEnv | Wrapper, opponents: Sequence[Policy | str | Path], *, draw_reward: float = 0.0) -> Versus:
+def versus(
+    env: VectorEnv | Wrapper,
+    opponents: Policy | str | Path | Sequence[Policy | str | Path],
+    *,
+    draw_reward: float = 0.0,
+) -> Versus:
     """Returns matches as environments of team 0 alone, against opponents that control team 1.
 
     The environments meet the opponents in turn, equally many each. Trained policies act as they are loaded (sampled,
@@ -212,15 +222,18 @@ def versus(env: VectorEnv | Wrapper, opponents: Sequence[Policy | str | Path], *
 
     Args:
         env: the matches.
-        opponents: policies, or what `load_policy` accepts; their number divides the number of environments.
+        opponents: policies, or what `load_policy` accepts; their number divides the number of environments. A single
+            one may be given without a list.
         draw_reward: added to the reward of a step that ends an episode with a draw.
 
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
     """
-    if isinstance(opponents, str) or not isinstance(opponents, Sequence):
-        fail("opponents", opponents, "a list of policies")
-    return Versus(env, [load_as("opponents", each, env.env) for each in opponents], draw_reward)
+    single = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
+    given: Any = [opponents] if single else opponents
+    if not isinstance(given, Sequence):
+        fail("opponents", given, "a policy, or a list of policies")
+    return Versus(env, [load_as("opponents", each, env.env) for each in given], draw_reward)
 
 
 class Mirror(OneTeam):
@@ -243,7 +256,7 @@ class Mirror(OneTeam):
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
-        self.check_action(action)
+        self.check_step(state, action, TeamState)
         both = action.reshape(self.inner.num_envs, 2 * self.num_agents, self.action_size)
         return self._seen(self._stepped(state, both), both)
 

@@ -20,7 +20,7 @@ from mqe_jax.precision import single
 from mqe_jax.settings import PathText, check, checked
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
-from mqe_jax.train.types import AnyEnvironment, Memory, PolicyOrAct
+from mqe_jax.train.types import AnyEnvironment, AnyPolicy, Memory, PolicyOrAct
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -87,7 +87,7 @@ class BothTeams:
 def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
 @overload
 def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy: ...
-@checked(source=PathText, env=AnyEnvironment | None)
+@checked(source=PathText, env=AnyEnvironment | None, deterministic=bool)
 def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False) -> Policy:
     """Returns the policy of a name, a run folder or a policy file.
 
@@ -105,6 +105,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
         InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
             scripted policy.
     """
+    env = getattr(env, "env", env)  # of a batch
     further = () if env is None else tuple(NAMED_PLANNERS.get(env.name, ()))
     if str(source) in (*NAMES, *further):
         if env is None:
@@ -149,14 +150,27 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
     return policy
 
 
-def check_policy(policy: TrainedPolicy, env: QuadrupedEnv, name: str = "policy") -> None:
-    """Checks that a trained policy is of this task, with its sizes, which depend on the task's parameters.
+def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
+    """Checks that a policy is of one team of this task; a trained one, that its robot and its sizes are the task's.
+
+    `env` is the task, or a batch of it.
 
     Raises:
-        InputError: naming both tasks, or both sizes.
+        InputError: naming both tasks, numbers of agents, robots, or sizes.
     """
+    check("policy", policy, AnyPolicy)
     if policy.task != env.name:
         raise InputError(f"policy: {name} was trained on {policy.task or 'no named task'}, not on {env.name}")
+    if policy.agents != len(env.teams[0]):
+        raise InputError(
+            f"policy: {name} acts for {policy.agents} agents; a team of {env.name} has {len(env.teams[0])}"
+        )
+    if not isinstance(policy, TrainedPolicy):
+        return
+    robot = policy.config.training_env.get("robot", TaskParams.robot)
+    ours = getattr(getattr(getattr(env, "env", env), "params", None), "robot", robot)
+    if ours != robot:
+        raise InputError(f"policy: {name} was trained with the robot {robot!r}; {env.name} has {ours!r} here")
     sizes = (len(env.teams[0]), env.observation_size, env.action_size)
     trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
     if sizes != trained:

@@ -141,8 +141,9 @@ def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
         @functools.wraps(function)
         def call(*given: P.args, **named: P.kwargs) -> R:
             bound = signature.bind(*given, **named)
-            for name in kinds.keys() & bound.arguments.keys():
-                bound.arguments[name] = check(name, bound.arguments[name], kinds[name])
+            for name, kind in kinds.items():
+                if name in bound.arguments:
+                    bound.arguments[name] = check(name, bound.arguments[name], kind)
             return function(*bound.args, **bound.kwargs)
 
         return call
@@ -152,7 +153,7 @@ def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 def check(name: str, value: Any, kind: Any) -> Any:
     """Returns a value as a type has it; raises the InputError of `fail` where it is none of the type."""
-    if is_record(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
     try:
         return _adapter(kind).validate_python(value)
@@ -184,6 +185,8 @@ def build(kind: type[T], values: Mapping[str, Any]) -> T:
     Raises:
         InputError: for a value that is not allowed or an unknown name, with the nearest known one.
     """
+    if not (isinstance(kind, type) and is_record(kind)):
+        fail("kind", kind, "a class of settings, such as TrainConfig")
     return kind(**_nested(kind, values))
 
 
@@ -196,6 +199,8 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
     Raises:
         InputError: as `build`.
     """
+    if not is_record(settings):
+        fail("settings", settings, "a record, such as TrainConfig()")
     return type(settings)(**_merged(settings, _nested(type(settings), changes)))
 
 

@@ -156,7 +156,7 @@ def test_render_returns_images() -> None:
     ("settings", "told"),
     [
         ({"autoreset_mode": "later"}, "autoreset_mode: 'later'; allowed: NextStep, SameStep, Disabled"),
-        ({"render_mode": "human"}, "render_mode: 'human'; allowed: None, rgb_array"),
+        ({"render_mode": "human"}, "render_mode: 'human' is not allowed; it must be 'rgb_array'"),
         ({"num_envs": 0}, "num_envs: 0 is not allowed; .* greater than 0"),
         ({"num_envs": 1.5}, r"num_envs: 1\.5 is not allowed; .* a valid integer"),
         ({"max_episode_steps": 0}, "max_episode_steps: 0 is not allowed; .* greater than 0"),
@@ -183,7 +183,7 @@ def test_bad_calls_are_named() -> None:
     for seed in ([1, 2], 1.5, "abc"):
         with pytest.raises(InputError, match=r"seed: .*3 integers"):
             vector.reset(seed=seed)
-    with pytest.raises(InputError, match=r"allowed: 0 to 2\^32 - 1"):
+    with pytest.raises(InputError, match=r"seed: 4294967296 is not allowed"):
         vector.reset(seed=2**32)
     with pytest.raises(InputError, match="reset_mask"):
         vector.reset(options={"reset_mask": np.zeros(COUNT, bool)})
@@ -287,7 +287,7 @@ def test_bad_opponents_are_named() -> None:
         task_env("go1gate", opponent="idle", impl="c", control="position")
     with pytest.raises(InputError, match="opponent: unknown 'scriptd'"):
         task_env(env, opponent="scriptd")
-    with pytest.raises(InputError, match="opponent: a policy of 1 agents on go1tug; go1wrestling needs one of 1"):
+    with pytest.raises(InputError, match=r"opponent: .* was trained on go1tug, not on go1wrestling"):
         task_env(env, opponent=counting("go1tug"))
     team = TeamEnv(env, "idle")
     with pytest.raises(InputError, match=r"action: shape \(2, 12\); expected \(1, 12\)"):

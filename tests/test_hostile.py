@@ -18,20 +18,25 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import mqe_jax
-from mqe_jax import limits, memory, robots
+from mqe_jax import limits, load_policy, memory, robots
 from mqe_jax.adapters import gymnasium
+from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.arguments import parse
 from mqe_jax.cli.options import parse_overrides
-from mqe_jax.envs import VectorEnv, make
-from mqe_jax.envs.replay import load_recording
+from mqe_jax.demonstrations import Demonstrated
+from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs.replay import load_recording, replay
 from mqe_jax.errors import InputError
+from mqe_jax.export.scene import scene_xml
+from mqe_jax.league import tournament
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.settings import build, check, load_yaml, override
+from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.policy import read_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train
 from mqe_jax.view import messages
 from mqe_jax.view.messages import RefusedError, UnparsableError
@@ -49,10 +54,13 @@ def made() -> dict[str, Any]:
     task, match, fake = make("go1gate", control="position"), make("go1tug", control="position"), fake_env.FakeEnv()
     poses = (np.zeros((3, fake.mj_model.nq)), np.zeros((3, 2, 3)), np.zeros((3, 2, 4)))
     config = override(TrainConfig(), {"num_envs": 2, "total_steps": 16, "rollout_steps": 8})
-    state = jax.eval_shape(task.reset, KEY)
+    state, matches = jax.eval_shape(task.reset, KEY), VectorEnv(match, 2)
+    team = versus(matches, "idle")
     return {
         "task": task, "state": state, "match": match, "fake": fake, "batch": fake_env.FakeVectorEnv(fake, 2),
-        "config": config, "matches": VectorEnv(match, 2), "episode": recording.Episode(*poses, dt=0.02),
+        "config": config, "matches": matches, "team": team, "states": jax.eval_shape(matches.reset, KEY),
+        "other": jax.eval_shape(match.reset, KEY), "teams": jax.eval_shape(team.reset, KEY),
+        "episode": recording.Episode(*poses, dt=0.02),
         "gif": Path("a.gif"), "long": recording.Episode(*(np.zeros((99, *pose.shape[1:])) for pose in poses), dt=0.02),
         "act": lambda obs, memory, key: (jnp.zeros((*obs.shape[:2], 3)), memory),
     }  # fmt: skip
@@ -84,7 +92,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], v), (0, NAN, 1.5, 10**9, "x")),
     ("copies: ", lambda x, v: VectorEnv(x["task"], 2, v), (0, NAN, -1)),
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], 2**17, 2), (None,)),
-    ("env: ", lambda x, v: VectorEnv(v, 2), ("go1gate", None)),
+    ("env: ", lambda x, v: VectorEnv(v, 2), ("go1gate", None, QuadrupedEnv)),
     ("key: ", lambda x, v: x["matches"].reset(v), (3, "x", None, np.zeros(2))),
     ("key: ", lambda x, v: x["task"].reset(v), (3, "x", None, np.zeros(3, np.uint32))),
     ("policy: ", lambda x, v: _evaluate(x, act=lambda obs, memory, key: v), (None, np.zeros((2, 2, 3)), (1, 2, 3))),
@@ -100,7 +108,31 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("source: ", lambda x, v: mqe_jax.load_policy(v), (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)),
     ("env: ", lambda x, v: mqe_jax.load_policy("scripted", v), ("go1gate",)),
     ("not a regular file", lambda x, v: mqe_jax.load_policy("/dev/zero"), (None,)),
-    ("opponents: ", lambda x, v: versus(x["matches"], v), ([], "idle", 3, [3], None)),
+    ("opponents", lambda x, v: versus(x["matches"], v), ([], 3, [3], None, [dict], ["idle", fake_env])),
+    ("opponents", lambda x, v: versus(x["matches"], v), ({"idle"},)),
+    ("key: ", lambda x, v: x["team"].reset(v), (3, None)),
+    ("state: ", lambda x, v: x["team"].step(x.get(v, v), np.zeros((2, 1, 12))), (None, 3, "state", "states")),
+    ("state: ", lambda x, v: x["team"].change(x.get(v, v), 0, v), (None, 3, "state", "states")),
+    ("block: ", lambda x, v: x["team"].change(x["teams"], v, None), (None, -1, "x", 1.5)),
+    ("policy: ", lambda x, v: x["team"].change(x["teams"], 0, v), (None, 3, TrainedPolicy)),
+    ("state: ", lambda x, v: x["task"].step(x.get(v, v), np.zeros((2, 12), np.float32)), (None, 3, "states", "other")),
+    ("state: ", lambda x, v: x["matches"].step(x.get(v, v), np.zeros((2, 2, 12))), (None, 3, "state", "other")),
+    ("assistance: ", lambda x, v: x["task"].reset(KEY, v), (None, "x", [], 2, -0.5, NAN, np.zeros(2))),
+    ("policy: ", lambda x, v: load_policy("go1tug", make("go1tug", impl="c", num_envs=1, robot=v)), ("go2",)),
+    ("deterministic: ", lambda x, v: load_policy("idle", x["match"], deterministic=v), (None, 3, "x")),
+    ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
+    ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
+    ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
+    ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones((2, 2)), np.full((2, 2, 3), NAN))),
+    ("match: ", lambda x, v: TeamEnv(x.get(v, v), "idle"), (None, 3, "matches")),
+    ("state: ", lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))), (None, "state")),
+    ("env: ", lambda x, v: recording.record(x.get(v, v), x["act"], KEY), (None, 3, "matches")),
+    ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
+    ("recording: ", lambda x, v: replay(v), (None, 3, "a.npz")),
+    ("env: ", lambda x, v: scene_xml(x.get(v, v)), (None, "go1gate", "matches")),
+    ("demonstrator: ", lambda x, v: Demonstrated(x["task"], 2, v), (None, 3, TrainedPolicy)),
+    ("robot: ", lambda x, v: robots.register(v), (None, "go1")),
+    ("path: ", lambda x, v: read_curve(v), (None, 3, "", "a\0b")),
     ("draw_reward: ", lambda x, v: versus(x["matches"], ["idle"], draw_reward=v), (NAN, "x", 1e300)),
     ("env: ", lambda x, v: versus(v, ["idle"]), (None, "go1tug")),
     ("env: ", lambda x, v: Mirror(v), (None, 3)),

@@ -23,7 +23,9 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
+from mqe_jax.limits import PositiveInt
 from mqe_jax.precision import single
+from mqe_jax.settings import check, checked
 
 try:
     with quietly():
@@ -77,7 +79,8 @@ class Env(BraxEnv):
     @single
     def step(self, state: State, action: jax.Array) -> State:
         """Advances by one environment step; raises an InputError for an action of another size."""
-        if jnp.size(action) != self.action_size:
+        check("state", state, State)
+        if jnp.shape(action) != (self.action_size,):
             raise InputError(
                 f"action: shape {jnp.shape(action)}; expected {(self.action_size,)} (agents * action size)"
             )
@@ -138,6 +141,7 @@ class AutoReset(Wrapper):
         return after.replace(pipeline_state=own, obs=obs)  # pyright: ignore[reportAttributeAccessIssue]
 
 
+@checked(episode_length=PositiveInt, action_repeat=PositiveInt)
 def wrap(
     env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable[..., Any] | None = None
 ) -> Wrapper:
@@ -146,8 +150,8 @@ def wrap(
     Raises:
         InputError: for a `randomization_fn`; use the task parameter `randomization` instead.
     """
-    if not isinstance(env.unwrapped, Env):
-        raise InputError(f"env: {type(env.unwrapped).__name__} is not a mqe_jax.adapters.brax.Env")
+    if not isinstance(getattr(env, "unwrapped", env), Env):
+        raise InputError(f"env: {type(getattr(env, 'unwrapped', env)).__name__} is not a mqe_jax.adapters.brax.Env")
     if randomization_fn is not None:
         raise InputError("randomization_fn: not supported; pass randomization=... to the Env instead")
     return AutoReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))

@@ -23,8 +23,8 @@ from mqe_jax.adapters import task_env, team_reward
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
-from mqe_jax.limits import Environments
-from mqe_jax.settings import check, fail
+from mqe_jax.limits import Environments, Seed
+from mqe_jax.settings import check, checked, fail
 
 
 def register() -> None:
@@ -66,6 +66,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = self.env.observation_space
         self._host = HostEnvs(self.env, 1, render_mode, render_size)
 
+    @checked(seed=Seed | None, options=Mapping | None)
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -131,6 +132,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._host = HostEnvs(self.env, num_envs, render_mode, render_size)
         self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
 
+    @checked(options=Mapping | None)
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -140,7 +142,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seed: of environment 0 (environment i: seed + i), or one per environment; None continues the PRNG stream.
             options: `reset_mask` (N,) bool selects the environments to reset.
         """
-        super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
+        super().reset(seed=check("seed", seed, Seed) if isinstance(seed, int | np.integer) else None)
         mask = _reset_mask(options, self.num_envs)
         seeds: list[int | None]
         if isinstance(seed, int | np.integer):

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike
 
 from mqe_jax.adapters import select
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.envs import State
 from mqe_jax.errors import InputError
-from mqe_jax.limits import Environments, Pixels
-from mqe_jax.settings import check
+from mqe_jax.limits import Environments, Pixels, Seed
+from mqe_jax.settings import check, fail
 from mqe_jax.viz.cameras import default_camera
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.geometry import rendering_model
@@ -69,8 +71,7 @@ class HostEnvs:
     ) -> None:
         num_envs = check("num_envs", num_envs, Environments)
         width, height = check("render_size", render_size, tuple[Pixels, Pixels])
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise InputError(f"render_mode: {render_mode!r}; allowed: None, {', '.join(RENDER_MODES)}")
+        check("render_mode", render_mode, Literal["rgb_array"] | None)
         self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.state: State | None = None
@@ -78,11 +79,8 @@ class HostEnvs:
         self._camera: Camera | None = None
         self._task = match = self.env.match if isinstance(self.env, TeamEnv) else self.env
         opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
-        key = (type(match), match.params, match.impl, match.control, match.physics.num_envs, opponent)
-        try:
-            self._begin, self._step = _compile(_Kind(key, self.env))
-        except TypeError:  # parameters that cannot be hashed
-            self._begin, self._step = _compile.__wrapped__(_Kind(key, self.env))
+        key = (type(match), repr(match.params), match.impl, match.control, match.physics.num_envs, opponent)
+        self._begin, self._step = _compile(_Kind(key, self.env))
 
     def reset(
         self, seeds: Sequence[int | None], generator: np.random.Generator, mask: np.ndarray | None = None
@@ -95,14 +93,12 @@ class HostEnvs:
         if self.state is None:
             seeds = [int(generator.integers(2**31)) if seed is None else seed for seed in seeds]
         seeded = np.array([seed is not None for seed in seeds])
-        numbers = np.array([seed or 0 for seed in seeds])
-        if numbers.min() < 0 or numbers.max() >= 2**32:
-            raise InputError(f"seed: {seeds}; allowed: 0 to 2^32 - 1")
+        numbers = np.array([check("seed", 0 if seed is None else seed, Seed) for seed in seeds])
         chosen = np.ones(self.num_envs, bool) if mask is None or self.state is None else mask
         self.state = self._begin(numbers.astype(np.uint32), seeded, chosen, self.state)
         return np.array(self.state.obs)
 
-    def step(self, action: np.ndarray, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
+    def step(self, action: ArrayLike, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
         """Steps all environments with actions (N, A, action_size) in [-1, 1], clipped to it.
 
         An environment is reset in the call that ends its episode (SAME_STEP), in the next call, which ignores its
@@ -112,7 +108,12 @@ class HostEnvs:
         if self.state is None:
             raise InputError("step: reset the environment first")
         shape = (self.num_envs, self.env.num_agents, self.env.action_size)
-        action = np.asarray(action, np.float32)
+        try:
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("error")  # complex numbers
+                action = np.asarray(action, np.float32)
+        except (TypeError, ValueError, np.exceptions.ComplexWarning):
+            fail("action", action, "an array of numbers")
         if action.shape != shape:
             raise InputError(f"action: shape {action.shape}; expected {shape} (environments, agents, action size)")
         if not np.isfinite(action).all():

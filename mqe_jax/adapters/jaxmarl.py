@@ -21,6 +21,8 @@ from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.errors import InputError
 from mqe_jax.precision import single
+from mqe_jax.settings import checked
+from mqe_jax.train.types import RandomKey
 
 try:
     with quietly():
@@ -64,6 +66,7 @@ class Env(MultiAgentEnv):
     action_table: np.ndarray | None
     """The action of each integer (1 + 2 action_size, action_size); None without discrete actions."""
 
+    @checked(discrete=bool)
     def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
         """Creates the environment of a task's id, or adapts a given one; `overrides` are those of `task_env`.
 
@@ -117,6 +120,7 @@ class Env(MultiAgentEnv):
         return self.get_obs(after), after, rewards, dones, infos
 
     @single
+    @checked(key=RandomKey, state=State, actions=Mapping)
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:

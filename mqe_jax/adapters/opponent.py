@@ -15,10 +15,11 @@ import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
-from mqe_jax.policies import SimplePolicy, load_as
+from mqe_jax.policies import SimplePolicy, check_policy, load_as
 from mqe_jax.precision import single
+from mqe_jax.settings import check, checked
 from mqe_jax.train.policy import Policy, TrainedPolicy
-from mqe_jax.train.types import Memory
+from mqe_jax.train.types import AnySingle, Memory
 
 
 @jax.tree_util.register_dataclass
@@ -45,6 +46,7 @@ class TeamEnv:
     num_agents: int
     """Number of agents of a team T."""
 
+    @checked(match=AnySingle)
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
         """Creates the environment; `opponent` is what `mqe_jax.load_policy` accepts, or a policy.
 
@@ -56,11 +58,10 @@ class TeamEnv:
         self.match = match
         self.opponent = load_as("opponent", opponent, match) if isinstance(opponent, str | Path) else opponent
         self.num_agents = len(match.teams[0])
-        if (self.opponent.task, self.opponent.agents) != (match.name, self.num_agents):
-            raise InputError(
-                f"opponent: a policy of {self.opponent.agents} agents on {self.opponent.task}; {match.name} needs one "
-                f"of {self.num_agents}"
-            )
+        try:
+            check_policy(self.opponent, match, "the opponent")
+        except InputError as error:
+            raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
         self._source = str(opponent) if isinstance(opponent, str | Path) else None
 
     def __repr__(self) -> str:
@@ -119,6 +120,7 @@ class TeamEnv:
 
         InputError for actions of another shape, and as `QuadrupedEnv.step`.
         """
+        check("state", state, TeamState)
         shape = (self.num_agents, self.match.action_size)
         if jnp.shape(action) != shape:
             raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)")

@@ -7,7 +7,7 @@ registers every task as `mqe/TASK-v0`, for `pettingzoo.make("parallel", id)` and
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,7 @@ from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
+from mqe_jax.settings import check
 
 try:
     import pettingzoo
@@ -97,11 +98,11 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Box:
         """Returns the space of an agent's observation (O,)."""
-        return self._observation_spaces[agent]
+        return self._observation_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
     def action_space(self, agent: str) -> gymnasium.spaces.Box:
         """Returns the space of an agent's action (action_size,), in [-1, 1]."""
-        return self._action_spaces[agent]
+        return self._action_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -119,9 +120,9 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
-        if set(actions) != set(self.agents):
-            raise InputError(f"actions: for {sorted(actions)}; expected one for each of {', '.join(self.agents)}")
-        out = self._host.step(np.stack([np.asarray(actions[agent], np.float32) for agent in self.agents])[None])
+        if set(check("actions", actions, Mapping)) != set(self.agents):
+            raise InputError(f"actions: for {list(actions)}; expected one for each of {', '.join(self.agents)}")
+        out = self._host.step([[actions[agent] for agent in self.agents]])
         terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.metrics.items()}
         agents = self.agents

@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -71,8 +71,15 @@ class Batch:
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
 
-    def check_action(self, action: jax.Array) -> None:
-        """Raises an InputError for actions of another shape than (N, A, action_size)."""
+    def check_step(self, state: Any, action: jax.Array, kind: type) -> None:
+        """Raises an InputError for anything but states of a kind of N environments, and actions (N, A, action_size)."""
+        steps = jnp.shape(state.step) if isinstance(state, kind) else ()
+        if steps != (self.num_envs,):
+            found = f"{type(state).__name__} {steps}".removesuffix(" ()")
+            raise InputError(
+                f"state: {found} is not allowed; it must be the {kind.__name__} of {self.num_envs} environments that "
+                f"`reset` of this {type(self).__name__} returns"
+            )
         shape = (self.num_envs, self.num_agents, self.action_size)
         if jnp.shape(action) != shape:
             raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
@@ -86,7 +93,7 @@ class VectorEnv(Batch):
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
         """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
-        if not hasattr(env, "with_num_envs"):  # of tasks and of `walk.env.WalkEnv`
+        if isinstance(env, type) or not hasattr(env, "with_num_envs"):  # of tasks and of `walk.env.WalkEnv`
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
         num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
@@ -120,7 +127,7 @@ class VectorEnv(Batch):
         Raises:
             InputError: as `QuadrupedEnv.step`, and for another number of environments.
         """
-        self.check_action(action)
+        self.check_step(state, action, State)
 
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action))

@@ -36,7 +36,7 @@ from mqe_jax.robots.index import RobotState, placed, read_robots
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
 from mqe_jax.settings import check, checked, differences, fail
-from mqe_jax.train.types import RandomKey
+from mqe_jax.train.types import Level, RandomKey
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -193,7 +193,7 @@ class QuadrupedEnv(Task[S, P]):
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
     @single
-    @checked(key=RandomKey)
+    @checked(key=RandomKey, assistance=Level)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns a randomised initial state; runs no forward pass of the physics.
 
@@ -248,9 +248,11 @@ class QuadrupedEnv(Task[S, P]):
             action: (A, action_size), floating point, in [-1, 1] (clipped to it).
 
         Raises:
-            InputError: if the action has another shape or dtype, or is not finite. Finiteness is checked only
-                outside of compiled code; inside, an action that is not finite ends the episode as diverged.
+            InputError: for a state of another task or of a batch, or if the action has another shape or dtype, or is
+                not finite. Finiteness is checked only outside of compiled code; inside, an action that is not finite
+                ends the episode as diverged.
         """
+        self._check_state(state)
         action = self._checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
@@ -343,6 +345,21 @@ class QuadrupedEnv(Task[S, P]):
         steps = assistance * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
         agent = jax.random.randint(agent_key, (), 0, self.num_agents)
         return jnp.where(jnp.arange(self.num_agents) == agent, steps, 0.0).astype(jnp.int32)
+
+    def _check_state(self, state: State[S]) -> None:
+        """Raises an InputError for anything but a state of one environment of this task."""
+        names, size = {f"reward/{field.name}" for field in dataclasses.fields(self.weights)}, self.compiled.model.nq
+        if isinstance(state, State):
+            shape = jnp.shape(state.data.qpos)
+            if shape == (size,) and names <= set(state.metrics):
+                return
+            found = f"one with qpos {shape} and the metrics {', '.join(sorted(state.metrics))}"
+        else:
+            found = f"of type {type(state).__name__}"
+        raise InputError(
+            f"state: {found} is not allowed; it must be one of {self.name}, with qpos ({size},), such as `reset` "
+            "returns; jax.vmap or VectorEnv steps a batch"
+        )
 
     def _checked(self, action: jax.Array) -> jax.Array:
         try:

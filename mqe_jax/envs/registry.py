@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, MutableMapping
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.settings import checked
 
 if TYPE_CHECKING:
     import jax
@@ -115,6 +116,7 @@ NAMED_PLANNERS: dict[str, dict[str, Planner | str]] = {}
 """Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`), as those of `PLANNERS`."""
 
 
+@checked(task=str, name=str, planner=Callable | str)
 def register_planner(task: str, name: str, planner: Planner | str) -> None:
     """Registers a further scripted policy of a task under a name.
 

@@ -18,7 +18,8 @@ from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 from mqe_jax.files import archive, parse_json, write_atomically
-from mqe_jax.settings import Parameters, PathText, check, checked, to_mapping
+from mqe_jax.settings import Parameters, PathText, check, checked, fail, to_mapping
+from mqe_jax.train.types import AnySingle
 
 # Fields on which a step depends; the others are recomputed by it.
 _FIELDS = ("step", "anchors", "control", "actuators", "randomized", "task", "assistance", "frozen_steps", "key")
@@ -48,8 +49,12 @@ class Recording:
         return make(self.task, impl=impl or self.impl, control=self.control, num_envs=1, **self.params)
 
 
+@checked(file=PathText, env=AnySingle, states=State)
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
+    shape = (*jnp.shape(states.step), env.num_agents, env.action_size)
+    if len(shape) != 3 or np.shape(actions) != shape:
+        fail("actions", f"of shape {np.shape(actions)}", f"{shape}, one for each state")
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
     first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
     about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
@@ -79,6 +84,7 @@ def load_recording(file: str | pathlib.Path) -> Recording:
         return made
 
 
+@checked(recording=Recording, env=AnySingle | None)
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
     """Replays a recording, by default on the recorded engine; returns the states after each action (T, ...).
 
@@ -86,6 +92,12 @@ def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
         InputError: if the recording's arrays do not fit the environment.
     """
     env = recording.make_env() if env is None else env
+    if (recording.task, recording.control) != (env.name, env.control):
+        given = f"recording of {recording.task} with control {recording.control!r}"
+        raise InputError(f"env: {env.name} with control {env.control!r} does not fit a {given}")
+    actions = (env.num_agents, env.action_size)
+    if recording.actions.shape[1:] != actions or not np.isfinite(recording.actions[:-1]).all():  # the last may diverge
+        raise InputError(f"recording of {recording.task}: its actions are not finite, or not {actions}")
     start = _restored(env, recording)
 
     def advance(state: State, action: jax.Array) -> tuple[State, State]:
@@ -117,6 +129,8 @@ def _restored(env: QuadrupedEnv, recording: Recording) -> State:
         if saved is None or saved.shape[1:] != leaf.shape:
             found = "is missing" if saved is None else f"has shape {saved.shape[1:]}"
             raise InputError(f"recording of {recording.task}: {name} {found}; expected shape {leaf.shape}")
+        if not np.isfinite(saved[0]).all():
+            raise InputError(f"recording of {recording.task}: {name} of its first state is not finite")
         leaves.append(jnp.asarray(saved[0], leaf.dtype))
     fields = jax.tree.unflatten(jax.tree.structure(fields), leaves)
     data = blank.data.replace(**fields.pop("data"))

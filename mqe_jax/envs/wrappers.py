@@ -59,7 +59,7 @@ class Wrapper(Outer):
     @single
     def step(self, state: WrappedState, action: jax.Array) -> WrappedState:
         """Advances all environments by one step with actions (N, A, action_size); errors as of `VectorEnv`."""
-        self.check_action(action)
+        self.check_step(state, action, WrappedState)
         action = self.passed(action)
         inner = dataclasses.replace(state.inner, step=state.step, assistance=state.assistance)
         return self._state(self.inner.step(inner, action), action, state.step + 1)

@@ -32,6 +32,7 @@ from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.policies import check_policy
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import NUM_JOINTS
+from mqe_jax.settings import checked
 from mqe_jax.skills import Skill
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -39,6 +40,7 @@ SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JO
 """Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
 
 
+@checked(policy=TrainedPolicy, env=QuadrupedEnv)
 def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy with its mean actions; its task defines control mode, robot and walk policy.
 

@@ -10,8 +10,10 @@ from mqe_jax.appearance import ROBOT_COLORS
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.robots import motors
 from mqe_jax.scene import build_spec
+from mqe_jax.settings import checked
 
 
+@checked(env=QuadrupedEnv)
 def scene_xml(env: QuadrupedEnv) -> str:
     """Returns the MJCF of the task's rendering model, which has the physics of the task's model.
 
@@ -22,6 +24,7 @@ def scene_xml(env: QuadrupedEnv) -> str:
     return spec.to_xml()
 
 
+@checked(env=QuadrupedEnv)
 def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     """Returns plain numbers, lists and mappings, in m, rad, s and N.
 

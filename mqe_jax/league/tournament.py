@@ -7,21 +7,24 @@ import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from mqe_jax.envs import VectorEnv
 from mqe_jax.files import replacing, write_atomically
+from mqe_jax.limits import NonNegativeInt
 from mqe_jax.literal import to_label
 from mqe_jax.opponents import OUTCOMES, Versus
 from mqe_jax.precision import single
-from mqe_jax.settings import checked
+from mqe_jax.settings import PathText, checked, fail
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import AnyBatch, RandomKey
+from mqe_jax.train.types import AnyBatch, AnyPolicy, RandomKey
 
 Array = NDArray[np.float64]
 CSV, PICTURE = "tournament.csv", "tournament.png"
@@ -30,6 +33,17 @@ _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 500
 _SAMPLES = 200  # of the bootstrap
 _LONG = 28  # characters of a name in the picture, at most
+
+
+def _results(value: Any) -> Any:
+    shape = np.shape(value)
+    if shape != (*shape[:1] * 2, 3) or not np.all(np.isfinite(value)) or np.min(value) < 0:
+        raise ValueError("outcomes of policies against policies, as of round_robin")
+    return value
+
+
+Results = Annotated[Any, pydantic.AfterValidator(_results)]
+"""Kind of an argument that is a result of `round_robin`."""
 
 
 class Ratings(NamedTuple):
@@ -41,7 +55,7 @@ class Ratings(NamedTuple):
 
 
 @single
-@checked(matches=AnyBatch, key=RandomKey)
+@checked(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `OUTCOMES`.
 
@@ -71,7 +85,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
 
 
 @single
-@checked(matches=AnyBatch, policies=Mapping, key=RandomKey)
+@checked(matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey)
 def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `OUTCOMES`."""
     keys = jax.random.split(key, len(policies))
@@ -79,18 +93,22 @@ def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Arr
     return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
 
 
+@checked(results=Results)
 def scores(results: NDArray[Any]) -> Array:
     """Returns the points of each policy against each, as both teams together, in games; a draw counts half (P, P)."""
     points = results[..., 0] + 0.5 * results[..., 1]
     return points + (results.sum(axis=-1) - points).T
 
 
+@checked(results=Results, anchor=NonNegativeInt)
 def rate(results: NDArray[np.int64], anchor: int) -> Ratings:
     """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0, and their intervals.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
     of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
     """
+    if anchor >= len(results):
+        fail("anchor", anchor, f"the index of one of the {len(results)} policies")
     games = results + np.array([0.0, 0.5, 0.0])
     weights = np.random.default_rng(0).standard_gamma(games, (_SAMPLES, *games.shape))
     weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
@@ -109,9 +127,14 @@ def _strengths(points: Array, anchor: int) -> Array:
     return _POINTS * np.log(strength)
 
 
+@checked(folder=PathText, names=Sequence[str], results=Results)
 def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings: Ratings) -> None:
     """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
-    text = io.StringIO()
+    if not isinstance(ratings, Ratings):
+        fail("ratings", ratings, "those of rate")
+    if not len(names) == len(results) == len(ratings.value):
+        fail("names", names, f"one for each of the {len(results)} policies, as the ratings")
+    folder, text = Path(folder), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("team0", "team1", *OUTCOMES, "rating_of_team0", "low", "high"))
     for i, j in itertools.product(range(len(names)), repeat=2):

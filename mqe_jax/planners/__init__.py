@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.registry import NAMED_PLANNERS, PLANNERS, Planner, load
 from mqe_jax.errors import InputError
+from mqe_jax.settings import checked
+from mqe_jax.train.types import AnySingle
 
 # The blocks (A, width) of one environment's observations by name.
 Observation = Mapping[str, jax.Array]
@@ -29,6 +31,7 @@ def planner_of(task: str, name: str = "scripted") -> Planner:
     return load("mqe_jax.planners", planner) if isinstance(planner, str) else planner
 
 
+@checked(env=AnySingle, name=str)
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
     """Returns the scripted policy of a task, from the observations (A, O) of one team to its actions (A, 3).
 

@@ -19,6 +19,7 @@ def get(name: str) -> Robot:
     return ROBOTS[name]
 
 
+@checked(robot=Robot)
 def register(robot: Robot) -> Robot:
     """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it.
 

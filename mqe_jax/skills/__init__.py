@@ -18,6 +18,7 @@ import numpy as np
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import Robot
+from mqe_jax.settings import checked
 
 
 class Command(NamedTuple):
@@ -196,6 +197,7 @@ def register(skill: type[S]) -> type[S]:
     return skill
 
 
+@checked(name=str, robot=Robot)
 def make(name: str, robot: Robot) -> Skill:
     """Returns a skill of a robot; InputError for an unknown name, with the nearest known one."""
     if name not in SKILLS:

@@ -102,7 +102,7 @@ def read_runs(folder: Path) -> list[Run]:
     return sorted(runs, key=lambda run: (run.cell.path.as_posix(), run.seed))
 
 
-def read_curve(path: Path) -> Curve:
+def read_curve(path: str | Path) -> Curve:
     """Reads the columns of a metrics.csv; InputError naming the file, if it is missing, malformed or has no row."""
     curve = read_metrics(path)
     if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):

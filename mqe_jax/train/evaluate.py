@@ -159,6 +159,8 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     """Returns the function of a policy of all agents, or a function itself, and its initial recurrent state."""
     either: Any = policy
     if not hasattr(either, "act"):
+        if any(np.shape(leaf)[:1] != (num_envs,) for leaf in jax.tree.leaves(memory)):
+            fail("memory", memory, f"arrays with a leading axis of {num_envs}, the environments")
         return functools.partial(_given, either), memory
     if (trained := getattr(either, "task", "")) and trained != env.name:
         fail("policy", f"one of {trained}", f"one of {env.name}; its `act` may be given alone")

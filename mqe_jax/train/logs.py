@@ -28,6 +28,7 @@ from rich.text import Text
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError
 from mqe_jax.files import append, make_folder, parsing, read_rows, write_atomically
+from mqe_jax.settings import PathText, check
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.types import is_per_episode
 
@@ -79,8 +80,9 @@ class CsvLog:
         write_atomically(self._path, text.getvalue().encode())
 
 
-def read_metrics(path: Path) -> dict[str, np.ndarray]:
+def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """Reads the columns of a metrics.csv (U,) each; InputError naming the file, if it is missing or malformed."""
+    path = Path(check("path", path, PathText))
     if not path.exists():
         raise InputError(f"{path}: no such file; a run folder has one after its first update")
     rows = read_rows(path)

@@ -13,15 +13,16 @@ import jax.numpy as jnp
 from annotated_types import Ge
 
 from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.files import make_folder
+from mqe_jax.files import check_folder, check_locks
+from mqe_jax.limits import PositiveInt
 from mqe_jax.precision import single
-from mqe_jax.settings import PathText, build, check, to_mapping
+from mqe_jax.settings import PathText, build, check, checked, fail, to_mapping
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims, NetworkSettings
 from mqe_jax.train.normalize import RunningStatistics, running_init, running_normalize
-from mqe_jax.train.types import Memory, Params
+from mqe_jax.train.types import Memory, Params, RandomKey
 
 POLICY_FILE = "policy.safetensors"
 
@@ -102,6 +103,7 @@ class TrainedPolicy:
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
+        num_envs = check("num_envs", num_envs, PositiveInt | None)
         memory = self.config.network.build(self.dims).initial_memory(num_envs or 1).actor
         return jax.tree.map(lambda x: x[0], memory) if num_envs is None else memory
 
@@ -121,10 +123,17 @@ class TrainedPolicy:
         self, arrays: PolicyArrays, obs: Any, memory: Memory, key: jax.Array | None = None
     ) -> tuple[jax.Array, Memory]:
         """Returns what a policy of the same architecture with other arrays does; see `act`."""
-        obs = jnp.asarray(obs, jnp.float32)
+        try:
+            obs = jnp.asarray(obs, jnp.float32)
+        except (TypeError, ValueError):
+            fail("obs", obs, "an array of numbers")
         agents, size = self.dims.agents, self.dims.observation
         if obs.ndim < 2 or obs.shape[-2:] != (agents, size):
             raise InputError(f"obs: shape {obs.shape} is not allowed; it must end in ({agents} agents, {size} numbers)")
+        check("key", key, RandomKey | None)
+        expected = jax.tree.structure(self.initial_memory())
+        if jax.tree.structure(memory) != expected:
+            fail("memory", memory, f"the recurrent state of this policy, {expected}")
         act = policy_act(self.dims, self.config.network, self.config.normalization.observations)
         return act(arrays, obs, memory, None if self.deterministic else key)
 
@@ -154,15 +163,19 @@ NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
 """Reads the policies that have names, the shipped ones, which `mqe_jax.zoo` adds."""
 
 
+@checked(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)
 def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
     """Writes a policy into a folder, which it creates, atomically; with `half`, its parameters as float16.
 
     The file holds whether the policy acts with its mean actions.
 
     Raises:
+        InputError: for a folder that cannot be written.
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
-    path = Path(check("run_dir", run_dir, PathText)) / name
+    if Path(name).name != name:
+        fail("name", name, "the name of a file, without a folder")
+    path = Path(run_dir) / name
     params = policy.params
     if half:
         params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
@@ -170,7 +183,8 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
         raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     about = {"dims": policy.dims._asdict(), "config": to_mapping(policy.config), "deterministic": policy.deterministic}
     metadata = {**policy.metadata, **about}
-    make_folder(path.parent)
+    check_locks(path)
+    check_folder(path.parent)
     save_tree(path, {"params": params, "normalizer": policy.normalizer}, metadata, kind="policy")
     return path
 

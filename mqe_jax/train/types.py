@@ -41,15 +41,35 @@ def _raw_key(implementation: str) -> Any:
     return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0, impl=implementation)))
 
 
+def _level(value: Any) -> Any:
+    array = getattr(value, "shape", None) == () and jnp.issubdtype(value.dtype, jnp.number)
+    if not array and not (isinstance(value, int | float) and 0 <= value <= 1):
+        raise ValueError("a number in [0, 1]")
+    return value
+
+
 def _environment(value: Any) -> Any:
-    if not all(hasattr(value, name) for name in ("name", "num_agents", "action_size", "reset", "step")):
+    names = ("name", "num_agents", "action_size", "reset", "step")
+    if isinstance(value, type) or not all(hasattr(value, name) for name in names):
         raise ValueError("an environment, such as that of mqe_jax.make")
+    return value
+
+
+def _single(value: Any) -> Any:
+    if hasattr(_environment(value), "num_envs"):
+        raise ValueError("one environment, such as that of mqe_jax.make, not a batch")
     return value
 
 
 def _batch(value: Any) -> Any:
     if not hasattr(_environment(value), "num_envs"):
         raise ValueError("a batch of environments, such as VectorEnv(mqe_jax.make(task), 64)")
+    return value
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, type) or not all(hasattr(value, x) for x in ("task", "agents", "act", "initial_memory")):
+        raise ValueError("a policy, such as that of mqe_jax.load_policy")
     return value
 
 
@@ -62,10 +82,16 @@ def _policy(value: Any) -> Any:
 
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
 """Kind of an argument that is a random key (see `mqe_jax.settings.checked`)."""
+Level = Annotated[Any, pydantic.AfterValidator(_level)]
+"""Kind of an argument that is a curriculum level, a number or an array () in [0, 1]."""
 AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]
 """Kind of an argument that is one environment or a batch."""
+AnySingle = Annotated[Any, pydantic.AfterValidator(_single)]
+"""Kind of an argument that is one environment."""
 AnyBatch = Annotated[Any, pydantic.AfterValidator(_batch)]
 """Kind of an argument that is a batch of environments."""
+AnyPolicy = Annotated[Any, pydantic.AfterValidator(_whole)]
+"""Kind of an argument that is a policy of a team."""
 PolicyOrAct = Annotated[Any, pydantic.AfterValidator(_policy)]
 """Kind of an argument that is a policy or its function `act`."""
 

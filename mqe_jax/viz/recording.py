@@ -1,19 +1,21 @@
 """Recording of episodes as numpy arrays."""
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from annotated_types import MinLen
 
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.errors import InputError
 from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.precision import single
-from mqe_jax.settings import checked, fail
+from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.evaluate import Act, acting
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import PolicyOrAct, RandomKey
+from mqe_jax.train.types import AnySingle, PolicyOrAct, RandomKey
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +37,15 @@ class Episode:
     settled: float = 0.0
     """Time from which `success` has its last value, s."""
 
+    def __post_init__(self) -> None:
+        counts = [len(self.qpos), len(self.mocap_pos), len(self.mocap_quat)]
+        if len({*counts}) > 1:
+            raise InputError(f"Episode: qpos, mocap_pos and mocap_quat of {counts} frames; expected equally many")
+
     def __len__(self) -> int:
         return len(self.qpos)
 
+    @checked(frames=slice)
     def cut(self, frames: slice) -> "Episode":
         """Returns the episode with a part of its frames, such as every n-th; `settled` stays that of the whole."""
         poses = {name: getattr(self, name)[frames] for name in ("qpos", "mocap_pos", "mocap_quat")}
@@ -45,7 +53,7 @@ class Episode:
 
 
 @single
-@checked(policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
+@checked(env=AnySingle, policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
 def record(
     env: QuadrupedEnv, policy: Policy | Act, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
 ) -> list[Episode]:
@@ -109,15 +117,19 @@ def record(
     return recorded
 
 
+@checked(episodes=Annotated[list[Any], MinLen(1)])
 def best(episodes: list[Episode]) -> Episode:
     """Returns the best episode: by success, then by average step reward."""
-    if not episodes:
-        fail("episodes", episodes, "at least one episode")
+    for episode in episodes:
+        check("episodes", episode, Episode)
     return max(episodes, key=lambda episode: (episode.success, episode.reward))
 
 
+@checked(episodes=Annotated[list[Any], MinLen(1)])
 def typical(episodes: list[Episode]) -> Episode:
     """Returns the median of the successful episodes, by success, then by average step reward; of all if none is."""
+    for episode in episodes:
+        check("episodes", episode, Episode)
     successful = [episode for episode in episodes if episode.success > 0] or episodes
     ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))
     return ranked[len(ranked) // 2]

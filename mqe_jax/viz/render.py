@@ -21,6 +21,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.interrupts import child
 from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
 from mqe_jax.settings import PathText, checked
+from mqe_jax.train.types import AnySingle
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
 from mqe_jax.viz.curves import draw_top
@@ -142,7 +143,7 @@ _SIZE = tuple[Pixels, Pixels]
 _BACKEND = Literal["auto", "egl", "osmesa"] | None
 
 
-@checked(size=_SIZE, backend=_BACKEND)
+@checked(env=AnySingle, episode=Episode, size=_SIZE, backend=_BACKEND)
 def render_frames(
     env: QuadrupedEnv,
     episode: Episode,
@@ -163,7 +164,17 @@ def render_frames(
     return _draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
 
 
-@checked(path=PathText, size=_SIZE | None, fps=FrameRate | None, speed=Speed, at=Time | None, backend=_BACKEND)
+@checked(
+    env=AnySingle,
+    episode=Episode,
+    path=PathText,
+    view=str | None,
+    size=_SIZE | None,
+    fps=FrameRate | None,
+    speed=Speed,
+    at=Time | None,
+    backend=_BACKEND,
+)
 def render_episode(
     env: QuadrupedEnv,
     episode: Episode,
@@ -184,8 +195,12 @@ def render_episode(
     Without GL, the packages required for 3-D rendering are printed to standard error.
     """
     path = check_output(Path(path), fps=fps, speed=speed, at=at)
-    if not len(episode) or episode.qpos.shape[1:] != (env.mj_model.nq,):
-        raise InputError(f"episode: {episode.qpos.shape} coordinates; {env.name} needs (frames, {env.mj_model.nq})")
+    sizes, found = (env.mj_model.nq, env.mj_model.nmocap), (episode.qpos.shape[1:], episode.mocap_pos.shape[1:2])
+    if not len(episode) or found != (sizes[:1], sizes[1:]):
+        shape = f"{episode.qpos.shape} coordinates, {episode.mocap_pos.shape} of walls"
+        raise InputError(f"episode: {shape}; {env.name} needs (frames, {sizes[0]}) and (frames, {sizes[1]}, 3)")
+    if not np.isfinite(episode.qpos).all():
+        raise InputError("episode: its coordinates hold NaN or infinite numbers")
     suffix = path.suffix.lower()
     size = size or {".mp4": (960, 540), ".png": (1280, 720)}.get(suffix, (480, 270))
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)

@@ -14,10 +14,12 @@ import numpy as np
 
 from mqe_jax import walk_policy
 from mqe_jax.errors import InputError, nearest
+from mqe_jax.limits import Environments, Seed
 from mqe_jax.precision import single
 from mqe_jax.robots.index import Proprioception, foot_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import rotate, rotate_inverse
+from mqe_jax.settings import checked
 from mqe_jax.skills.weights import Params
 from mqe_jax.walk import trainees
 from mqe_jax.walk.env import WalkEnv, heading_velocity
@@ -235,6 +237,7 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
+@checked(robot=Robot, params=dict, impl=str, episodes=Environments, seed=Seed, scenarios=Sequence[str] | None)
 def evaluate_skill(
     skill: str,
     robot: Robot,
@@ -252,10 +255,8 @@ def evaluate_skill(
         rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under `scenarios`.
 
     Raises:
-        InputError: for an unknown scenario, or episodes below 1.
+        InputError: for an unknown scenario, or an argument of another kind.
     """
-    if episodes < 1:
-        raise InputError(f"episodes: {episodes} must be at least 1")
     known = [name for name, scenario in SCENARIOS.items() if skill in scenario.skills]
     names = known if scenarios is None else list(scenarios)
     for name in names:

@@ -13,7 +13,7 @@ from annotated_types import Ge
 from mqe_jax.envs import TASKS
 from mqe_jax.errors import InputError
 from mqe_jax.limits import NonNegative, PositiveInt
-from mqe_jax.settings import build, record, to_mapping
+from mqe_jax.settings import PathText, build, checked, record, to_mapping
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
@@ -54,6 +54,7 @@ def file_of(task: str) -> Path:
     return FOLDER / f"{task}.safetensors"
 
 
+@checked(task=str)
 def card(task: str) -> Card:
     """Returns the card of a task's shipped policy.
 
@@ -78,6 +79,7 @@ def load(task: str) -> TrainedPolicy:
     return dataclasses.replace(policy, deterministic=about.mode == "deterministic")
 
 
+@checked(policy=TrainedPolicy, about=Card, folder=PathText)
 def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
     """Writes a policy with its card, its parameters as float16; returns the file."""
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
