@@ -315,7 +315,7 @@ def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None)
         with tempfile.TemporaryDirectory(prefix=".mqe-", dir=there) as inner:
             made = Path(inner, folder.relative_to(there))
             made.mkdir(parents=True, exist_ok=True)
-            (made / (file.name if file is not None and file.name else "a")).touch()
+            (made / (file.name if file is not None and file.name else ".probe")).touch()
     except (OSError, ValueError) as error:  # ValueError: a null byte
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{field}: {file or folder} cannot be written ({reason})") from None

@@ -44,6 +44,8 @@ assert main({bad!r}) == 2  # imports MuJoCo, as every command
 sys.path.insert(0, {tests!r})
 import fake_env
 fake_env.build.make_env = fake_env.make_env
+from mqe_jax.envs import TASKS
+TASKS["fake"] = fake_env.FakeEnv
 for line in {lines!r}:
     sys.argv = ["mqe", *line]
     assert main() == 0, line

@@ -217,7 +217,7 @@ N = 32
 class Bending:
     """A demonstrator that bends all joints further in every step of an episode, by its recurrent state."""
 
-    task, agents = "go1plane", 1
+    task, agents = "go1plane", 2
 
     def initial_memory(self, num_envs: int) -> jax.Array:
         return jnp.ones(num_envs)

@@ -49,7 +49,7 @@ class Recording:
         return make(self.task, impl=impl or self.impl, control=self.control, num_envs=1, **self.params)
 
 
-@checked(file=PathText, env=AnySingle, states=State)
+@checked(file=PathText, env=AnySingle)
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
     shape = (*jnp.shape(states.step), env.num_agents, env.action_size)

@@ -165,7 +165,10 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
             assistance=next_assistance(
-                config, now.assistance, metrics.get("success", jnp.float32(0.5)), metrics["episodes"]
+                config,
+                now.assistance,
+                metrics.get("success", jnp.float32(0.5)),
+                metrics.get("episodes", jnp.float32(0.0)),
             ),
             rollout=rollout_state,
             key=key,
