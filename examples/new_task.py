@@ -6,11 +6,11 @@ docs/new_task.md explains the steps; `python examples/new_task.py` evaluates the
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from mqe_jax.collision import OBJECT_BIT, WALL_BIT
 from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
@@ -22,6 +22,9 @@ from mqe_jax.scene import Scene
 from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
 from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall
 from mqe_jax.train.evaluate import evaluate_batch
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 # Step 1: a terrain block defines its walls.
 
