@@ -53,8 +53,9 @@ docs: $(STAMP) npm ## Build the documentation site into build/site
 soak: $(STAMP) ## Run the heavy tests too (about an hour)
 	MQE_SOAK=1 $(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal
 
-audit: $(STAMP) ## Known vulnerabilities of the pinned packages, where the database can be reached
-	$(BIN)/python tools/release.py --audit
+audit: $(STAMP) ## Look up known vulnerabilities of the pinned packages
+	test -x build/audit/bin/pip-audit || { $(BIN)/python -m venv build/audit && build/audit/bin/pip install -q "pip-audit>=2.9"; }
+	build/audit/bin/pip-audit -r constraints.txt --disable-pip --no-deps
 
 release: $(STAMP) ## Wheel and bill of materials into dist/, tried with the README in an empty environment
 	$(BIN)/python tools/release.py

@@ -1,4 +1,4 @@
-"""The command line: output, streams, settings, run folders, policies and profiles."""
+"""The command line: output, streams, settings, run folders and policies."""
 
 import json
 import os
@@ -9,17 +9,15 @@ from typing import Any
 
 import fake_env
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from fake_env import SMALL, FakeEnv
 
 import mqe_jax
 from mqe_jax import build, cli
-from mqe_jax.cli import arguments, profile
-from mqe_jax.cli.profile import Operation
+from mqe_jax.cli import arguments
 from mqe_jax.cli.train import parse_skill_train, parse_train
-from mqe_jax.envs import QuadrupedEnv, make
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
@@ -337,58 +335,3 @@ def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixtur
     assert "the settings are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
     build.for_task(demo, "go1gate")
     assert not capfd.readouterr().err
-
-
-# -- mqe bench --profile: times of operations by the parts of a step ---------------------------------------------------
-
-
-def test_shares_divide_each_instant_equally_among_what_runs() -> None:
-    operations = [
-        Operation("physics", False, 10.0, 14.0),
-        Operation("physics", False, 12.0, 13.0),  # on another thread
-        Operation("control", False, 12.0, 16.0),
-        Operation("reset", True, 18.0, 20.0),
-    ]
-    found = profile.shares(operations)
-    assert found == pytest.approx({"physics": 3.167 / 10, "control": 2.833 / 10, "reset": 0.2, "idle": 0.2}, abs=1e-3)
-
-
-def test_operations_of_a_program_are_attributed_by_the_innermost_scope() -> None:
-    @jax.named_scope("task")
-    def outer(x: jax.Array) -> jax.Array:
-        with jax.named_scope("physics"):
-            x = jnp.sort(x @ x)
-        return jnp.tanh(x)
-
-    def loop(x: jax.Array) -> jax.Array:
-        return jax.lax.fori_loop(0, 3, lambda _, x: jax.vmap(outer)(x), x)
-
-    start = jnp.ones((4, 300, 300))
-    program, seconds = profile.compiled(loop, start)
-    kinds = profile.scopes(program.as_text(), "other")
-    assert {part for part, kind in kinds.values() if kind == "sort"} == {"physics"}
-    found = profile.traced(lambda: program(start), program.as_text(), "other")
-    assert {"physics", "task"} <= {operation.part for operation in found}
-    assert profile.shares(found)["physics"] > profile.shares(found)["task"] > 0.0
-    assert set(seconds) == {"trace_s", "compile_s", "cached_s"} and min(seconds.values()) > 0.0
-
-
-def test_contacts_are_those_of_standing_robots() -> None:
-    env = make("go1plane", impl="c", control="position", num_envs=4)
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
-    low = state.data.replace(qpos=state.data.qpos.at[:2, 2].set(0.27).at[2:, 2].set(5.0))
-    found = profile.contacts(env.physics.model, {name: np.asarray(x) for name, x in profile.sampled(low).items()})
-    assert found["contacts_max"] >= 4 and 0 < found["contacts_mean"] <= found["contacts_max"] / 2
-    assert found["rows_max"] > found["contacts_max"]
-
-
-@pytest.mark.soak
-def test_a_profile_of_a_task(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "profile.png"
-    arguments = ["--profile", "--sizes", "16", "64", "--steps", "4", "--repeats", "2", "--json", "-o", str(picture)]
-    assert cli.main(["bench", "go1gate", "--impl", "c", *arguments]) == 0
-    rows = json.loads(capfd.readouterr().out)["profiles"]
-    assert [row["num_envs"] for row in rows] == [16, 64] and picture.stat().st_size > 5000
-    for row in rows:
-        assert sum(row["step"].values()) == pytest.approx(1.0) and row["step"]["physics"] > 0.2
-        assert row["env_steps_per_s"] > 0 and row["cached_s"] < row["compile_s"] and row["training"]["learner"] > 0.0

@@ -23,7 +23,6 @@ BAD = {
     "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
     "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
-    "sizes alone": (["bench", "go1gate", "--sizes", "8"], ["sizes", "--profile"]),
     "control": (["bench", "go1gate", "--control", "velocity"], ["'velocity'", "command, position, torque"]),
     "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
     "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),
@@ -102,7 +101,6 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd:
 OUTPUTS = {
     "render": (["render", "go1gate", "-o"], ".gif"),
     "replay": (["replay", "none.npz", "-o"], ".png"),
-    "bench": (["bench", "--profile", "-o"], ".png"),
     "export": (["export", "go1gate", "--onnx"], ".onnx"),
     "convert": (["skill", "convert", "walk", "fifo", "fifo", "-o"], ".safetensors"),
 }

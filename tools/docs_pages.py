@@ -16,6 +16,7 @@ import inspect
 import io
 import posixpath
 import re
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from typing import Any
 import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
-from release import badges, repository
 
 from mqe_jax import zoo
 
@@ -42,6 +42,12 @@ def on_files(files: Any, config: Any) -> Any:
         path = f"play/{file.relative_to(PLAY).as_posix()}"
         files.append(File.generated(config, path, abs_src_path=str(file)))
     return files
+
+
+def repository() -> str:
+    """Returns the repository's address, `[project.urls]` in pyproject.toml; empty if it is not set."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return project.get("urls", {}).get("Repository", "").rstrip("/")
 
 
 def on_config(config: Any) -> Any:
@@ -115,7 +121,7 @@ def pages() -> dict[str, str]:
         from mqe_jax.envs import TASKS
     made = {f"tasks/{name}.md": task_page(task) for name, task in TASKS.items()}
     made["tasks/index.md"] = overview(TASKS)
-    made["index.md"] = badges(front((ROOT / "README.md").read_text(encoding="utf-8")), repository())
+    made["index.md"] = front((ROOT / "README.md").read_text(encoding="utf-8"))
     return made
 
 

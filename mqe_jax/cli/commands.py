@@ -6,14 +6,12 @@ Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 from __future__ import annotations
 
 import textwrap
-from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions, print_table
-from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, Episodes, Horizon
 from mqe_jax.literal import echo
 from mqe_jax.settings import record
@@ -194,13 +192,6 @@ class Bench(TaskOptions):
     repeats: Horizon = 10
     """Number of timed calls after five that warm up; their median, slowest and fastest are reported."""
     seed: Seed = 0
-    profile: bool = False
-    """Also measure what an environment step and a training update consist of: physics, walk policy (control),
-    observation and reward (task), reset, learner and idle time; kernels, contacts, compilation and memory."""
-    sizes: Annotated[list[Environments], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
-    """Numbers of environments of the profile. Default: --num-envs."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """Image of the profile to write, such as profile.png."""
 
     def run(self) -> dict[str, Any]:
         """Measures throughput; prints a table, or returns the object for `--json`."""
@@ -209,12 +200,6 @@ class Bench(TaskOptions):
         from mqe_jax import build
         from mqe_jax.cli import bench
 
-        if not self.profile and (self.sizes or self.output):
-            raise InputError("sizes and output need --profile")
-        if self.profile:
-            from mqe_jax.cli.profile import run
-
-            return run(self)
         env, vector_env = build.make_env(self.task, self.impl, self.overrides(), self.num_envs)
         key = jax.random.PRNGKey(self.seed)
         result = bench.bench(env, vector_env, key, steps=self.steps, repeats=self.repeats)
