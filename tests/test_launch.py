@@ -1,4 +1,4 @@
-"""`mqe launch`: several processes equal one, end together, and resume on another number; on one host and on two."""
+"""`mqe launch`: several processes equal one, end together, and resume on another number."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import contextlib
 import os
 import random
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,15 +51,6 @@ def differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dic
     [
         ([], "processes: missing; give --processes N, or start with srun or mpirun"),
         (["--processes", "2", "--devices", "0"], "devices: '0' is not allowed; it must be as many as processes, 2"),
-        (["--coordinator", "host:1"], "coordinator and index are given together"),
-        (["--coordinator", "host:1", "--index", "2", "--processes", "2"], "index: 2 is not allowed"),
-        (["--coordinator", "host", "--index", "0", "--processes", "2"], "coordinator: 'host' is not allowed"),
-        (
-            ["--coordinator", "host:99999", "--index", "0", "--processes", "2"],
-            "coordinator: 'host:99999' is not allowed",
-        ),
-        (["--coordinator", "host:0", "--index", "0", "--processes", "2"], "coordinator: 'host:0' is not allowed"),
-        (["--coordinator", "h:1", "--index", "0", "--processes", "2", "--devices", "0", "1"], "devices: '0, 1' is not"),
     ],
 )
 def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.CaptureFixture[str]) -> None:
@@ -92,11 +82,6 @@ def test_a_command_that_cannot_be_launched(command: list[str], capfd: pytest.Cap
     assert cli.main(["launch", "--processes", "2", *command]) == 2
     said = f"command: {' '.join(command)!r} is not allowed; it must be train, skill train or sweep"
     assert said in capfd.readouterr().err
-
-
-def test_a_sweep_has_no_coordinator(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["launch", "--coordinator", "h:1", "--index", "0", "--processes", "2", "sweep", "sweep.yaml"]) == 2
-    assert "coordinator: 'h:1' is not allowed; it must be left out for a sweep" in capfd.readouterr().err
 
 
 def test_a_mistake_that_all_processes_find_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -353,100 +338,6 @@ def test_a_sweep_of_srun(tmp_path: Path) -> None:
     assert [updates(run) for run in runs] == [3, 3]
 
 
-def by_hand(commands: list[list[str]], act: Callable[[list[subprocess.Popen[str]]], None]) -> list[str]:
-    """Starts the commands of two hosts on this one; returns what they say after `act`."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    flags = ["launch", "--coordinator", f"127.0.0.1:{port}", "--processes", "2"]
-    with contextlib.ExitStack() as stack:
-        both = [
-            stack.enter_context(started([*MQE, *flags, "--index", str(i), *words])) for i, words in enumerate(commands)
-        ]
-        act(both)
-        return [process.communicate(timeout=90)[1] for process in both]
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("what", ["folder", "settings"])
-def test_hosts_with_different_commands(what: str, tmp_path: Path) -> None:
-    """A folder that one host does not see, or other settings: one line each, instead of different trainings."""
-    words = [[*TRAIN, "--total-steps", "64", "--run-dir", str(tmp_path / "0"), "--resume"] for _ in range(2)]
-    if what == "folder":
-        mqe("launch", "--processes", "2", *TRAIN, "--total-steps", "32", "--run-dir", str(tmp_path / "0"))
-        words[1][words[1].index(str(tmp_path / "0"))] = str(tmp_path / "1")
-    else:
-        words[1] += ["--seed", "7"]
-    for said in by_hand(words, lambda both: None):
-        assert said.splitlines()[-1].startswith("mqe: run_dir: processes have different settings or see different")
-        assert "gloo" not in said
-
-
-@pytest.mark.soak
-def test_a_launcher_of_one_host_that_is_killed(tmp_path: Path) -> None:
-    """The other host ends with one line; several times, since JAX raises several kinds of errors."""
-    words = [*TRAIN, "--total-steps", "16000000", "--run-dir", str(tmp_path / "run"), "--resume"]
-    for _ in range(4):
-        before = updates(tmp_path / "run")
-
-        def kill(both: list[subprocess.Popen[str]], before: int = before) -> None:
-            wait_for(lambda: updates(tmp_path / "run") > before + 5, both[0])
-            both[1].kill()
-
-        first, _ = by_hand([words, words], kill)
-        said = [line for line in lines(first) if "starting a new run" not in line]
-        assert said == [f"mqe: {devices.PEER_ENDED}; the same command with --resume goes on"]
-
-
-@pytest.fixture
-def hosts() -> Iterator[list[str]]:
-    """Two network namespaces, joined by a virtual cable; their addresses are 10.77.0.1 and 10.77.0.2."""
-    names = [f"mqe{os.getpid()}{side}" for side in "ab"]
-    make = [f"ip netns add {name}" for name in names]
-    make += [f"ip link add {names[0]} netns {names[0]} type veth peer name {names[1]} netns {names[1]}"]
-    for i, name in enumerate(names):
-        inside = f"ip -n {name}"
-        make += [f"{inside} addr add 10.77.0.{i + 1}/24 dev {name}", f"{inside} link set {name} up"]
-        make += [f"{inside} link set lo up"]
-    try:
-        for command in make:
-            if (
-                shutil.which("ip") is None
-                or subprocess.run(command.split(), capture_output=True, check=False).returncode
-            ):
-                pytest.skip(f"not permitted here: {command}")
-        yield names
-    finally:
-        for name in names if shutil.which("ip") else ():
-            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("vanishes", [False, True])
-def test_two_hosts(vanishes: bool, hosts: list[str], tmp_path: Path) -> None:
-    """They train together over TCP; where the cable is cut, both end within a minute with one line each."""
-    run = tmp_path / "run"
-    flags = ["launch", "--coordinator", "10.77.0.1:7777", "--processes", "2"]
-    words = [*TRAIN, "--total-steps", "16000000" if vanishes else "16", "--run-dir", str(run)]
-    named = ["unshare", "-u", "sh", "-c", 'hostname $0; exec "$@"']  # gloo connects to what a host's name means
-    commands = [
-        ["ip", "netns", "exec", name, *named, f"10.77.0.{i + 1}", *MQE, *flags, "--index", str(i), *words]
-        for i, name in enumerate(hosts)
-    ]
-    with started(commands[0]) as first, started(commands[1]) as second:
-        if vanishes:
-            wait_for(lambda: updates(run) > 5, first)
-            subprocess.run(["ip", "-n", hosts[1], "link", "set", hosts[1], "down"], check=True)
-        said = [process.communicate(timeout=90 if vanishes else 300)[1] for process in (first, second)]
-    if vanishes:
-        assert all(f"mqe: {devices.PEER_ENDED}" in text and len(lines(text)) == 1 for text in said), said
-        assert first.returncode and second.returncode
-        return
-    assert first.returncode == second.returncode == 0, said
-    assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
-    assert_equal_runs(tmp_path / "one", run, 1e-5)
-
-
 def test_on_one_host_nobody_else_can_join() -> None:
     """Every address of 127.0.0.0/8 is this machine's, as its addresses in a network are."""
     with socket.socket() as free:
@@ -454,7 +345,7 @@ def test_on_one_host_nobody_else_can_join() -> None:
         port = free.getsockname()[1]
     connected = [f"socket.socket().connect_ex(('{host}', {port})) == 0" for host in ("127.0.0.1", "127.0.0.2")]
     program = f"import socket; from mqe_jax.cli.launch import join; join(); print({', '.join(connected)}, flush=True)"
-    environment = {**os.environ, launch.MEMBER: f"0/1@127.0.0.1:{port}"}
+    environment = {**os.environ, launch.MEMBER: f"0/1@{port}"}
     with subprocess.Popen(
         [sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
@@ -473,13 +364,10 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
 
     first, second = members("--processes", "2")
     assert (first["CUDA_VISIBLE_DEVICES"], second["CUDA_VISIBLE_DEVICES"]) == ("4", "5")
-    assert first[launch.MEMBER].startswith("0/2@127.0.0.1:")
+    assert first[launch.MEMBER].startswith("0/2@")
     assert second[launch.MEMBER] == first[launch.MEMBER].replace("0/2", "1/2")
     assert [own["CUDA_VISIBLE_DEVICES"] for own in members("--processes", "2", "--devices", "7", "1")] == ["7", "1"]
-    assert members("--processes", "4", "--coordinator", "h:1", "--index", "3") == [{launch.MEMBER: "3/4@h:1"}]
     device, alone = "CUDA_VISIBLE_DEVICES", {launch.MEMBER: "alone"}
-    by_hand = ("--processes", "4", "--coordinator", "h:1", "--index", "3", "--devices", "1")
-    assert members(*by_hand) == [{launch.MEMBER: "3/4@h:1", device: "1"}]
     assert members("--processes", "1") == [{**alone, device: "4"}]
     monkeypatch.delenv(device)
     monkeypatch.setattr(launch, "_gpus", lambda: 2)

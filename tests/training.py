@@ -204,7 +204,7 @@ def rows(run: Path) -> list[dict[str, str]]:
 
 def without_progress(lines: Iterable[str]) -> Iterator[str]:
     """Yields the lines of a training's standard error but those of its progress."""
-    progress = re.compile(r"[\w-]+: (compiling|evaluating|takes about|.* steps/s, )")
+    progress = re.compile(r"(\[\d+\] )?[\w-]+: (compiling|evaluating|takes about|.* steps/s, )")
     return (line for line in lines if not progress.match(line))
 
 

@@ -19,7 +19,6 @@ from typing import Annotated, Any
 import tyro
 
 from mqe_jax import interrupts
-from mqe_jax.cli.meeting import LIMIT, meet
 from mqe_jax.errors import InputError
 from mqe_jax.limits import PositiveInt
 from mqe_jax.literal import echo
@@ -27,11 +26,13 @@ from mqe_jax.settings import fail, record
 from mqe_jax.train.devices import PEER, PEER_ENDED
 
 MEMBER = "MQE_PROCESS"
-"""Environment variable of a process that `launch` started: INDEX/COUNT@HOST:PORT, `AUTO` or `ALONE`."""
+"""Environment variable of a process that `launch` started: INDEX/COUNT@PORT, `AUTO` or `ALONE`."""
 AUTO = "auto"
 """SLURM or MPI knows the other processes of the training."""
 ALONE = "alone"
 """The process trains by itself, as those of a sweep do."""
+LIMIT = 40.0
+"""Time in which all processes come, s."""
 HEARTBEAT = 30
 """Time after which a process is dead whose host does not answer, s."""
 
@@ -42,8 +43,7 @@ _DEVICES = "CUDA_VISIBLE_DEVICES"
 _NO_DEVICES = ("", "-1")  # of `_DEVICES`: JAX computes on the CPU
 _RANKS = {"SLURM_PROCID": "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK": "OMPI_COMM_WORLD_LOCAL_RANK"}
 """Variables of srun and mpirun: a process's index among all, and among those of its host."""
-_ADDRESS = re.compile(r"[^@\s]+:(\d{1,5})")
-_MEMBER = re.compile(rf"(\d+)/(\d+)@({_ADDRESS.pattern})")
+_MEMBER = re.compile(r"(\d+)/(\d+)@(\d+)")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _RESUME = "the same command with --resume goes on"
 _REPEAT = "the same command goes on"  # a sweep
@@ -63,13 +63,9 @@ class Launch:
     """
 
     processes: PositiveInt | None = None
-    """Number of processes; on several hosts without SLURM or MPI, of all of them."""
+    """Number of processes of this host."""
     devices: Annotated[list[int], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
     """GPUs of this host, one per process. Default: the first ones."""
-    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """Address of process 0 with a free port, the same in the commands on all hosts; needs --index."""
-    index: int | None = None
-    """Which process this is, from 0, with --coordinator."""
     command: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
     """Arguments of the command."""
 
@@ -92,10 +88,6 @@ class Launch:
 
     def _members(self) -> list[dict[str, str]]:
         """Returns the environment variables that each process of this host has in addition."""
-        if (self.coordinator is None) != (self.index is None):
-            raise InputError("coordinator and index are given together, or neither of them")
-        if self.coordinator is not None and self.index is not None:
-            return [self._member_of(self.coordinator, self.index)]
         if self.processes is None:
             return [self._member_of_job()]
         own = self._own_devices(self.processes)
@@ -104,18 +96,7 @@ class Launch:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        return [{**variables, MEMBER: f"{i}/{self.processes}@127.0.0.1:{port}"} for i, variables in enumerate(own)]
-
-    def _member_of(self, coordinator: str, index: int) -> dict[str, str]:
-        """Returns the variables of the only process here of a training on several hosts."""
-        if self._sweeps:
-            fail("coordinator", coordinator, "left out for a sweep: give --processes alone, on every host")
-        match = _ADDRESS.fullmatch(coordinator)
-        if match is None or not 1 <= int(match[1]) <= 65535:
-            fail("coordinator", coordinator, "HOST:PORT, a port from 1 to 65535")
-        if self.processes is None or not 0 <= index < self.processes:
-            fail("index", index, f"from 0 to --processes - 1; --processes is {self.processes}")
-        return {**(self._own_devices(1)[0] if self.devices else {}), MEMBER: f"{index}/{self.processes}@{coordinator}"}
+        return [{**variables, MEMBER: f"{i}/{self.processes}@{port}"} for i, variables in enumerate(own)]
 
     def _member_of_job(self) -> dict[str, str]:
         """Returns the variables of a process that srun or mpirun has started."""
@@ -198,10 +179,8 @@ def join() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if member == ALONE:
         return
-    import jax  # before the processes meet: it takes seconds
+    import jax
 
-    if match is not None:
-        meet(match[3], int(match[1]), int(match[2]))
     alone = threading.Timer(LIMIT, _end_alone)
     alone.daemon = True
     alone.start()
@@ -212,10 +191,9 @@ def join() -> None:
         if match is None:
             jax.distributed.initialize(**timeouts)
         else:
-            # JAX binds the coordinator's port to all addresses of the machine unless told otherwise.
-            bind = match[3] if match[3].startswith("127.0.0.1:") else None
-            place = int(match[2]), int(match[1])
-            jax.distributed.initialize(match[3], *place, coordinator_bind_address=bind, **timeouts)
+            index, count, address = int(match[1]), int(match[2]), f"127.0.0.1:{match[3]}"
+            # Without the bind address JAX listens on all addresses of the machine.
+            jax.distributed.initialize(address, count, index, coordinator_bind_address=address, **timeouts)
     except Exception as error:  # of JAX's readers of SLURM's and MPI's variables too
         raise InputError(f"coordinator: the other processes cannot be reached ({error})") from None
     finally:
