@@ -18,10 +18,11 @@ from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.league.league import League
 from mqe_jax.league.sides import BothSides
+from mqe_jax.limits import Seeds
 from mqe_jax.literal import echo
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_as, load_policy
-from mqe_jax.settings import Parameters, PathText, check, differences, fail, joined, load_yaml, override
+from mqe_jax.settings import Parameters, PathText, check, checked, differences, fail, joined, load_yaml, override
 from mqe_jax.train.config import MOVING, TrainConfig, load_config
 from mqe_jax.train.evaluate import Act
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
@@ -53,6 +54,7 @@ class Environments(NamedTuple):
     """Environments of evaluations during training; None without."""
 
 
+@checked(env=Mapping | None)
 def prepare(
     task: Task,
     config: Config = None,
@@ -82,6 +84,7 @@ def prepare(
     return Environments(configs, task, None)
 
 
+@checked(seeds=Seeds)
 def make_learner(
     task: Task, config: Config = None, *, env: Mapping[str, Any] | None = None, impl: str = "auto", seeds: int = 1
 ) -> Learner:
@@ -241,6 +244,7 @@ class Players(NamedTuple):
     """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
 
 
+@checked(env=Mapping | None)
 def players(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,
@@ -261,7 +265,8 @@ def players(
     if isinstance(made, QuadrupedEnv):
         name, params = made.name, joined(parameters_of(made), params)
     else:
-        made = name = ALIASES.get(str(made), str(made))
+        given = str(check("task", made, PathText))
+        made = name = ALIASES.get(given, given)
         if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
             config = run_config(name)
             made, params, policy = config.task or "", joined(config.env, params), policy or name

@@ -229,8 +229,8 @@ def versus(
     Raises:
         InputError: for a task that is not a match, another number of opponents, or a policy of another task.
     """
-    single = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
-    given: Any = [opponents] if single else opponents
+    alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
+    given: Any = [opponents] if alone else opponents
     if not isinstance(given, Sequence):
         fail("opponents", given, "a policy, or a list of policies")
     return Versus(env, [load_as("opponents", each, env.env) for each in given], draw_reward)

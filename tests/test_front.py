@@ -144,6 +144,9 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
         ("fake", {"config": {"ppo.clp": 1}}, r"ppo.clp: unknown name .*did you mean 'clip'"),
         ("fake", {"seed": -1}, "seed: -1 is not allowed"),
         ("fake", {"resume": True}, "resume: True is not allowed; it must be false without a run_dir"),
+        ("fake", {"env": "x"}, "env: 'x' is not allowed"),
+        ("fake", {"resume": "perhaps"}, "resume: 'perhaps' is not allowed; it must be true or false"),
+        ("fake", {"dump_diverged": 5}, "dump_diverged: 5 is not allowed"),
         (fake(), {"env": {"gate_width": 1}}, "env: .* is not allowed; it must be left out for a batch"),
         (fake(), {"config": {"opponents": ["idle"]}}, r"opponents: \('idle',\) .* left out for a batch"),
     ],
@@ -151,6 +154,31 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
 def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
         mqe_jax.learn(task, **arguments)
+
+
+@pytest.mark.parametrize("seeds", [5, [], [1.5], "ab", range(65)])
+def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
+    with pytest.raises(InputError, match=r"seeds.* is not allowed"):
+        mqe_jax.learn_seeds("fake", FEW, seeds=seeds)
+    with pytest.raises(InputError, match=r"seeds: .* is not allowed"):
+        mqe_jax.make_learner("fake", FEW, seeds=0 if seeds == 5 else seeds)
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "said"),
+    [
+        (None, {}, "task: None is not allowed"),
+        ("fake", {"env": "x"}, "env: 'x' is not allowed"),
+        ("fake", {"env": 5}, "env: 5 is not allowed"),
+        ("~/none", {}, "run: '/nowhere/none' is no folder"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_named(
+    task: Any, arguments: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/nowhere")
+    with pytest.raises(InputError, match=said):
+        mqe_jax.evaluate(task, "idle", **arguments)
 
 
 def test_an_environment_keeps_its_parameters() -> None:

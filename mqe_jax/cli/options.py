@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import Annotated, Any, TextIO
 
 import tyro
 
@@ -17,9 +17,6 @@ from mqe_jax.errors import InputError, shown
 from mqe_jax.files import parse_yaml
 from mqe_jax.literal import line
 from mqe_jax.settings import joined, record
-
-if TYPE_CHECKING:
-    pass
 
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[

@@ -103,7 +103,7 @@ def load_run(folder: str | Path) -> Run:
     return Run(policy, metrics, evaluations["evaluations"], evaluations["absolute"])
 
 
-@checked(seed=Seed | None, run_dir=PathText | None)
+@checked(seed=Seed | None, run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
 def learn(
     task: Task,
     config: Config = None,
@@ -145,7 +145,7 @@ def learn(
     return _train(prepared, [None if run_dir is None else Path(run_dir)], resume, dump_diverged)[0]
 
 
-@checked(run_dir=PathText | None)
+@checked(seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
 def learn_seeds(
     task: Task,
     config: Config = None,
@@ -171,9 +171,8 @@ def learn_seeds(
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
     check("seeds", len(seeds), Seeds)
-    numbers = [check("seeds", seed, Seed) for seed in seeds]
-    prepared = prepare(task, config, env, impl=impl, seeds=numbers)
-    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
+    prepared = prepare(task, config, env, impl=impl, seeds=seeds)
+    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in seeds]
     return _train(prepared, folders, resume, dump_diverged)
 
 
