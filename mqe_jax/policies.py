@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -203,28 +204,34 @@ def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None
 
 
 def _plan(name: str, env: QuadrupedEnv) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Returns the function of observations (N, A, O) and a key that is the policy of a name."""
+    """Returns the function of observations (N, A, O) and a key that is the policy of a name; it can be pickled."""
     if name not in NAMES or name == "scripted":
-        scripted = _scripted(env, name)
-        return lambda obs, key: scripted(obs)
+        return _scripted(env, name)
     shape = (len(env.teams[0]), env.action_size)
     if name == "random":
-
-        def uniform(obs: jax.Array, key: jax.Array) -> jax.Array:
-            return devices.rows(lambda n: jax.random.uniform(key, (n, *shape), minval=-1.0, maxval=1.0), len(obs))
-
-        return uniform
-    first = _FORWARD if name == "forward" else 0.0
-    return lambda obs, key: jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
+        return functools.partial(_uniform, shape)
+    return functools.partial(_constant, shape, _FORWARD if name == "forward" else 0.0)
 
 
-def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array], jax.Array]:
-    """Returns a scripted policy of the task for a batch: observations (N, A, O) to actions (N, A, 3)."""
-    plan = scripted_policy(env, name)
+def _uniform(shape: tuple[int, ...], obs: jax.Array, key: jax.Array) -> jax.Array:
+    return devices.rows(lambda n: jax.random.uniform(key, (n, *shape), minval=-1.0, maxval=1.0), len(obs))
+
+
+def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Array) -> jax.Array:
+    return jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
+
+
+def _planned(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
+    return env.controller.rescaled(jax.vmap(scripted_policy(env, name))(obs))
+
+
+def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Returns a scripted policy of the task for a batch: observations (N, A, O) and a key to actions (N, A, 3)."""
+    scripted_policy(env, name)  # which raises where there is none
     if env.control != "command":
         raise InputError(
             f"policy: {name!r} outputs walk commands; control is {env.control!r}, use another, such as random"
         )
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")
-    return lambda obs: env.controller.rescaled(jax.vmap(plan)(obs))
+    return functools.partial(_planned, env, name)

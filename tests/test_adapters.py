@@ -253,9 +253,10 @@ def test_environments_with_the_same_opponent_share_compiled_functions() -> None:
     assert first.identity == second.identity != other.identity
     before = _compile.cache_info()
     hosts = [HostEnvs(team, 1) for team in (first, second, other)]
+    programs = [host._programs for host in hosts]
     after = _compile.cache_info()
     assert (after.misses - before.misses, after.hits - before.hits) == (2, 1)
-    assert hosts[0].env is first
+    assert hosts[0].env is first and programs[0] is programs[1]
 
 
 def test_every_adapter_takes_an_opponent() -> None:

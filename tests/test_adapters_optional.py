@@ -313,11 +313,14 @@ def test_pettingzoo_knows_the_tasks_by_name(zoo: Any) -> None:
 
 
 def test_a_copy_is_a_new_environment_with_the_same_settings(zoo: Any) -> None:
-    """Vectorisers copy environments by pickling them."""
-    env = zoo.parallel_env("go1gate", **SHORT)
-    copy = pickle.loads(pickle.dumps(env))
-    assert copy.task is not env.task and copy.task.params == env.task.params
-    np.testing.assert_array_equal(copy.reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"])
+    """Vectorisers copy environments by pickling them: copied generators would give all of them the same episodes."""
+    env = zoo.parallel_env("go1wrestling", opponent="scripted", **SHORT)
+    env.reset(seed=1)
+    copies = [pickle.loads(pickle.dumps(env)) for _ in range(2)]
+    assert copies[0].task is not env.task and copies[0].task.params == env.task.params
+    one, other = (copy.reset()[0]["robot_0"] for copy in copies)
+    assert (one != other).any()
+    np.testing.assert_array_equal(copies[0].reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"])
 
 
 def test_render_of_pettingzoo(zoo: Any) -> None:

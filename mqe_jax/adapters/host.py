@@ -79,8 +79,15 @@ class HostEnvs:
         self._camera: Camera | None = None
         self._task = match = self.env.match if isinstance(self.env, TeamEnv) else self.env
         opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
-        key = (type(match), repr(match.params), match.impl, match.control, match.physics.num_envs, opponent)
-        self._begin, self._step = _compile(_Kind(key, self.env))
+        self._key = (type(match), repr(match.params), match.impl, match.control, match.physics.num_envs, opponent)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy has: all but the compiled functions."""
+        return {name: value for name, value in vars(self).items() if name != "_programs"}
+
+    @functools.cached_property
+    def _programs(self) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
+        return _compile(_Kind(self._key, self.env))
 
     def reset(
         self, seeds: Sequence[int | None], generator: np.random.Generator, mask: np.ndarray | None = None
@@ -95,7 +102,7 @@ class HostEnvs:
         seeded = np.array([seed is not None for seed in seeds])
         numbers = np.array([check("seed", 0 if seed is None else seed, Seed) for seed in seeds])
         chosen = np.ones(self.num_envs, bool) if mask is None or self.state is None else mask
-        self.state = self._begin(numbers.astype(np.uint32), seeded, chosen, self.state)
+        self.state = self._programs[0](numbers.astype(np.uint32), seeded, chosen, self.state)
         return np.array(self.state.obs)
 
     def step(self, action: ArrayLike, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
@@ -118,7 +125,7 @@ class HostEnvs:
             raise InputError(f"action: shape {action.shape}; expected {shape} (environments, agents, action size)")
         if not np.isfinite(action).all():
             raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
-        self.state, out = self._step(self.state, action, reset)
+        self.state, out = self._programs[1](self.state, action, reset)
         return jax.tree.map(np.array, jax.device_get(out))  # copies, as JAX arrays are read-only
 
     def render(self, index: int = 0) -> np.ndarray | None:

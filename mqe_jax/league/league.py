@@ -24,6 +24,7 @@ from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.config import MOVING, TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims
+from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import PolicyArrays, TrainedPolicy
 
@@ -61,7 +62,7 @@ class League(Versus):
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig) -> None:
         """Creates the matches of a training run; `opponents` are those of `TrainConfig.opponents`."""
         dims = env_dims(versus(matches, ["idle"]), config)
-        self._network, self._config, self.sources = config.network.build(dims), config, tuple(opponents)
+        self._dims, self._config, self.sources = dims, config, tuple(opponents)
         drawn = sum(source in DRAWN for source in opponents)
         if drawn and config.league.members <= drawn:
             fail("league.members", config.league.members, f"more than the blocks that play members, {drawn}")
@@ -124,6 +125,10 @@ class League(Versus):
     def _member(self, league: LeagueState, block: int) -> PolicyArrays:
         """Returns the arrays of the member that a block plays."""
         return jax.tree.map(lambda x: x[league.member[block]], league.pool.arrays)
+
+    @property
+    def _network(self) -> Network:
+        return self._config.network.build(self._dims)  # whose functions cannot be pickled
 
     def _own(self, state: TrainState) -> PolicyArrays:
         """Returns the arrays of the learner's policy."""

@@ -1,0 +1,116 @@
+"""Pickled environments, adapters and policies, as a spawned process gets them: the copy acts as the original."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mqe_jax.adapters.gymnasium  # noqa: F401  (registers the tasks)
+from mqe_jax.demonstrations import Demonstrated
+from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs.wrappers import Deadline
+from mqe_jax.league.league import League
+from mqe_jax.league.sides import BothSides
+from mqe_jax.opponents import Mirror, versus
+from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.settings import build
+from mqe_jax.train.config import TrainConfig
+from tests.states import made
+from tests.training import assert_same
+
+KEY = jax.random.PRNGKey(0)
+PLANE: dict[str, Any] = {"impl": "c", "control": "position"}
+
+
+def copied(value: Any) -> Any:
+    return pickle.loads(pickle.dumps(value))
+
+
+def walking(task: str) -> QuadrupedEnv:
+    return make(task, impl="c", num_envs=2)
+
+
+def matches() -> VectorEnv:
+    return VectorEnv(walking("go1wrestling"), 2)
+
+
+def league() -> League:
+    values = {"num_envs": 2, "rollout_steps": 2, "total_steps": 8, "opponents": ["newest", "older"]}
+    return League(matches(), ["newest", "older"], build(TrainConfig, values))
+
+
+BATCHES: dict[str, Callable[[], Any]] = {
+    "vector": lambda: VectorEnv(made("go1plane"), 2),
+    "deadline": lambda: Deadline(VectorEnv(made("go1plane"), 2)),
+    "demonstrated": lambda: Demonstrated(walking("go1gate"), 2, load_policy("scripted", walking("go1gate"))),
+    "versus": lambda: versus(matches(), ["go1wrestling", "scripted"]),
+    "mirror": lambda: Mirror(matches()),
+    "both sides": lambda: BothSides(matches()),
+    "league": league,
+}
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_batches(name: str) -> None:
+    """Programs are compared as text: most take long to compile."""
+    batch = BATCHES[name]()
+    action = jnp.zeros((batch.num_envs, batch.num_agents, batch.action_size))
+    programs = []
+    for each in (batch, copied(batch)):
+        state = jax.eval_shape(each.reset, KEY)
+        programs.append(f"{jax.make_jaxpr(each.reset)(KEY)} {jax.make_jaxpr(each.step)(state, action)}")
+    assert programs[0] == programs[1]
+
+
+@pytest.mark.parametrize("name", ["scripted", "random", "idle", "forward", "go1wrestling", "both"])
+def test_policies(name: str) -> None:
+    env = walking("go1wrestling")
+    policy = load_policy("scripted" if name == "both" else name, env)
+    policy = all_agents(env, policy, load_policy("go1wrestling", env)) if name == "both" else policy
+    obs = jax.random.normal(KEY, (2, policy.agents, env.observation_size))
+    one, other = (each.act(obs, each.initial_memory(2), KEY) for each in (policy, copied(policy)))
+    assert_same(one, other)
+
+
+@pytest.mark.parametrize("task", ["go1plane", "go1wrestling"])
+def test_gymnasium_environments_keep_their_state(task: str) -> None:
+    settings = {**PLANE, "opponent": "random"} if task == "go1wrestling" else PLANE
+    envs = gymnasium.make_vec(f"mqe/{task}-v0", num_envs=2, **settings)
+    single = gymnasium.make(f"mqe/{task}-v0", **settings)
+    for env in (envs, single):
+        env.reset(seed=0)
+        action = np.full(env.action_space.shape or (), 0.1, np.float32)
+        copy = copied(env)
+        assert_same(env.step(action)[:2], copy.step(action)[:2])
+
+
+def test_another_process_steps_an_environment(tmp_path: Path) -> None:
+    env = make("go1plane", num_envs=2, **PLANE)
+    policy = load_policy("random", env)
+    (tmp_path / "pair").write_bytes(pickle.dumps((env, policy)))
+    code = """
+import pickle, sys
+import jax, numpy as np
+env, policy = pickle.load(open(sys.argv[1], "rb"))
+key = jax.random.PRNGKey(0)
+state = jax.jit(env.reset)(key)
+action, _ = policy.act(state.obs[None], (), key)
+print(float(np.sum(jax.jit(env.step)(state, action[0]).data.qpos, dtype=np.float64)))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "pair")], capture_output=True, text=True, check=True
+    )
+    state = jax.jit(env.reset)(KEY)
+    action, _ = policy.act(state.obs[None], (), KEY)
+    expected = np.sum(np.asarray(jax.jit(env.step)(state, action[0]).data.qpos, np.float64))
+    assert float(done.stdout) == pytest.approx(float(expected), abs=1e-5)
