@@ -29,7 +29,7 @@ KEY_STEP = 0.25
 HOLD_RATE = 10.0
 """Messages of a held button per second."""
 _MOST_STEPS = 25  # single steps waiting
-FREE, NONE = "free", "none"
+ACTION, FREE, NONE = "action", "free", "none"
 _COLORS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
 _POINTS = 200
 
@@ -66,7 +66,7 @@ class Panel:
         self._robots = tuple(robots) or tuple(f"robot {i + 1}" for i in range(session.env.num_agents))
         self._wanted_steps, self._wants_reset = 0, False
         self._wanted: Choice | None = None
-        self.camera, self.env, self.back = FREE, 0, 0
+        self.camera, self.env, self.back = ACTION if session.num_envs == 1 else FREE, 0, 0
         self.contacts = self.shapes = False
         self._state = self._gui.add_html("")
         if menu is not None:
@@ -223,9 +223,8 @@ class Panel:
     def _add_view(self, bodies: Sequence[str]) -> None:
         gui, session = self._gui, self._session
         with gui.add_folder("View"):
-            camera = gui.add_dropdown(
-                "Camera", (FREE, *bodies), initial_value=FREE, hint="Body that the camera follows"
-            )
+            hint = "What the camera follows: robots and objects (action), or one of them"
+            camera = gui.add_dropdown("Camera", (ACTION, FREE, *bodies), initial_value=self.camera, hint=hint)
             numbers = tuple(str(i + 1) for i in range(session.num_envs))
             env = gui.add_dropdown("Environment", numbers, initial_value="1", visible=session.num_envs > 1)
             contacts = gui.add_checkbox("Contacts", False, hint="Contact points and forces in this environment")

@@ -16,6 +16,7 @@ from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
+_SKY, _SUN = 1.5, 1.7  # intensities of the light
 _OPAQUE = 0.5  # opacity below which geoms are left out: meshes of several colours have none
 _PLANES = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
@@ -35,6 +36,8 @@ class Stage:
     """Ids of the bodies that a camera can follow, by label."""
     offset: np.ndarray
     """Place of each environment (N, 3), m."""
+    span: float = 0.0
+    """Diagonal of the box about the followed bodies, m."""
 
     def __init__(self, server: Any, model: mujoco.MjModel, frame: Episode) -> None:
         self._server, self._model = server, model
@@ -48,6 +51,7 @@ class Stage:
         self._mocap: np.ndarray | None = None
         self.bodies = followable(self._model)
         self._root = server.scene.add_frame("/world", show_axes=False)
+        self._add_light()
         self._add_floor(low, high)
         fixed, moving, self._walls = _sort_geoms(self._model)
         still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
@@ -58,12 +62,14 @@ class Stage:
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
 
-    def draw(self, frame: Episode, followed: tuple[int, int] | None = None) -> None:
-        """Renders the environments' poses; `followed` (environment, body) is kept at the origin."""
+    def draw(self, frame: Episode, followed: tuple[int, list[int]] | None = None) -> None:
+        """Renders the environments' poses; the middle of `followed` (environment, bodies) is kept at the origin."""
         positions, turns = self._poses(frame)
         with self._server.atomic():
             if followed is not None:
-                x, y, _ = positions[followed]
+                places = positions[followed]
+                self.span = float(np.linalg.norm(np.ptp(places, axis=0)))
+                x, y, _ = (places.min(axis=0) + places.max(axis=0)) / 2
                 self._root.position = (-x, -y, 0.0)
             self._place(self._batches, positions, turns)
             self._draw_walls(frame)
@@ -101,6 +107,14 @@ class Stage:
             centre, turn, size = (np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3))
             handle.batched_positions = centre + self.offset.astype(np.float32)
             handle.batched_wxyzs, handle.batched_scales = turn, size
+
+    def _add_light(self) -> None:
+        """Lights the scene about as clips are lit: viser's own lights and surroundings wash colours out."""
+        scene = self._server.scene
+        scene.configure_default_lights(False)
+        scene.configure_environment_map(None)
+        scene.add_light_hemisphere("/sky", ground_color=(150, 150, 140), intensity=_SKY)
+        scene.add_light_directional("/sun", position=(-3.0, -4.0, 9.0), intensity=_SUN, cast_shadow=False)
 
     def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
         side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0]

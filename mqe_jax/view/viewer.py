@@ -14,7 +14,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.view.markup import paragraph
 from mqe_jax.view.menu import Menu
 from mqe_jax.view.overlay import Overlay
-from mqe_jax.view.panel import FREE, Panel, robot_labels
+from mqe_jax.view.panel import ACTION, FREE, Panel, robot_labels
 from mqe_jax.view.server import open_server
 from mqe_jax.view.session import Session
 from mqe_jax.view.stage import Stage, seen, start_frame
@@ -55,8 +55,11 @@ class Viewer:
         self.server.scene.reset()
         self._clear()
         self._stage = Stage(self.server, model, frame)
+        if len(frame) == 1:
+            robots = [body for label, body in self._stage.bodies.items() if label.startswith("robot")]
+            self._stage.draw(frame, (0, robots))
         camera = self.server.initial_camera
-        camera.position, camera.look_at = self._stage.overview()
+        camera.position, camera.look_at = self._view(following=len(frame) == 1)
         camera.fov = _FIELD_OF_VIEW
 
     def _clear(self) -> None:
@@ -128,7 +131,7 @@ class Viewer:
         self._menu.shown = choice
         self.show(session)
         for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at = self._view()
+            client.camera.position, client.camera.look_at = self._view(following=self._followed() is not None)
         return True
 
     def _draw(self) -> None:
@@ -157,19 +160,24 @@ class Viewer:
         env, frame = self.session.env, self.session.moment(self._panel.back).frame
         return frame.qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
 
-    def _followed(self) -> tuple[int, int] | None:
-        if self._panel.camera == FREE:
+    def _followed(self) -> tuple[int, list[int]] | None:
+        """Returns the environment and the bodies that the camera follows."""
+        camera = self._panel.camera
+        if camera == FREE:
             return None
-        return self._panel.env, self._bodies[self._panel.camera]
+        return self._panel.env, list(self._bodies.values()) if camera == ACTION else [self._bodies[camera]]
 
-    def _view(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns camera position and look-at point (3,), m, for the whole scene or the followed body."""
-        return self._stage.overview() if self._followed() is None else seen(np.array([0.0, 0.0, 0.2]), 3.0)
+    def _view(self, *, following: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Returns camera position and look-at point (3,), m, for the whole scene or for what the camera follows."""
+        return seen(np.array([0.0, 0.0, 0.2]), 3.0 + self._stage.span) if following else self._stage.overview()
 
     def _aim(self) -> None:
-        """Resets the cameras of all clients after a change of the followed body."""
-        if self._followed() is None:
+        """Resets the cameras of all clients after a change of what they follow."""
+        followed = self._followed()
+        if followed is None:
             self._stage.release()
-        position, look_at = self._view()
+        else:
+            self._stage.draw(self.session.moment(self._panel.back).frame, followed)
+        position, look_at = self._view(following=followed is not None)
         for client in self.server.get_clients().values():
             client.camera.position, client.camera.look_at = position, look_at
