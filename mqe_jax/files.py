@@ -7,14 +7,12 @@ import csv
 import itertools
 import json
 import os
-import platform
 import re
 import secrets
 import stat
 import tempfile
 import time
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,9 +26,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
-_TEMPORARY = re.compile(r"\.mqe-([0-9a-f]{8})-(\d+)-[0-9a-f]{16}\.tmp(\.\w+)?")  # host, process
-_ABANDONED = 3600.0  # s after its last change another host's temporary file counts as left
+_TEMPORARY = re.compile(r"\.mqe-[0-9a-f]{16}\.tmp(\.\w+)?")
+_ABANDONED = 3600.0  # s after its last change a temporary file counts as left
 _TAGS = {f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")}
 LOCK = ".mqe.lock"
 """Name of the file that a process locks in a run folder."""
@@ -46,8 +43,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     It creates the folder. The file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
-    unique = f"{_HOST}-{os.getpid()}-{secrets.token_hex(8)}"
-    temporary = path.with_name(f".mqe-{unique}.tmp{path.suffix}")
+    temporary = path.with_name(f".mqe-{secrets.token_hex(8)}.tmp{path.suffix}")
     check_locks(path)
     interrupts.temporaries.add(temporary)
     try:
@@ -109,24 +105,15 @@ def check_locks(path: Path) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Removes the files of `replacing` that processes which have ended left in a folder; links are not followed.
+    """Removes the files of `replacing` that ended processes left in a folder, an hour after their last change.
 
-    Whether one of another host has ended is not known here: what it left goes an hour after its last change.
+    A process that still writes one may be on another host. Links are not followed.
     """
     for path in () if folder.is_symlink() else folder.glob(".mqe-*.tmp*"):
-        match = _TEMPORARY.fullmatch(path.name)
-        if match and path not in interrupts.temporaries and not _alive(int(match[2])):
-            with contextlib.suppress(OSError):
-                if match[1] == _HOST or time.time() - path.lstat().st_mtime > _ABANDONED:
-                    path.unlink()
-
-
-def _alive(process: int) -> bool:
-    """Returns whether another process has this number."""
-    with contextlib.suppress(OSError, OverflowError):
-        os.kill(process, 0)
-        return process != os.getpid()
-    return False
+        with contextlib.suppress(OSError):
+            old = time.time() - path.lstat().st_mtime > _ABANDONED
+            if old and _TEMPORARY.fullmatch(path.name) and path not in interrupts.temporaries:
+                path.unlink()
 
 
 # -- readers: every failure of a parser is an InputError that names the file; no file costs more than its limit --------

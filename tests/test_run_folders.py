@@ -110,29 +110,26 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
             assert sorted(Path(folder).rglob("*")) == before
 
 
-def test_files_of_dead_processes_go_when_a_run_starts(tmp_path: Path) -> None:
-    """Those of processes that run, such as a clip that is being written, stay, and another host's for an hour.
+def test_temporary_files_that_nothing_changes_for_an_hour_go_when_a_run_starts(tmp_path: Path) -> None:
+    """Another process, on any host and system, may still write a younger one, such as a clip.
 
     Nothing else goes: no folder, no file of another name, nothing behind a link.
     """
-    dead, end = 2**22 + 1, f"-{16 * 'a'}.tmp"  # above the largest process number
+    own, young, folder = (f".mqe-{16 * letter}.tmp" for letter in "abc")
     run, other = tmp_path / "run", tmp_path / "other"
     (run / "checkpoints").mkdir(parents=True)
-    (run / f".mqe-{files._HOST}-{dead + 1}{end}").mkdir()
+    (run / folder).mkdir()
     other.mkdir()
     (run / "link").symlink_to(other)
-    own = f".mqe-{files._HOST}-{dead}{end}"
-    gone = [own, f".mqe-{files._HOST}-{os.getpid()}{end}.mp4", f"checkpoints/{own}.safetensors"]
-    gone += [f".mqe-00000001-{dead}{end}"]
-    kept = [f".mqe-{files._HOST}-{os.getppid()}{end}.mp4", f".mqe-00000000-{dead}{end}", f"link/{own}"]
-    kept += [".hidden", ".notes.tmp", f".keep.{dead}.tmp", f".keep.{files._HOST}.{dead}.tmp.tar.gz", f"{own}~"]
+    gone = [own, f"{own}.mp4", f"checkpoints/{own}.safetensors"]
+    kept = [young, f"link/{own}", ".hidden", ".notes.tmp", ".mqe-1.tmp", ".keep.1.tmp.tar.gz", f"{own}~"]
+    then = time.time() - 3700
     for name in (*gone, *kept):
         (run / name).write_text("half")
-    then = time.time() - 3700
-    os.utime(run / gone[-1], (then, then))
+        os.utime(run / name, None if name == young else (then, then))
+    os.utime(run / folder, (then, then))
     train(PROBE, SETTINGS, run)
-    assert [name for name in (*gone, *kept) if (run / name).exists()] == kept
-    assert (run / f".mqe-{files._HOST}-{dead + 1}{end}").is_dir()
+    assert [name for name in (*gone, *kept, folder) if (run / name).exists()] == [*kept, folder]
 
 
 @pytest.mark.parametrize("name", ["checkpoints", "best", "metrics.csv"])
@@ -360,7 +357,9 @@ def test_parts_of_programs_that_a_killed_process_left_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    (tmp_path / f".mqe-{files._HOST}-999999999-{16 * 'a'}.tmp").write_bytes(b"half")
+    left = tmp_path / f".mqe-{16 * 'a'}.tmp"
+    left.write_bytes(b"half")
+    os.utime(left, (1.0, 1.0))
     (tmp_path / "jit_step-2-cache").write_bytes(b"whole")
     programs.write_whole()
     assert [path.name for path in tmp_path.iterdir()] == ["jit_step-2-cache"]
