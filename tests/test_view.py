@@ -115,9 +115,10 @@ def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(st
     widths = 3.0 - 2 * half[..., 1].sum(0)
     np.testing.assert_allclose(widths, 0.6, atol=0.1)
     trunk = scene.bodies["robot 2"]
-    scene.draw(stage.frame, (2, trunk))
-    want = stage.frame.qpos[2, stage.env.index.base_qpos[1, :2]] + scene.offset[2, :2]
-    np.testing.assert_allclose(np.asarray(scene._root.position)[:2], -want, atol=1e-5)
+    places = stage.frame.qpos[2, stage.env.index.base_qpos[:, :2]] + scene.offset[2, :2]
+    for bodies, want in (([trunk], places[1]), ([scene.bodies["robot 1"], trunk], places.mean(axis=0))):
+        scene.draw(stage.frame, (2, bodies))
+        np.testing.assert_allclose(np.asarray(scene._root.position)[:2], -want, atol=1e-5)
     scene.release()
     np.testing.assert_allclose(scene._root.position, 0.0)
 
@@ -230,6 +231,25 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     viewer._panel.shapes = viewer._panel.contacts = False
     viewer._draw()
     assert not viewer._shapes and viewer._overlay._arrows is None
+    viewer.server.stop()
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_cameras_start_at_the_action_of_one_environment_and_above_several(num_envs: int) -> None:
+    """Before and after compilation; viser's own lights, brighter than those of clips, are off."""
+    pytest.importorskip("mjviser")
+    from mqe_jax.view.viewer import Viewer
+
+    viewer = Viewer(port=free_port())
+    camera, run = viewer.server.initial_camera, session(Driven(), num_envs=num_envs)
+    distances = []
+    for begin in (lambda: viewer.announce(run.env, num_envs), lambda: viewer.show(run)):
+        begin()
+        distances.append(float(np.linalg.norm(np.subtract(camera.position, camera.look_at))))
+    root = np.asarray(viewer._stage._root.position)[:2]
+    middle = run.frame().qpos[0, run.env.index.base_qpos[:, :2]].mean(axis=0)
+    np.testing.assert_allclose(root, -middle if num_envs == 1 else 0.0, atol=1e-5)
+    assert all(3.0 <= distance < 6.0 for distance in distances) == (num_envs == 1)
     viewer.server.stop()
 
 

@@ -55,12 +55,8 @@ class Viewer:
         self.server.scene.reset()
         self._clear()
         self._stage = Stage(self.server, model, frame)
-        if len(frame) == 1:
-            robots = [body for label, body in self._stage.bodies.items() if label.startswith("robot")]
-            self._stage.draw(frame, (0, robots))
-        camera = self.server.initial_camera
-        camera.position, camera.look_at = self._view(following=len(frame) == 1)
-        camera.fov = _FIELD_OF_VIEW
+        self.server.initial_camera.fov = _FIELD_OF_VIEW
+        self._point(frame, (0, list(self._stage.bodies.values())) if len(frame) == 1 else None)
 
     def _clear(self) -> None:
         self.server.gui.reset()
@@ -82,6 +78,7 @@ class Viewer:
         self._bodies = {named.get(label, label): body for label, body in self._stage.bodies.items()}
         agents = robots[: session.env.num_agents]
         self._panel = Panel(self.server, session, tuple(self._bodies), self._aim, agents, self._menu)
+        self._aim()
 
     def run(self, open_session: Callable[[], Session]) -> None:
         """Opens a session, steps and renders it at its speed until an exception; then stops the server."""
@@ -130,8 +127,6 @@ class Viewer:
             return False
         self._menu.shown = choice
         self.show(session)
-        for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at = self._view(following=self._followed() is not None)
         return True
 
     def _draw(self) -> None:
@@ -167,17 +162,18 @@ class Viewer:
             return None
         return self._panel.env, list(self._bodies.values()) if camera == ACTION else [self._bodies[camera]]
 
-    def _view(self, *, following: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Returns camera position and look-at point (3,), m, for the whole scene or for what the camera follows."""
-        return seen(np.array([0.0, 0.0, 0.2]), 3.0 + self._stage.span) if following else self._stage.overview()
-
     def _aim(self) -> None:
-        """Resets the cameras of all clients after a change of what they follow."""
-        followed = self._followed()
+        """Points the cameras at what the panel chooses."""
+        self._point(self.session.moment(self._panel.back).frame, self._followed())
+
+    def _point(self, frame: Episode, followed: tuple[int, list[int]] | None) -> None:
+        """Points the cameras of all clients, also of later ones, at the followed bodies or the whole scene."""
         if followed is None:
             self._stage.release()
+            position, look_at = self._stage.overview()
         else:
-            self._stage.draw(self.session.moment(self._panel.back).frame, followed)
-        position, look_at = self._view(following=followed is not None)
-        for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at = position, look_at
+            self._stage.draw(frame, followed)
+            position, look_at = seen(np.array([0.0, 0.0, 0.2]), 3.0 + self._stage.span)
+        cameras = [client.camera for client in self.server.get_clients().values()]
+        for camera in (self.server.initial_camera, *cameras):
+            camera.position, camera.look_at = position, look_at
