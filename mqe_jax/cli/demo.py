@@ -17,6 +17,7 @@ from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.literal import echo
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
+from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import env_dims, make_ppo
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.start import initial_key
@@ -31,6 +32,7 @@ def demo(arguments: Demo) -> None:
     began, run_dir = time.perf_counter(), arguments.run_dir
     config = for_task(base_config(DEMO_TASK, arguments.config), DEMO_TASK)
     check_folder(run_dir)
+    resume = (run_dir / CONFIG_FILE).exists()
     _, batch = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
@@ -48,7 +50,7 @@ def demo(arguments: Demo) -> None:
     table = {"before": evaluate(DEMO_TASK, before, **measure).to_dict()}
     print(f"before training: {_summary(table['before'])}", flush=True)
     with interrupts.before_exit(lambda: "the same command resumes from here"):
-        run = learn(DEMO_TASK, config, impl=arguments.impl, run_dir=run_dir, resume=True)
+        run = learn(DEMO_TASK, config, impl=arguments.impl, run_dir=run_dir, resume=resume)
     if not run.finished:
         raise KeyboardInterrupt
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()

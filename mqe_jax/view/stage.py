@@ -16,7 +16,7 @@ from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
-_SKY, _SUN = 1.5, 1.7  # intensities of the light
+_SKY, _SUN = 2.4, 2.7  # intensities of the light
 _OPAQUE = 0.5  # opacity below which geoms are left out: meshes of several colours have none
 _PLANES = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
