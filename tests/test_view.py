@@ -236,20 +236,19 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_cameras_start_at_the_action_of_one_environment_and_above_several(num_envs: int) -> None:
-    """Before and after compilation; viser's own lights, brighter than those of clips, are off."""
     pytest.importorskip("mjviser")
     from mqe_jax.view.viewer import Viewer
 
-    viewer = Viewer(port=free_port())
-    camera, run = viewer.server.initial_camera, session(Driven(), num_envs=num_envs)
-    distances = []
-    for begin in (lambda: viewer.announce(run.env, num_envs), lambda: viewer.show(run)):
-        begin()
-        distances.append(float(np.linalg.norm(np.subtract(camera.position, camera.look_at))))
-    root = np.asarray(viewer._stage._root.position)[:2]
-    middle = run.frame().qpos[0, run.env.index.base_qpos[:, :2]].mean(axis=0)
-    np.testing.assert_allclose(root, -middle if num_envs == 1 else 0.0, atol=1e-5)
-    assert all(3.0 <= distance < 6.0 for distance in distances) == (num_envs == 1)
+    viewer, run = Viewer(port=free_port()), session(Driven(), num_envs=num_envs)
+    viewer.show(run)
+    camera, robots = viewer.server.initial_camera, run.frame().qpos[0, FakeEnv.robot_x[:, None] + np.arange(2)]
+    distance = float(np.linalg.norm(np.subtract(camera.position, camera.look_at)))
+    followed = num_envs == 1
+    middle = robots.mean(axis=0) if followed else np.zeros(2)
+    np.testing.assert_allclose(np.asarray(viewer._stage._root.position)[:2], -middle, atol=1e-5)
+    apart = float(np.linalg.norm(np.subtract(*robots)))
+    whole = float(np.linalg.norm(np.subtract(*viewer._stage.overview())))
+    assert distance == pytest.approx(3.0 + apart if followed else whole, abs=0.02) and whole > 3.2 + apart
     viewer.server.stop()
 
 

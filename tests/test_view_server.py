@@ -110,7 +110,7 @@ def test_a_refused_value_changes_nothing_and_is_logged_in_a_line(shown: SimpleNa
         ("Speed", float("nan"), "Expected `float`"),
         ("Speed", "2", "Speed is '2', allowed: 0.1 to 4.0"),
         ("Environment", "3", "Environment is '3', allowed: 1, 2"),
-        ("Camera", "x\n\x1b[2J", "Camera is 'x\\n\\x1b[2J', allowed: free, robot 1, robot 2"),
+        ("Camera", "x\n\x1b[2J", "Camera is 'x\\n\\x1b[2J', allowed: action, free, robot 1, robot 2"),
         ("Driven", 1, "Driven is 1.0, allowed: none, robot 1, robot 2"),
         ("Back", -1.0, "Back is -1.0, allowed: 0.0 to 20.0"),
         ("Contacts", 1, "Contacts is 1.0, allowed: true, false"),
