@@ -14,7 +14,7 @@ from mqe_jax import VectorEnv, make, versus
 from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Result, evaluate_batch
-from mqe_jax.train.learner import env_dims, make_ppo
+from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.policy import policy_of
 
 
@@ -26,12 +26,12 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
     matches = VectorEnv(make("go1wrestling", rewards={"push": 3.0, "approach": 1.0}, num_envs=num_envs), num_envs)
 
     one_team = versus(matches, ["idle"])  # for the sizes of a policy; its first snapshot is untrained
-    learner = make_ppo(one_team, config)
+    learner = make_learner(one_team, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     snapshot = policy_of(state, env_dims(one_team, config), config, task=matches.name)
 
     env = versus(matches, [snapshot, "scripted"])  # half of the environments each
-    learner = make_ppo(env, config)
+    learner = make_learner(env, config)
     state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
     for i in range(updates):
         if i % snapshot_every == 0:

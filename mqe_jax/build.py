@@ -16,20 +16,22 @@ from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, Vec
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest
-from mqe_jax.league.league import League
+from mqe_jax.league.league import League, Roster
 from mqe_jax.league.sides import BothSides
 from mqe_jax.limits import Seeds
 from mqe_jax.literal import echo
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_as, load_policy
 from mqe_jax.settings import Parameters, PathText, check, checked, differences, fail, joined, load_yaml, override
-from mqe_jax.train.config import MOVING, TrainConfig, load_config
+from mqe_jax.train import learner
+from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import Act
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
-from mqe_jax.train.learner import Learner, env_dims, make_ppo
+from mqe_jax.train.learner import Learner, env_dims
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.start import initial_key, policy_to_start
+from mqe_jax.train.types import Cast
 from mqe_jax.train.types import VectorEnv as AnyVectorEnv
 
 Task = str | QuadrupedEnv | AnyVectorEnv
@@ -43,17 +45,6 @@ Player = str | Path | Policy | Act | None
 CONFIG_FOLDER = Path(__file__).parent / "configs"
 
 
-class Environments(NamedTuple):
-    """What a training is made of."""
-
-    configs: list[TrainConfig]
-    """Settings of each seed."""
-    learning: Any
-    """Environments in which the policy learns."""
-    evaluation: Any
-    """Environments of evaluations during training; None without."""
-
-
 @checked(env=Mapping | None)
 def prepare(
     task: Task,
@@ -62,8 +53,8 @@ def prepare(
     *,
     impl: str = "auto",
     seeds: Sequence[int] | None = None,
-) -> Environments:
-    """Returns settings and environments of a training; arguments and errors as `mqe_jax.learn`.
+) -> tuple[list[TrainConfig], Cast]:
+    """Returns the settings of each seed and the environments of a training; arguments and errors as `mqe_jax.learn`.
 
     `seeds` are trained in one program; by default the one of the settings.
     """
@@ -80,8 +71,8 @@ def prepare(
         fail("task", task, "a task's id, an environment such as that of mqe_jax.make, or a batch of environments")
     configs = [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
     if isinstance(task, str | QuadrupedEnv):
-        return Environments(configs, *environments(impl, settings, len(configs), task))
-    return Environments(configs, task, None)
+        return configs, environments(impl, settings, len(configs), task)
+    return configs, Cast(task)
 
 
 @checked(seeds=Seeds)
@@ -107,8 +98,8 @@ def make_learner(
     Raises:
         InputError: as `mqe_jax.learn`.
     """
-    (settings, *_), learning, _ = prepare(task, config, env, impl=impl, seeds=range(seeds))
-    return make_ppo(learning, settings)
+    (settings, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
+    return learner.make_learner(cast.env, settings, league=cast.league, teacher=cast.teacher)
 
 
 def make_env(
@@ -138,8 +129,8 @@ def parameters_of(task: str | QuadrupedEnv) -> dict[str, Any]:
     return {**control, **differences(task.params, task.Params())}
 
 
-def environments(impl: str, config: TrainConfig, seeds: int, task: str | QuadrupedEnv | None = None) -> tuple[Any, Any]:
-    """Returns training and evaluation environments (None without evaluation) of seeds trained together.
+def environments(impl: str, config: TrainConfig, seeds: int, task: str | QuadrupedEnv | None = None) -> Cast:
+    """Returns the environments of seeds trained together, and who else plays in them.
 
     The task is that of the settings, or `task` as in `make_env`.
 
@@ -148,17 +139,17 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
-    both, env = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    both, started = make_env(task, impl, config.training_env, config.num_envs, seeds)
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> Any:
         if demonstrator is None:
-            started = env if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
+            made = started if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
         else:
             policy = load_as("curriculum.demonstrator", demonstrator, both)
             everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
-            started = Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
-        return Deadline(started) if config.time_limit_ends else started
+            made = Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
+        return Deadline(made) if config.time_limit_ends else made
 
     eval_env = None
     if config.evaluation.every is not None:
@@ -166,30 +157,33 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     if config.train_env:
         _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env)
     _check_teams(both, config)
-    learning: Any
+    league = teacher = None
     if len(both.teams) < 2:
-        learning = batch(config.num_envs)
+        env = batch(config.num_envs)
     elif opponents:
         matches = batch(config.num_envs)
-        learning = League(BothSides(matches) if config.both_sides else matches, opponents, config)
+        league = League(BothSides(matches) if config.both_sides else matches, opponents, config)
+        env = league.env
     else:
-        learning = Mirror(batch(config.num_envs // 2))
+        env = Mirror(batch(config.num_envs // 2))
     if config.imitation.teacher is not None:
-        learning.teacher = load_as("imitation.teacher", config.imitation.teacher, both)
+        teacher = load_as("imitation.teacher", config.imitation.teacher, both)
     if len(both.teams) > 1 and eval_env is not None:
-        fixed = [opponent for opponent in opponents if opponent not in MOVING]
-        eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed or anchors(eval_env.env)[:1])
-    return learning, eval_env
+        fixed = Roster(opponents).fixed or anchors(eval_env.env)[:1]
+        if episodes % len(fixed):
+            fail("evaluation.episodes", episodes, f"a multiple of the number of opponents in evaluations, {len(fixed)}")
+        eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed)
+    return Cast(env, eval_env, league, teacher)
 
 
 def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
     """Raises an InputError where a training of seeds could not start."""
     check_loggers(config.loggers)
-    env, _ = environments(impl, config, seeds)
-    make_ppo(env, config)
+    cast = environments(impl, config, seeds)
+    learner.make_learner(cast.env, config, league=cast.league, teacher=cast.teacher)
     if config.start is not None:
-        network = config.network.build(env_dims(env, config))
-        policy_to_start(env.name, jax.eval_shape(network.init, initial_key(config)), config)
+        network = config.network.build(env_dims(cast.env, config))
+        policy_to_start(cast.env.name, jax.eval_shape(network.init, initial_key(config)), config)
 
 
 def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv) -> None:

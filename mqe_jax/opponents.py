@@ -167,7 +167,7 @@ class Versus(OneTeam):
         if policy.architecture != first.architecture:
             other = f"{policy.architecture}, not {first.architecture}"
             raise InputError(f"policy: of another architecture than block {block}: {other}")
-        changed = exchanged(opponent, _arrays(policy), at_once=at_once)
+        changed = exchange(opponent, _arrays(policy), at_once=at_once)
         return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
 
     @property
@@ -291,7 +291,7 @@ class Mirror(OneTeam):
         )
 
 
-def exchanged(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:
+def exchange(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:
     """Returns the opponent of a block with other arrays; see `Versus.change`."""
     if at_once:
         return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting))

@@ -98,17 +98,17 @@ def shared_programs() -> Iterator[None]:
     from mqe_jax.train.seeds import Seeds
 
     learners, seeds, seeds_map = _kept_programs()
-    make_ppo = start.make_ppo
+    make_learner = start.make_learner
     others = dict.fromkeys(("seed", "start", "evaluation", "checkpoint", "loggers", "task", "env"))
 
-    def shared_learner(env: Any, config: Any, trace: Any = None, processes: int = 1) -> Any:
-        key = env, repr(vars(config) | others), getattr(trace, "__func__", None), processes
+    def shared_learner(env: Any, config: Any, **options: Any) -> Any:
+        key = env, repr(vars(config) | others), *options.values()
         if key not in learners:
-            learners[key] = make_ppo(env, config, trace, processes)
+            learners[key] = make_learner(env, config, **options)
         return learners[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(start, "make_ppo", shared_learner)
+        patch.setattr(start, "make_learner", shared_learner)
         patch.setattr(Seeds, "map", seeds_map)
         patch.setattr(runner, "Seeds", seeds)
         yield

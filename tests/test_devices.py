@@ -15,7 +15,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.settings import build
 from mqe_jax.train import devices
 from mqe_jax.train.config import PPO, TrainConfig
-from mqe_jax.train.learner import make_ppo
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.rollout import minibatches
 
 KEY = jax.random.PRNGKey(3)
@@ -98,8 +98,8 @@ def test_two_shares_are_one_batch(network: str) -> None:
         | ({"hidden_sizes": (8,), "chunk_length": 4} if network != "mat" else {"width": 8}),
     }
     config = build(TrainConfig, values)
-    whole = make_ppo(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 8), config)
-    share = make_ppo(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
+    whole = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 8), config)
+    share = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
 
     def run(init: Callable[[Any], Any], update: Callable[[Any], Any]) -> Callable[[Any], Any]:
         init, update = jax.jit(init), jax.jit(update)
@@ -122,4 +122,4 @@ def test_groups_that_do_not_fit(count: int, groups: int, said: str) -> None:
     config = build(TrainConfig, {"num_envs": 4, "rollout_steps": 4, "ppo": {"minibatches": 2, "groups": groups}})
     env = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4 // count if count == 2 else 4)
     with pytest.raises(InputError, match=said):
-        make_ppo(env, config, processes=2 if count == 2 else 1)
+        make_learner(env, config, processes=2 if count == 2 else 1)

@@ -184,10 +184,10 @@ def test_what_cannot_be_evaluated_is_named(
 def test_an_environment_keeps_its_parameters() -> None:
     """Those in which it differs from its task's are the run's."""
     env = mqe_jax.make("go1gate", impl="c", control="position", gate_width=0.7, rewards={"collision": -5.0})
-    (config,), learning, evaluation = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, {"robot": "go2"})
+    (config,), cast = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, {"robot": "go2"})
     assert config.env == {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}, "robot": "go2"}
-    assert to_mapping(evaluation.env.params) == to_mapping(env.params) | {"robot": "go2"}
-    assert learning.env.params.gate_width == 0.7 and learning.env.control == "position"
+    assert to_mapping(cast.eval_env.env.params) == to_mapping(env.params) | {"robot": "go2"}
+    assert cast.env.env.params.gate_width == 0.7 and cast.env.env.control == "position"
     assert build.players(env, "idle").env.params == env.params
 
 
@@ -228,7 +228,7 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
 
     result = mqe_jax.evaluate("fake", "forward", episodes=2)
 
-    def measure(batch: Any, policy: Any, episodes: int, key: Any, recorder: Any) -> mqe_jax.Result:
+    def measure(batch: Any, policy: Any, episodes: int, key: Any) -> mqe_jax.Result:
         played.update(batch=batch, policy=policy)
         return result
 

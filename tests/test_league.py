@@ -28,7 +28,7 @@ from mqe_jax.opponents import versus
 from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import TrainState, env_dims, make_ppo
+from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.policy import policy_of, read_policy, save_policy
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
@@ -70,8 +70,8 @@ def config_of(sources: tuple[str, ...] = SOURCES, **settings: Any) -> TrainConfi
 def history() -> list[TrainState]:
     """States of a training after each update; episodes have ten steps, a rollout four, a snapshot is due every one."""
     config = config_of()
-    env = League(matches(num_envs=8), SOURCES, config)
-    learner = make_ppo(env, config)
+    league = League(matches(num_envs=8), SOURCES, config)
+    learner = make_learner(league.env, config, league=league)
     update, states = jax.jit(learner.update), [jax.jit(learner.init)(KEY)]
     for _ in range(9):
         states.append(update(states[-1])[0])
@@ -94,14 +94,14 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
 
 def test_new_environments_play_what_the_league_says(history: list[TrainState]) -> None:
     """As after a resume without environments: they are reset, and the rest is of an earlier update."""
-    env = League(matches(num_envs=8), SOURCES, config_of())
-    reset = env.reset(KEY)
+    league = League(matches(num_envs=8), SOURCES, config_of())
+    reset = league.env.reset(KEY)
     state = dataclasses.replace(history[9], rollout=history[9].rollout._replace(env_state=reset))
-    newest, *drawn, idle = env.seated(state).rollout.env_state.opponents
+    newest, *drawn, idle = league.seat(state).rollout.env_state.opponents
     same = lambda x, y: jax.tree.map(np.testing.assert_array_equal, x, y)  # noqa: E731
     for opponent, arrays in (
-        (newest, env._own(state)),
-        *((o, env._member(state.extra, 1 + i)) for i, o in enumerate(drawn)),
+        (newest, league._own(state)),
+        *((o, league._member(state.extra, 1 + i)) for i, o in enumerate(drawn)),
     ):
         same(opponent.arrays, arrays)
         same(opponent.before, arrays)
@@ -110,12 +110,12 @@ def test_new_environments_play_what_the_league_says(history: list[TrainState]) -
 
 def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainState], tmp_path: Path) -> None:
     config, state = config_of(start=str(tmp_path)), history[9]
-    env = League(matches(num_envs=8), SOURCES, config)
-    save_policy(tmp_path, policy_of(state, env_dims(env, config), config, task=env.name, env_steps=0))
-    learner, processes = own_learner(env, config, None)
-    begun, _ = first_state(env, learner, processes, config, None, Seeds(learner.init, 1).shared)
-    mine = env._own(begun)
-    jax.tree.map(np.testing.assert_array_equal, mine.params, env._own(state).params)
+    league = League(matches(num_envs=8), SOURCES, config)
+    save_policy(tmp_path, policy_of(state, env_dims(league.env, config), config, task="go1tug", env_steps=0))
+    learner, processes = own_learner(league.env, config, league)
+    begun, _ = first_state("go1tug", learner, processes, config, None, Seeds(learner.init, 1).shared, league)
+    mine = league._own(begun)
+    jax.tree.map(np.testing.assert_array_equal, mine.params, league._own(state).params)
     for arrays in (
         jax.tree.map(lambda x: x[0], begun.extra.pool.arrays),
         *(o.arrays for o in begun.rollout.env_state.opponents[:3]),
@@ -125,11 +125,11 @@ def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainSt
 
 def test_a_league_resumed_without_environments_plays_its_members(history: list[TrainState], tmp_path: Path) -> None:
     config, state = config_of(), history[9]
-    env = League(matches(num_envs=8), SOURCES, config)
-    metadata = {"task": env.name, "config": to_mapping(config), "environments": False}
+    league = League(matches(num_envs=8), SOURCES, config)
+    metadata = {"task": "go1tug", "config": to_mapping(config), "environments": False}
     file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
-    learner, processes = own_learner(env, config, None)
-    resumed, _ = first_state(env, learner, processes, config, file, Seeds(learner.init, 1).shared)
+    learner, processes = own_learner(league.env, config, league)
+    resumed, _ = first_state("go1tug", learner, processes, config, file, Seeds(learner.init, 1).shared, league)
     seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)
     for now, before in seats:
         jax.tree.map(np.testing.assert_array_equal, now.arrays, before.arrays)
@@ -162,7 +162,7 @@ def test_a_block_plays_another_member_after_its_episodes(history: list[TrainStat
 
 
 def test_a_block_keeps_its_member_while_episodes_against_the_last_one_run(history: list[TrainState]) -> None:
-    env = League(matches(num_envs=8), SOURCES, config_of())
+    rules = League(matches(num_envs=8), SOURCES, config_of())
 
     @jax.jit
     def members(state: TrainState) -> jax.Array:
@@ -170,7 +170,7 @@ def test_a_block_keeps_its_member_while_episodes_against_the_last_one_run(histor
 
         def one(key: jax.Array) -> jax.Array:
             league = state.extra._replace(key=key, played=jnp.full_like(state.extra.played, 5))
-            return env.after(dataclasses.replace(state, extra=league))[0].extra.member
+            return rules.after(dataclasses.replace(state, extra=league))[0].extra.member
 
         return jax.vmap(one)(jax.random.split(KEY, 16))
 
@@ -185,19 +185,19 @@ def test_a_winning_policy_joins_early_but_not_at_once(
 ) -> None:
     """A snapshot is due every eight updates, after two of them where the policy wins often: here half of its games."""
     league = {**SMALL, "snapshot_steps": 256, "snapshot_win_rate": win_rate}
-    env, state = League(matches(num_envs=8), SOURCES, config_of(league=league)), history[1]
+    rules, state = League(matches(num_envs=8), SOURCES, config_of(league=league)), history[1]
     state = dataclasses.replace(state, extra=state.extra._replace(snapshot=jnp.int32(0)))
 
     def last(updates: jax.Array) -> jax.Array:
-        return env.after(dataclasses.replace(state, updates=updates))[0].extra.snapshot
+        return rules.after(dataclasses.replace(state, updates=updates))[0].extra.snapshot
 
     assert jax.jit(jax.vmap(last))(jnp.array([1, 2, 7, 8], jnp.int32)).tolist() == snapshots
 
 
 def test_blocks_with_other_opponents_protect_no_member(history: list[TrainState]) -> None:
-    env, state = League(matches(num_envs=8), SOURCES, config_of()), history[5]
+    rules, state = League(matches(num_envs=8), SOURCES, config_of()), history[5]
     beaten = state.extra.pool._replace(score=jnp.array([9.0, 8.0, 7.0, 0.0]), games=jnp.full(4, 9.0))
-    after = jax.jit(env.after)
+    after = jax.jit(rules.after)
     for member, replaced in (([0, 2, 3, 0], 0), ([0, 0, 3, 0], 1), ([0, 0, 1, 0], 2)):
         league = state.extra._replace(pool=beaten, member=jnp.array(member, jnp.int32), played=jnp.zeros(4, jnp.int32))
         born = after(dataclasses.replace(state, updates=jnp.int32(99), extra=league))[0].extra.pool.born
@@ -304,8 +304,7 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
 
 
 def test_a_process_has_a_league_of_its_own_environments() -> None:
-    env = League(matches(num_envs=8), SOURCES, config_of()).share(2)
-    assert isinstance(env, League) and env.learner_hook is env
+    env = League(matches(num_envs=8), SOURCES, config_of()).env.share(2)
     assert env.num_envs == env.inner.num_envs == 4
 
 
@@ -348,7 +347,10 @@ def test_a_round_robin_names_what_is_wrong() -> None:
 def test_where_the_scripted_policy_does_not_fit_the_anchor_is_an_idle_team(params: dict[str, Any]) -> None:
     assert setup.anchors(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == ["idle", "random"]
     changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
-    assert setup.environments("c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1)[1] is not None
+    assert (
+        setup.environments("c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1).eval_env
+        is not None
+    )
 
 
 def test_a_tournament_meets_every_pair_on_both_sides(

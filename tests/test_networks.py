@@ -30,7 +30,7 @@ from mqe_jax.settings import build, override
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.learner import make_ppo
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import NETWORKS, EnvDims, Network
 from mqe_jax.train.policy import TrainedPolicy, read_policy
@@ -63,7 +63,7 @@ def settings(algorithm: str, *changes: dict[str, Any]) -> TrainConfig:
 
 def learn(env: VectorEnv, config: TrainConfig, updates: int, last: int) -> float:
     """Trains and returns the mean reward per step over the last updates."""
-    learner = make_ppo(env, config)
+    learner = make_learner(env, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(1))
     update = jax.jit(learner.update)
     rewards = []

@@ -24,7 +24,7 @@ from mqe_jax.settings import build
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.learner import env_dims, make_ppo
+from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import score
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
@@ -189,7 +189,7 @@ def test_the_trainer_sees_one_team(kind: str) -> None:
     env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)
     settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
     config = build(TrainConfig, {**SETTINGS, **settings, "num_envs": env.num_envs})
-    learner = make_ppo(env, config)
+    learner = make_learner(env, config)
     dims = env_dims(env, config)
     assert (dims.agents, dims.values) == (inner.num_agents // 2, 1)
     if kind == "versus":

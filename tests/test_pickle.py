@@ -44,9 +44,9 @@ def matches() -> VectorEnv:
     return VectorEnv(walking("go1wrestling"), 2)
 
 
-def league() -> League:
+def league() -> Any:
     values = {"num_envs": 2, "rollout_steps": 2, "total_steps": 8, "opponents": ["newest", "older"]}
-    return League(matches(), ["newest", "older"], build(TrainConfig, values))
+    return copied(League(matches(), ["newest", "older"], build(TrainConfig, values))).env
 
 
 BATCHES: dict[str, Callable[[], Any]] = {

@@ -21,7 +21,7 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.settings import build
 from mqe_jax.terrain import Gate, Track
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import make_ppo
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.logs import row_of
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
 from mqe_jax.train.optim import adam
@@ -104,10 +104,10 @@ def test_metrics_of_episodes_are_missing_without_any() -> None:
 
 def test_a_league_without_games_has_metrics_and_no_change() -> None:
     env: Any = object.__new__(league.League)
-    env.sources, env._moving, env._scripted = ("older", "scripted"), np.array([True, False]), np.array([False, True])
+    env._roster = league.Roster(("older", "scripted"))
     start, none = pool.new_pool({"x": jnp.zeros(1)}, 2), jnp.zeros(2, jnp.int32)
     state = league.LeagueState(start, none, none, jnp.float32(100.0), jnp.int32(0), jnp.zeros((2, 3)), KEY)
-    after = env._recorded(state, [SimpleNamespace(outcomes=jnp.zeros(3, jnp.int32))] * 2)
+    after = env._record(state, [SimpleNamespace(outcomes=jnp.zeros(3, jnp.int32))] * 2)
     jax.tree.map(np.testing.assert_array_equal, after, state)
     assert {float(x) for name, x in env._metrics(after).items() if name.count("/") == 2} == {0.0}
 
@@ -139,7 +139,7 @@ def test_rewards_that_are_always_zero_leave_everything_finite() -> None:
         },
     )
     env = Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4)
-    learner = make_ppo(env, config)
+    learner = make_learner(env, config)
     state, metrics = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state.params)) and float(metrics["value_mean"]) == 0.0
     assert np.isfinite(float(metrics["explained_variance"]))

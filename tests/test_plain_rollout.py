@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.league import league, pool
-from mqe_jax.opponents import Mirror, Opponent, exchanged
+from mqe_jax.opponents import Mirror, Opponent, exchange
 from mqe_jax.policies import BothTeams, load_policy
 from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import Network
@@ -88,7 +88,7 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
 
     @jax.jit
     def both(state: RolloutState) -> Any:
-        options = {"normalize": True, "action_scale": 0.25, "trace_step": None}
+        options = {"normalize": True, "action_scale": 0.25}
         found = []
         for _ in range(2):
             state, *rest = rollout(env, network, params, ObservationNormalizer(*statistics), state, KEY, 4, **options)
@@ -194,7 +194,7 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
     sources, members = ("newest", "older", "scripted", "uniform", "idle"), 4
     moving, scripted = np.isin(sources, ("older", "uniform")), np.isin(sources, ("scripted",))
     env: Any = object.__new__(league.League)
-    env.sources, env._moving, env._scripted, env._members = sources, moving, scripted, members
+    env._roster, env._members = league.Roster(sources), members
     random = np.random.default_rng(0)
     ratings = random.normal(0, 200, members).astype(np.float32)
     start = pool.new_pool({"x": jnp.zeros(1)}, members)._replace(
@@ -207,7 +207,7 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
         member = random.integers(0, 3, 5)
         outcomes = random.integers(0, 400 if number % 7 == 0 else 4, (5, 3)) * (random.random((5, 1)) < 0.7)
         state = state._replace(member=jnp.asarray(member, jnp.int32))
-        state = env._recorded(state, [SimpleNamespace(outcomes=jnp.asarray(row)) for row in outcomes])
+        state = env._record(state, [SimpleNamespace(outcomes=jnp.asarray(row)) for row in outcomes])
         gained, met = 0.0, set()
         for i, (wins, draws, losses) in enumerate(outcomes):
             count, points = wins + draws + losses, wins + 0.5 * draws
@@ -246,7 +246,7 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
 def test_blocks_draw_the_members_that_their_source_says() -> None:
     """Of two members one is always beaten, the other never; a block that has not played enough keeps its member."""
     env: Any = object.__new__(league.League)
-    env.sources, env._moving = ("older", "uniform", "older", "idle"), np.array([True, True, True, False])
+    env._roster = league.Roster(("older", "uniform", "older", "idle"))
     env._config = SimpleNamespace(league=SimpleNamespace(episodes=5))
     now = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(born=jnp.array([0, 3, -1]), games=jnp.full(3, 1e6))
     now, none = now._replace(score=jnp.array([1e6, 0.0, 0.0])), jnp.zeros(4, jnp.int32)
@@ -255,7 +255,7 @@ def test_blocks_draw_the_members_that_their_source_says() -> None:
     def drawn(key: jax.Array) -> Any:
         played = jnp.array([5, 6, 4, 9], jnp.int32)
         state = league.LeagueState(now, none, played, jnp.zeros(()), jnp.int32(0), jnp.zeros((4, 3)), key)
-        after, redrawn = env._redrawn(state, opponents)
+        after, redrawn = env._draw(state, opponents)
         return after.member, after.played, redrawn
 
     member, played, redrawn = jax.jit(jax.vmap(drawn))(jax.random.split(KEY, 512))
@@ -267,11 +267,11 @@ def test_blocks_draw_the_members_that_their_source_says() -> None:
 def test_a_second_change_replaces_only_the_opponent_that_is_waited_for() -> None:
     waiting = jnp.array([True, False])
     one = Opponent(jnp.float32(1.0), jnp.float32(0.0), waiting, (), jnp.zeros(3, jnp.int32))
-    two = exchanged(one, jnp.float32(2.0))
+    two = exchange(one, jnp.float32(2.0))
     assert (float(two.arrays), float(two.before), two.waiting.tolist()) == (2.0, 0.0, [True, False])
-    free = exchanged(dataclasses.replace(two, waiting=~jnp.ones(2, bool)), jnp.float32(3.0))
+    free = exchange(dataclasses.replace(two, waiting=~jnp.ones(2, bool)), jnp.float32(3.0))
     assert (float(free.arrays), float(free.before), free.waiting.tolist()) == (3.0, 2.0, [True, True])
-    now = exchanged(two, jnp.float32(4.0), at_once=True)
+    now = exchange(two, jnp.float32(4.0), at_once=True)
     assert (float(now.arrays), float(now.before), now.waiting.tolist()) == (4.0, 4.0, [False, False])
 
 

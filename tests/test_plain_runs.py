@@ -22,7 +22,7 @@ from mqe_jax.settings import build, to_mapping
 from mqe_jax.train import learner as learning
 from mqe_jax.train.checkpoint import save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import env_dims, make_ppo
+from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import Seeds
@@ -87,7 +87,7 @@ def test_environments_get_the_assistance_of_the_schedule_and_of_their_success(
 ) -> None:
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
     values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5, "assistance_step": step}}
-    learner = make_ppo(Help(needed), build(TrainConfig, {**values, "network": {"recurrent": False}}))
+    learner = make_learner(Help(needed), build(TrainConfig, {**values, "network": {"recurrent": False}}))
     state, update = jax.jit(learner.init)(KEY), jax.jit(learner.update)
     for assistance in expected:
         state, metrics = update(state)
@@ -98,15 +98,15 @@ def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp
     env = Probe(probes.show_hidden, probes.pay_one, N)
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 4, "checkpoint": {"environments": False}}
     config = build(TrainConfig, {**values, "network": {"recurrent": False}})
-    learner, processes = own_learner(env, config, None)
+    learner, processes = own_learner(env, config)
     shared = Seeds(learner.init, 1).shared
-    start, _ = first_state(env, learner, processes, config, None, shared)
+    start, _ = first_state("probe", learner, processes, config, None, shared)
     keys = [start.rollout.env_state.key.tolist()]
     metadata = {"task": "probe", "config": to_mapping(config), "seconds": 1.0, "environments": False}
     for updates in (1, 2):
         later = without_environments(start) | {"updates": jnp.int32(updates)}
         path = save_checkpoint(tmp_path, later, 16 * updates, metadata, keep=2)
-        state, seconds = first_state(env, learner, processes, config, path, shared)
+        state, seconds = first_state("probe", learner, processes, config, path, shared)
         keys.append(state.rollout.env_state.key.tolist())
         assert seconds == 1.0 and int(state.updates) == updates and state.key.tolist() == start.key.tolist()
     assert len({tuple(key) for key in keys}) == 3
@@ -125,7 +125,7 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
         config = build(
             TrainConfig, {**values, "network": {"recurrent": False, "hidden_sizes": [4]}, "rollout_steps": 4}
         )
-        state = jax.jit(make_ppo(env, config).init)(KEY)
+        state = jax.jit(make_learner(env, config).init)(KEY)
         policy = policy_of(state, env_dims(env, config), config, task="probe")
         one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
         assert (one["env_steps"], two["env_steps"]) == (3, 5) and one["sampled"] == two["sampled"] != one[
@@ -154,7 +154,7 @@ def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> N
 def test_a_member_joins_with_the_learners_rating_and_weights() -> None:
     """A snapshot is due every four updates, and a place in use by a block that plays members is kept."""
     env: Any = object.__new__(league.League)
-    env._moving, env._members = np.array([True, False]), 2
+    env._roster, env._members = league.Roster(("older", "idle")), 2
     settings = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=1.0)
     env._config = SimpleNamespace(league=settings, steps_per_update=4)
     full = pool.new_pool({"x": jnp.zeros(1)}, 2)._replace(born=jnp.array([0, 1]), score=jnp.array([9.0, 5.0]))

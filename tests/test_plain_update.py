@@ -82,12 +82,16 @@ def config_of(name: str) -> TrainConfig:
     return build(TrainConfig, {**{k: v for k, v in SETTINGS[name].items() if k not in merged}, **merged})
 
 
+def learner_of(env: Any, config: TrainConfig) -> learning.Learner:
+    return learning.make_learner(env, config, teacher=Teacher() if config.imitation.teacher else None)
+
+
 def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tuple[Any, Transition]:
     """A state after some updates, whose statistics are not trivial, and a rollout of random numbers."""
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
-    env = dataclasses.replace(env, teacher=Teacher(), show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
+    env = dataclasses.replace(env, show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
     normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
-    shapes = jax.eval_shape(learning.make_ppo(env, config).init, jax.random.PRNGKey(0))
+    shapes = jax.eval_shape(learner_of(env, config).init, jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     size = env.observation_size, env.privileged_observation_size
     statistics = [RunningStatistics(0.3 * normal(n), normal(n) ** 2, jnp.float32(30.0)) for n in size]
@@ -329,7 +333,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
     length = config.network.build(learning.env_dims(env, config)).chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
     monkeypatch.setattr(learning, "minibatches", lambda *_: jnp.asarray(order))
-    after, metrics = jax.jit(learning.make_ppo(env, config).update)(state)
+    after, metrics = jax.jit(learner_of(env, config).update)(state)
 
     plain = Plain(config, state, data)
     plain.prepare()

@@ -30,7 +30,7 @@ from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
-from tests.training import Probe, Traces
+from tests.training import Probe
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -226,22 +226,22 @@ def stop_after(updates: int) -> Any:
 
 
 @pytest.fixture(scope="module")
-def alone(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Traces, TrainState]:
-    """A training of seed 1 by itself: its folder, recorded steps and last state."""
-    folder, recorder = tmp_path_factory.mktemp("alone"), Traces()
-    (state,) = train_seeds(PROBE, [seeded(1)], [folder], recorder=recorder)
-    return folder, recorder, state
+def alone(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
+    """A training of seed 1 by itself: its folder and last state."""
+    folder = tmp_path_factory.mktemp("alone")
+    (state,) = train_seeds(PROBE, [seeded(1)], [folder])
+    return folder, state
 
 
 @pytest.mark.soak
-def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
+def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path, alone: tuple[Path, TrainState]) -> None:
     configs = [seeded(seed) for seed in (0, 1, 2)]
     folders = [tmp_path / f"seed{config.seed}" for config in configs]
     with pytest.raises(Stop):
         train_seeds(PROBE, configs, folders, on_update=stop_after(2))
     (folders[1] / "checkpoints" / "step_000000000032.safetensors").unlink()  # killed between two seeds' checkpoints
     states = train_seeds(PROBE, configs, folders, resume=True)
-    pairs = zip(jax.tree.leaves(states[1].params), jax.tree.leaves(alone[2].params), strict=True)
+    pairs = zip(jax.tree.leaves(states[1].params), jax.tree.leaves(alone[1].params), strict=True)
     for together, single in pairs:
         np.testing.assert_allclose(together, single, rtol=1e-4, atol=1e-5)
     assert int(states[1].updates) == 5
@@ -273,21 +273,16 @@ def test_seeds_killed_between_two_checkpoints_resume(tmp_path: Path, monkeypatch
         assert [row["env_steps"] for row in rows(folder)] == ["16", "32", "48", "64", "80"]
 
 
-def test_seeds_together_are_recorded_and_learn_as_alone(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
-    recorder, folders = Traces(), [tmp_path / "0", tmp_path / "1"]
-    train_seeds(PROBE, [seeded(0), seeded(1)], folders, recorder=recorder)
-    assert len(recorder.all) == len(alone[1].all) == 5
-    for together, single in zip(recorder.all, alone[1].all, strict=True):
-        assert together.snapshot.shape == together.diverged.shape == (4, 8)
-        np.testing.assert_array_equal(together.snapshot[:, 4:], single.snapshot)
-        np.testing.assert_allclose(together.action[:, 4:], single.action, atol=1e-4)
+def test_seeds_together_learn_as_alone(tmp_path: Path, alone: tuple[Path, TrainState]) -> None:
+    folders = [tmp_path / "0", tmp_path / "1"]
+    train_seeds(PROBE, [seeded(0), seeded(1)], folders)
     for one, other in zip(rows(folders[1]), rows(alone[0]), strict=True):
-        assert one.keys() == other.keys() and "trace" not in one
+        assert one.keys() == other.keys()
         for name in one.keys() - {"seconds", "fps"}:
             np.testing.assert_allclose(float(one[name]), float(other[name]), rtol=1e-3, atol=1e-5, err_msg=name)
 
 
-def test_a_seed_without_a_checkpoint_is_named(tmp_path: Path, alone: tuple[Path, Traces, TrainState]) -> None:
+def test_a_seed_without_a_checkpoint_is_named(tmp_path: Path, alone: tuple[Path, TrainState]) -> None:
     with pytest.raises(InputError, match=f"{alone[0].name} 80, new none"):
         train_seeds(PROBE, [seeded(1), seeded(2)], [alone[0], tmp_path / "new"], resume=True)
     assert not (tmp_path / "new").exists()
@@ -298,9 +293,7 @@ def test_seeds_must_have_the_same_settings(tmp_path: Path) -> None:
         train_seeds(PROBE, [seeded(0), seeded(1, ppo__clip=0.3)], [tmp_path / "a", tmp_path / "b"])
 
 
-def test_a_checkpoint_without_environments_is_small_and_resumes(
-    tmp_path: Path, alone: tuple[Path, Traces, TrainState]
-) -> None:
+def test_a_checkpoint_without_environments_is_small_and_resumes(tmp_path: Path, alone: tuple[Path, TrainState]) -> None:
     config = seeded(1, checkpoint__environments=False)
     with pytest.raises(Stop):
         train(PROBE, config, tmp_path, on_update=stop_after(2))
@@ -315,8 +308,8 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
     configs = [seeded(seed, evaluation__every=2, evaluation__episodes=4) for seed in (0, 1)]
     folders = [tmp_path / f"seed{config.seed}" for config in configs]
     with pytest.raises(Stop):
-        train_seeds(PROBE, configs, folders, on_update=stop_after(4), eval_env=PROBE, recorder=Traces())
-    train_seeds(PROBE, configs, folders, resume=True, eval_env=PROBE, recorder=Traces())
+        train_seeds(PROBE, configs, folders, on_update=stop_after(4), eval_env=PROBE)
+    train_seeds(PROBE, configs, folders, resume=True, eval_env=PROBE)
     for folder in folders:
         record = json.loads((folder / "evaluations.json").read_text())
         assert [e["env_steps"] for e in record["evaluations"]] == [32, 64, 80]

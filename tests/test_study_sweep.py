@@ -23,6 +23,7 @@ from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.types import Cast
 from tests import training as probes
 from tests.training import Probe
 
@@ -75,7 +76,7 @@ def run_until(folder: Path, sweep: Sweep, updates: int) -> bool:
             raise Stop
 
     try:
-        sweeps.run(folder, sweeps.plan(sweep, folder, config_of), lambda config, seeds: (PROBE, PROBE), on_update)
+        sweeps.run(folder, sweeps.plan(sweep, folder, config_of), lambda config, seeds: Cast(PROBE, PROBE), on_update)
     except Stop:
         return False
     return True
@@ -111,9 +112,9 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
     jobs = sweeps.plan(sweep, folder, config_of)
     trained: list[str] = []
 
-    def environments(config: TrainConfig, seeds: int) -> tuple[Probe, Probe]:
+    def environments(config: TrainConfig, seeds: int) -> Cast:
         trained.append(config.ppo.ratio)
-        return PROBE, PROBE
+        return Cast(PROBE, PROBE)
 
     jobs[0].folders[1].mkdir(parents=True)
     with locked(jobs[0].folders[1]):
@@ -127,10 +128,10 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
 def test_a_run_that_becomes_non_finite_does_not_keep_others_from_training(tmp_path: Path) -> None:
     sweep, folder = load(tmp_path), tmp_path / "study"
 
-    def environments(config: TrainConfig, seeds: int) -> tuple[Probe, Probe]:
+    def environments(config: TrainConfig, seeds: int) -> Cast:
         if config.ppo.ratio == "dimension":
             raise NonFiniteError("the first job")
-        return PROBE, PROBE
+        return Cast(PROBE, PROBE)
 
     outcome = sweeps.run(folder, sweeps.plan(sweep, folder, config_of), environments)
     assert [str(error) for _, error in outcome.failed] == ["the first job"] and not outcome.others
@@ -144,11 +145,11 @@ def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) ->
     sweeps.prepare(sweep, folder)
     asked = iter([False, False, False, True, True])
     jobs = sweeps.plan(sweep, folder, config_of)
-    assert sweeps.run(folder, jobs, lambda config, seeds: (PROBE, PROBE), stop=lambda: next(asked)) == ([], [])
+    assert sweeps.run(folder, jobs, lambda config, seeds: Cast(PROBE, PROBE), stop=lambda: next(asked)) == ([], [])
     shutil.copytree(folder, there)
     left = sweeps.plan(sweep, there, config_of)
     assert [job.steps_left for job in left] == [32]
-    assert sweeps.run(there, left, lambda config, seeds: (PROBE, PROBE)) == ([], [])
+    assert sweeps.run(there, left, lambda config, seeds: Cast(PROBE, PROBE)) == ([], [])
     for run in read_runs(there):
         assert list(run.curve["env_steps"]) == [16, 32, 48] and len(run.evaluations) == 2
 
@@ -323,12 +324,12 @@ def test_a_cell_that_fails_is_named_and_the_others_are_trained(
     load(tmp_path)
     trained: list[str] = []
 
-    def train(env: Probe, configs: list[TrainConfig], *_: object, **named: object) -> None:
+    def train(configs: list[TrainConfig], **named: object) -> None:
         if configs[0].ppo.ratio == "dimension":
             raise InputError("opponents: this one cannot be read")
         trained.append(configs[0].ppo.ratio)
 
-    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: (PROBE, PROBE))
+    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
     monkeypatch.setattr(sweeps, "train_seeds", train)
     monkeypatch.setattr("mqe_jax.study.report.report", lambda folder: [])
     assert cli.main(["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]) == 2
@@ -364,7 +365,7 @@ def test_the_commands_say_what_is_left_and_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     load(tmp_path)
-    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: (PROBE, PROBE))
+    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
     arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]
     assert cli.main([*arguments, "--dry-run"]) == 0
     out = capfd.readouterr().out

@@ -21,7 +21,7 @@ from mqe_jax.settings import build
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.learner import make_ppo
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
@@ -86,7 +86,8 @@ def test_a_league_trains_in_single_precision() -> None:
     values = {"num_envs": 4, "rollout_steps": 4, "total_steps": 64, "league": {"members": 4}, "opponents": sources}
     with strict_x64():
         config = build(TrainConfig, values)
-        learner = make_ppo(League(matches(), sources, config), config)
+        league = League(matches(), sources, config)
+        learner = make_learner(league.env, config, league=league)
         state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
         assert kinds(jax.eval_shape(learner.update, state)[0]) == kinds(state)
 

@@ -15,11 +15,11 @@ from mqe_jax.policies import SimplePolicy
 from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
-from mqe_jax.train.learner import TrainState, env_dims, make_ppo
+from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.types import VectorEnv
 from tests import training as probes
-from tests.training import Probe, Traces
+from tests.training import Probe
 
 
 def small(**values: Any) -> TrainConfig:
@@ -37,7 +37,7 @@ def small(**values: Any) -> TrainConfig:
 
 def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState, dict[str, jax.Array]]:
     """Runs updates and returns the last state and metrics."""
-    learner = make_ppo(env, config)
+    learner = make_learner(env, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     update = jax.jit(learner.update)
     metrics = {}
@@ -69,7 +69,7 @@ def test_small_rewards_are_learnt_as_large_ones() -> None:
         """The values of both signs in units of the scale, and the explained variance."""
         env = Probe(probes.show_hidden, lambda hidden, action: scale * hidden, num_envs=16)
         config = small(num_envs=16, ppo__epochs=1)
-        learner = make_ppo(env, config)
+        learner = make_learner(env, config)
         state, metrics = jax.lax.scan(
             lambda state, _: learner.update(state), learner.init(jax.random.PRNGKey(0)), None, 30
         )
@@ -105,7 +105,7 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
 def test_an_environment_of_two_teams_is_refused() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=32, teams=((1,), (0,)))
     with pytest.raises(ValueError, match="probe has 2 teams"):
-        make_ppo(env, small())
+        make_learner(env, small())
 
 
 def test_memory_carries_a_sign_through_an_episode() -> None:
@@ -138,7 +138,7 @@ class OnePass(NamedTuple):
 def one_pass() -> OnePass:
     """Runs updates of one epoch over one batch, with a recurrent network; odd environments have longer episodes."""
     env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
-    learner = make_ppo(
+    learner = make_learner(
         env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
     )
     update = jax.jit(learner.update)
@@ -175,7 +175,7 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
         return order
 
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    learner = make_ppo(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
+    learner = make_learner(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     monkeypatch.setattr(jax.random, "permutation", noted)
     jax.block_until_ready(jax.jit(learner.update)(state))
@@ -202,10 +202,10 @@ class Recurrent(Opposite):
 def test_a_teacher_is_imitated_while_its_weight_lasts() -> None:
     """The reward asks for the sign, the teacher shows the opposite: imitated at first, given up for the reward."""
     env = Probe(probes.show_hidden, lambda hidden, action: hidden * jnp.mean(jnp.clip(action[..., 0], -1, 1), -1))
-    env = dataclasses.replace(env, num_envs=32, teacher=Opposite())
+    env = dataclasses.replace(env, num_envs=32)
     config = small(total_steps=32 * 8 * 120, network__log_std_min=-1.0)
     config = override(config, {"imitation": {"teacher": "scripted", "weight": 20.0, "until": 0.5}})
-    learner = make_ppo(env, config)
+    learner = make_learner(env, config, teacher=Opposite())
     state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
     rewards = []
     for _ in range(120):
@@ -214,7 +214,7 @@ def test_a_teacher_is_imitated_while_its_weight_lasts() -> None:
     assert np.mean(rewards[20:40]) < -0.3
     assert np.mean(rewards[-10:]) > 0.6
     with pytest.raises(InputError, match=r"^imitation\.teacher: 'scripted' is not allowed; .* without recurrent state"):
-        make_ppo(dataclasses.replace(env, teacher=Recurrent()), config)
+        make_learner(env, config, teacher=Recurrent())
 
 
 def test_settings_must_fit_the_environment() -> None:
@@ -231,7 +231,7 @@ def test_settings_must_fit_the_environment() -> None:
         ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
     ):
         with pytest.raises(InputError, match=f"^{message}"):
-            make_ppo(env, small(**values))
+            make_learner(env, small(**values))
 
 
 class WrongSize(Probe):
@@ -243,7 +243,7 @@ class WrongSize(Probe):
 def test_a_wrong_observation_size_is_named() -> None:
     env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
     with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)"):
-        make_ppo(env, small(num_envs=4))
+        make_learner(env, small(num_envs=4))
 
 
 class Tuple(NamedTuple):
@@ -283,13 +283,13 @@ def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered
     config = small(num_envs=4, stagger_episodes=True, network__critic_input="observations", ppo__epochs=1)
     config = override(config, {"normalization.observations": True})
     config = override(config, {"curriculum.failure_bootstrap": 0.5})
-    learner = make_ppo(Foreign(), config)
+    learner = make_learner(Foreign(), config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(1))
     assert len(np.unique(state.rollout.env_state.step)) > 1
     _, metrics = jax.jit(learner.update)(state)
     assert all(np.isfinite(float(value)) for value in metrics.values())
     with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
-        make_ppo(Foreign(), small(num_envs=4))
+        make_learner(Foreign(), small(num_envs=4))
 
 
 def test_a_policy_of_another_task_is_not_evaluated() -> None:
@@ -300,12 +300,18 @@ def test_a_policy_of_another_task_is_not_evaluated() -> None:
 
 def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
     """Also those of different blocks, and of different evaluations in one program."""
-    env, recorder = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6), Traces()
+    env, seen = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6), []
+
+    def see(action: Any) -> Any:
+        seen.append(np.array(action))
+        return action
 
     def act(params: Any, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        return jax.random.uniform(key, (4, 2, 1)), memory
+        action = jax.random.uniform(key, (4, 2, 1))
+        shown = jax.pure_callback(see, action, action, vmap_method="broadcast_all")
+        return action, jnp.sum(shown, axis=(1, 2))  # so that the call is not left out
 
-    evaluator = Evaluator(env, act, block=2, recorder=recorder)
+    evaluator = Evaluator(env, act, jnp.zeros(4), block=2)
     evaluator(None, 4, jax.random.split(jax.random.PRNGKey(0), 2))
-    actions = np.concatenate([np.ravel(trace.action) for trace in recorder.all])
-    assert len(recorder.all) == 3 and len(np.unique(actions)) == actions.size == 6 * 2 * 4 * 2
+    actions = np.concatenate([np.ravel(action) for action in seen])
+    assert len(seen) == 6 and len(np.unique(actions)) == actions.size == 6 * 2 * 4 * 2

@@ -34,7 +34,7 @@ from mqe_jax.train.runner import open_training, train
 from mqe_jax.train.start import check_parameters, check_same, without_environments
 from mqe_jax.viz.curves import plot_curves, save_figure
 from tests import training as probes
-from tests.training import Probe, Traces, assert_same
+from tests.training import Probe, assert_same
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
@@ -390,14 +390,3 @@ def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, Train
     assert newest is not None
     with pytest.raises(ValueError, match="holds a checkpoint; a policy is needed"):
         read_policy(newest)
-
-
-def test_a_recorder_gets_every_step(tmp_path: Path) -> None:
-    training, evaluation = Traces(), Traces()
-    train(PROBE, settings(), tmp_path, recorder=training)
-    assert len(training.all) == 5 and training.all[0].snapshot.shape == (4, 4)
-    assert training.all[0].action.shape == (4, 4, 2, 1) and training.all[0].diverged.shape == (4, 4)
-    # The environment gets unbounded samples, which it clips to what it allows.
-    assert max(float(np.abs(trace.action).max()) for trace in training.all) > 1.0
-    evaluate_batch(PROBE, read_policy(tmp_path), 4, KEY, recorder=evaluation)
-    assert evaluation.all[0].snapshot.shape == (50, 4)

@@ -18,7 +18,7 @@ from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import JOINT_NAMES
 from mqe_jax.settings import override
-from mqe_jax.train.learner import TrainState, make_ppo
+from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.types import NetworkMemory
 from mqe_jax.walk.env import WalkEnv
@@ -73,7 +73,7 @@ def settings(**changes: Any) -> Any:
 def history() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
     """States and metrics of four updates of one gradient step, the first two of the critic alone."""
     config = settings(total_steps=4 * 48, ppo={"epochs": 1, "minibatches": 1, "critic_warmup": 0.5})
-    learner = make_ppo(probe(), config)
+    learner = make_learner(probe(), config)
     update, states, rows = jax.jit(learner.update), [jax.jit(learner.init)(jax.random.PRNGKey(0))], []
     for _ in range(4):
         state, metrics = update(states[-1])

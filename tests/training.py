@@ -22,7 +22,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.networks import Network
-from mqe_jax.train.types import Params, Trace
+from mqe_jax.train.types import Params
 
 
 @jax.tree_util.register_dataclass
@@ -66,7 +66,6 @@ class Probe:
     even_truncate: bool = False
     teams: tuple[tuple[int, ...], ...] = ((0, 1),)
     name: str = "probe"
-    teacher: Any = None
 
     @property
     def observation_size(self) -> int:
@@ -164,19 +163,6 @@ def pay_public_good(hidden: jax.Array, action: jax.Array) -> jax.Array:
 def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Reward maximal for equal actions: -2 variances if sampled independently, -1 if one depends on the other."""
     return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
-
-
-class Traces:
-    """A recorder that stores its traces."""
-
-    def __init__(self) -> None:
-        self.all: list[Trace] = []
-
-    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace:
-        return Trace(before.hidden, action, after.metrics["diverged"])
-
-    def add(self, trace: Trace) -> None:
-        self.all.append(trace)
 
 
 def random_params(network: Network, seed: int = 0) -> Params:

@@ -18,7 +18,7 @@ from mqe_jax.literal import echo
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
 from mqe_jax.train.folder import CONFIG_FILE
-from mqe_jax.train.learner import env_dims, make_ppo
+from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
@@ -43,7 +43,7 @@ def demo(arguments: Demo) -> None:
         "seed": config.seed + 1000,
     }
 
-    state = jax.jit(make_ppo(batch, config).init)(initial_key(config))
+    state = jax.jit(make_learner(batch, config).init)(initial_key(config))
     before = policy_of(state, env_dims(batch, config), config, task=DEMO_TASK)
     del state
     echo("mqe demo: evaluating the untrained policy")

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
 
-from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import content, save_recording
-from mqe_jax.envs.wrappers import WrappedState
+from mqe_jax.envs.wrappers import Outer, WrappedState
+from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder
 from mqe_jax.literal import echo
 from mqe_jax.opponents import TeamState
 from mqe_jax.settings import PathText, check, fail
-from mqe_jax.train.types import Trace
 
 STEPS = 64
 """Maximum number of steps in a recording, the last of which diverges."""
@@ -27,62 +28,81 @@ LIMIT = 100
 
 
 @contextlib.contextmanager
-def record_divergences(batch: Any, folder: str | Path | None) -> Iterator[DivergenceRecorder | None]:
-    """Yields a recorder of a batch's divergences, or None without a folder.
+def guard(batch: Any, folder: str | Path | None) -> Iterator[Any]:
+    """Yields a batch that records its divergences, or the batch itself without a folder.
 
     Prints at the end how many recordings there are, if any, and how to replay one.
     """
     if folder is None:
-        yield None
+        yield batch
         return
-    env = getattr(batch, "env", None)
-    if env is None:
+    if getattr(batch, "env", None) is None:
         fail("dump_diverged", folder, f"none: {batch.name} has no physics of this package")
-    recorder = DivergenceRecorder(env, Path(check("dump_diverged", folder, PathText)))
+    guarded = Guard(batch, Path(check("dump_diverged", folder, PathText)))
     try:
-        yield recorder
+        yield guarded
     finally:
-        if files := recorder.written:
+        if files := guarded.written:
             echo(f"mqe: recorded {len(files)} divergences; replay the first with: mqe replay {files[0]}")
 
 
-class DivergenceRecorder:
-    """Writes the last steps of environments that diverge to `FOLDER/diverged_0000.npz`, ..."""
+class Guard(Outer):
+    """A batch of environments that writes the last steps before a divergence to `FOLDER/diverged_0000.npz`, ...
+
+    Every step sends the fields on which it depends to the host, which keeps the last `STEPS`.
+    """
 
     written: list[Path]
     """Files written."""
 
-    def __init__(self, env: QuadrupedEnv, folder: Path) -> None:
+    def __init__(self, inner: Any, folder: Path) -> None:
+        super().__init__(inner)
         check_folder(folder, "dump_diverged")
-        self.written: list[Path] = []
-        self._env, self._folder = env, folder
-        self._previous: Trace | None = None
+        self.written = []
+        self._folder, self._steps = folder, deque[tuple[Any, np.ndarray]](maxlen=STEPS)
+        self._limit = LIMIT
 
-    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace:
-        """Returns the fields on which a step of all environments depends, and all agents' actions."""
+    def reset(self, key: jax.Array) -> Any:
+        """Returns the initial states of all environments."""
+        return self.inner.reset(key)
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        """Advances all environments by one step; see the wrapped batch."""
+        after = shown = self.inner.step(state, action)
         if isinstance(after, TeamState):
-            before, action, after = before.match, after.action, after.match
+            state, action, after = state.match, after.action, after.match
         while isinstance(after, WrappedState):
-            before, action, after = before.inner, after.action, after.inner
-        return Trace(content(before), action, after.metrics["diverged"])
+            state, action, after = state.inner, after.action, after.inner
+        diverged = shown.metrics["diverged"]
+        kind = jax.ShapeDtypeStruct(diverged.shape, diverged.dtype)
+        before = content(state), action, after.metrics["diverged"]
+        # Returns the metric, on which the program depends: it neither drops nor reorders the calls.
+        diverged = jax.pure_callback(self._see, kind, diverged, *before, vmap_method="broadcast_all")
+        return dataclasses.replace(shown, metrics={**shown.metrics, "diverged": diverged})
 
-    def add(self, trace: Trace) -> None:
-        """Writes a recording of each environment that diverged in a trace, with steps of the previous one if needed."""
-        for step, index in np.argwhere(np.asarray(trace.diverged) > 0.0)[: LIMIT - len(self.written)]:
-            parts = [trace] if self._previous is None else [self._previous, trace]
-            steps, actions = jax.tree.map(
-                lambda *leaves, i=index: np.concatenate([np.asarray(leaf[:, i]) for leaf in leaves]),
-                *[(part.snapshot, part.action) for part in parts],
-            )
-            end = len(actions) - len(trace.diverged) + step + 1
-            last = slice(max(0, end - STEPS), end)
-            steps: Any = jax.tree.map(lambda leaf, last=last: leaf[last], steps)
+    def share(self, parts: int) -> Self:
+        """Raises an InputError: recordings of several processes are not supported."""
+        raise InputError(f"dump_diverged: not allowed in {parts} processes; start the same training in one")
+
+    def _see(self, shown: Any, before: Any, action: Any, diverged: Any) -> np.ndarray:
+        """Stores a step of all environments, of all seeds, and writes a recording of each that diverged in it."""
+        lead = np.shape(diverged)
+        join = lambda x: np.array(x).reshape(-1, *np.shape(x)[len(lead) :])  # noqa: E731
+        self._steps.append((jax.tree.map(join, before), join(action)))
+        for index in np.flatnonzero(np.ravel(diverged))[: self._limit - len(self.written)]:
+            parts = [jax.tree.map(lambda x, i=index: x[i], step) for step in self._steps]
+            steps, actions = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
             states: Any = SimpleNamespace(data=SimpleNamespace(**steps.pop("data")), **steps)
-            save_recording(self._next_file(), self._env, states, actions[last])
-        self._previous = trace
+            try:
+                save_recording(file := self._next_file(), self.env, states, actions)
+            except (OSError, InputError) as error:
+                self._limit = 0
+                echo(f"mqe: {error}; no further divergence is recorded")
+                break
+            self.written.append(file)
+        return np.asarray(shown)
 
     def _next_file(self) -> Path:
         taken = {file.name for file in self._folder.glob("diverged_*.npz")}
         name = next(name for i in range(len(taken) + 1) if (name := f"diverged_{i:04d}.npz") not in taken)
-        self.written.append(self._folder / name)
-        return self.written[-1]
+        return self._folder / name

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from mqe_jax.build import Config, Environments, Task, prepare
+from mqe_jax.build import Config, Task, prepare
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Seed, Seeds
 from mqe_jax.literal import echo
-from mqe_jax.runs.divergence import record_divergences
+from mqe_jax.runs.divergence import guard
 from mqe_jax.settings import PathText, check, checked
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_run, write_config
@@ -22,6 +22,7 @@ from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
 from mqe_jax.train.monitor import read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
+from mqe_jax.train.types import Cast
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -141,8 +142,8 @@ def learn(
         InputError: for a task, settings or parameters that are not allowed, or a run folder that cannot be used.
         NonFiniteError: after the first update with a loss or weight that is not finite.
     """
-    prepared = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
-    return _train(prepared, [None if run_dir is None else Path(run_dir)], resume, dump_diverged)[0]
+    configs, cast = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
+    return _train(configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged)[0]
 
 
 @checked(seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
@@ -171,19 +172,22 @@ def learn_seeds(
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
     check("seeds", len(seeds), Seeds)
-    prepared = prepare(task, config, env, impl=impl, seeds=seeds)
+    configs, cast = prepare(task, config, env, impl=impl, seeds=seeds)
     folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in seeds]
-    return _train(prepared, folders, resume, dump_diverged)
+    return _train(configs, cast, folders, resume, dump_diverged)
 
 
 def _train(
-    prepared: Environments, folders: Sequence[Path | None], resume: bool, dump_diverged: str | Path | None
+    configs: Sequence[TrainConfig],
+    cast: Cast,
+    folders: Sequence[Path | None],
+    resume: bool,
+    dump_diverged: str | Path | None,
 ) -> list[Run]:
     """Trains into the folders of the seeds, or writes nothing where they are None."""
-    configs, learning, evaluation = prepared
     with (
-        record_divergences(learning, dump_diverged) as recorder,
-        open_training(learning, configs, folders, resume, evaluation, recorder) as training,
+        guard(cast.env, dump_diverged) as env,
+        open_training(configs=configs, run_dirs=folders, resume=resume, **cast._replace(env=env)._asdict()) as training,
     ):
         if resume and not training.resumed:
             where = ", ".join(map(str, folders))

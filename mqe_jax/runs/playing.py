@@ -18,7 +18,7 @@ from mqe_jax.build import Player
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.league.sides import BothSides
 from mqe_jax.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
-from mqe_jax.runs.divergence import record_divergences
+from mqe_jax.runs.divergence import guard
 from mqe_jax.settings import PathText, checked, fail
 from mqe_jax.train.evaluate import Result, evaluate_batch
 
@@ -75,9 +75,8 @@ def evaluate(
             if count % 2:
                 fail(name, count, "even: the policy plays half of the episodes on each side (sides: both)")
         batch, about["sides"] = BothSides(batch), sides
-    with record_divergences(batch, dump_diverged) as recorder:
-        key = jax.random.PRNGKey(seed)
-        result = evaluate_batch(batch, playing.policy, episodes, key, recorder=recorder)
+    with guard(batch, dump_diverged) as guarded:
+        result = evaluate_batch(guarded, playing.policy, episodes, jax.random.PRNGKey(seed))
     return dataclasses.replace(result, about={**about, "seed": seed})
 
 

@@ -29,11 +29,11 @@ from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_folders
 from mqe_jax.train.runner import OnUpdate, train_seeds
-from mqe_jax.train.types import VectorEnv
+from mqe_jax.train.types import Cast
 
 SWEEP_FILE = "sweep.yaml"
 
-Environments = Callable[[TrainConfig, int], tuple[VectorEnv, VectorEnv | None]]
+Environments = Callable[[TrainConfig, int], Cast]
 """Factory of the training and evaluation environments for a given number of seeds trained together."""
 
 
@@ -282,5 +282,7 @@ def _train(job: Job, environments: Environments, on_update: OnUpdate | None, sto
         for run_dir in job.folders:
             locks.enter_context(making(run_dir))
             locks.enter_context(locked(run_dir))
-    env, eval_env = environments(job.configs[0], len(job.configs))
-    train_seeds(env, job.configs, job.folders, True, on_update, eval_env, stop=stop)
+    cast = environments(job.configs[0], len(job.configs))
+    train_seeds(
+        configs=job.configs, run_dirs=job.folders, resume=True, on_update=on_update, stop=stop, **cast._asdict()
+    )

@@ -46,11 +46,15 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
     if config.curriculum.assistance_step and "success" not in state.metrics:
         fail("curriculum.assistance_step", config.curriculum.assistance_step, f"0: {env.name} has no metric success")
-    teacher: Any = getattr(env, "teacher", None)
-    if config.imitation.teacher is not None and (teacher is None or jax.tree.leaves(teacher.initial_memory(1))):
-        fail("imitation.teacher", config.imitation.teacher, "a policy without recurrent state, which is env.teacher")
     if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
         fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
+
+
+def check_teacher(config: TrainConfig, teacher: Any) -> None:
+    """Checks that there is a teacher if the settings name one, and that it has no recurrent state."""
+    name = config.imitation.teacher
+    if (name is None) != (teacher is None) or (teacher is not None and jax.tree.leaves(teacher.initial_memory(1))):
+        fail("imitation.teacher", name, "a policy without recurrent state, which is the learner's argument `teacher`")
 
 
 def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -> None:

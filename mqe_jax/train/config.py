@@ -29,9 +29,6 @@ from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
 
-MOVING = ("newest", "older", "uniform")
-"""Opponents that exist in training only."""
-
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
 
 
@@ -250,10 +247,6 @@ class TrainConfig:
         shares = len(self.opponents) or 1
         if self.num_envs % shares:
             fail("num_envs", self.num_envs, f"a multiple of the number of opponents, {shares}")
-        fixed = sum(opponent not in MOVING for opponent in self.opponents) or 1
-        if self.evaluation.every is not None and self.evaluation.episodes % fixed:
-            allowed = f"a multiple of the number of opponents in evaluations, {fixed}"
-            fail("evaluation.episodes", self.evaluation.episodes, allowed)
         if self.ppo.critic_warmup and self.network.name == "mat":
             fail("ppo.critic_warmup", self.ppo.critic_warmup, "0 with the network mat, whose encoder serves both")
 

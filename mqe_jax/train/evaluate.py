@@ -20,18 +20,7 @@ from mqe_jax.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.literal import line, to_html
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
-from mqe_jax.train.types import (
-    AnyBatch,
-    Memory,
-    PolicyOrAct,
-    RandomKey,
-    Recorder,
-    TraceStep,
-    VectorEnv,
-    join_traces,
-    teams_of,
-    where_rows,
-)
+from mqe_jax.train.types import AnyBatch, Memory, PolicyOrAct, RandomKey, VectorEnv, teams_of, where_rows
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
@@ -189,7 +178,6 @@ def evaluate_batch(
     memory: Memory = (),
     block: int = 50,
     max_steps: int = 1_000_000,
-    recorder: Recorder | None = None,
 ) -> Result:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
@@ -204,7 +192,6 @@ def evaluate_batch(
         memory: initial recurrent state of a function, leading axis N; a policy brings its own.
         block: steps per compiled call.
         max_steps: limit on the steps of an environment.
-        recorder: receives all steps, block by block.
 
     Raises:
         InputError: for `episodes` < 1, a policy of another task or with a `memory` too, or episodes that do not end
@@ -215,7 +202,7 @@ def evaluate_batch(
     def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)
 
-    evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps, recorder=recorder)
+    evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps)
     return evaluator(None, episodes, key[None])[0]
 
 
@@ -234,24 +221,21 @@ class Evaluator:
         *,
         block: int = 50,
         max_steps: int = 1_000_000,
-        recorder: Recorder | None = None,
     ) -> None:
         block, max_steps = check("block", block, Horizon), check("max_steps", max_steps, PositiveInt)
-        self._env, self._block, self._max_steps, self._recorder = env, block, max_steps, recorder
-        trace_step = None if recorder is None else recorder.trace
+        self._env, self._block, self._max_steps = env, block, max_steps
 
-        def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> tuple[_Progress, Any]:
+        def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> _Progress:
             def own_act(obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
                 return act(params, obs, memory, key)
 
-            return _run_block(env, own_act, progress, key, memory, quota, block, trace_step)
+            return _run_block(env, own_act, progress, key, memory, quota, block)
 
         def run(
             progress: _Progress, params: Any, keys: jax.Array, done_steps: jax.Array, quota: jax.Array
-        ) -> tuple[_Progress, Any]:
+        ) -> _Progress:
             keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.split(key)[1], done_steps))(keys)
-            progress, traces = jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
-            return progress, None if trace_step is None else join_traces(traces)
+            return jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
 
         # Random keys are computed inside of both: a program of its own for each would delay the first block.
         self._begin = jax.jit(jax.vmap(lambda key: _begin(env, jax.random.split(key)[0], memory)))
@@ -265,9 +249,7 @@ class Evaluator:
         quota = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
         progress = self._begin(keys)
         for done_steps in range(0, self._max_steps, self._block):
-            progress, trace = self._run(progress, params, keys, np.uint32(done_steps), quota)
-            if self._recorder is not None:
-                self._recorder.add(trace)
+            progress = self._run(progress, params, keys, np.uint32(done_steps), quota)
             if np.all(np.asarray(progress.finished) >= quota):
                 # Only the sums are indexed: environment states may contain unbatched leaves.
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
@@ -286,23 +268,15 @@ def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:
 
 
 def _run_block(
-    env: VectorEnv,
-    act: Act,
-    progress: _Progress,
-    key: jax.Array,
-    initial_memory: Memory,
-    quota: jax.Array,
-    block: int,
-    trace_step: TraceStep | None,
-) -> tuple[_Progress, Any]:
+    env: VectorEnv, act: Act, progress: _Progress, key: jax.Array, initial_memory: Memory, quota: jax.Array, block: int
+) -> _Progress:
     own = np.array(teams_of(env)[0])
 
-    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, Any]:
+    def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
         action, memory = act(p.env_state.obs, p.memory, step_key)
         state = env.step(p.env_state, action)
         done = state.terminated | state.truncated
         counted = p.finished < quota
-        trace = () if trace_step is None else trace_step(p.env_state, action, state)
 
         step_sums = {n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()}
         end_sums = {n: s + jnp.where(counted & done, state.metrics[n], 0.0) for n, s in p.end_sums.items()}
@@ -316,10 +290,10 @@ def _run_block(
                 step_sums=step_sums,
                 end_sums=end_sums,
             ),
-            trace,
+            None,
         )
 
-    return jax.lax.scan(one_step, progress, jax.random.split(key, block))
+    return jax.lax.scan(one_step, progress, jax.random.split(key, block))[0]
 
 
 def _result(task: str, episodes: int, progress: _Progress) -> Result:

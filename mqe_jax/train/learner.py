@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from mqe_jax.precision import single
 from mqe_jax.train import devices
-from mqe_jax.train.checks import check_divisible, check_environment
+from mqe_jax.train.checks import check_divisible, check_environment, check_teacher
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss
 from mqe_jax.train.networks import EnvDims, Network
@@ -32,7 +32,7 @@ from mqe_jax.train.normalize import (
 from mqe_jax.train.optim import AdamState, Optimizer, adam, begun_anew
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, minibatches, normalize_obs, rollout, take
 from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
-from mqe_jax.train.types import Batch, LearnerHook, Params, PyTree, TraceStep, Transition, VectorEnv, replace_fields
+from mqe_jax.train.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
 
 Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]
@@ -61,7 +61,7 @@ class TrainState:
     updates: jax.Array
     """Updates done () int32."""
     extra: PyTree = ()
-    """State of the environment's learner hook (`mqe_jax.train.types.LearnerHook`); empty without one."""
+    """State of the league (`mqe_jax.train.types.Matchmaker`); empty without one."""
 
 
 class Learner(NamedTuple):
@@ -82,20 +82,26 @@ def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
     )
 
 
-def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None = None, processes: int = 1) -> Learner:
+def make_learner(
+    env: VectorEnv, config: TrainConfig, *, league: Matchmaker | None = None, teacher: Any = None, processes: int = 1
+) -> Learner:
     """Returns the learner of an environment.
 
-    With `trace_step` (`Recorder.trace`), the metrics of an update also hold `trace`, a `Trace` of the rollout. With
-    several `processes`, `env` is the share of one, and its functions are compiled by `devices.Processes`.
+    Args:
+        env: the environments; with several processes, the share of one.
+        config: settings.
+        league: gives the environments their opponents between updates.
+        teacher: the policy that `imitation` imitates, without recurrent state.
+        processes: number of processes; `devices.Processes` compiles the functions of several.
 
     Raises:
         InputError: if the settings do not fit the environment.
     """
     check_environment(env, config, processes)
+    check_teacher(config, teacher)
     dims = env_dims(env, config)
     network = config.network.build(dims)
     check_divisible(config, network, processes)
-    hook: LearnerHook | None = getattr(env, "learner_hook", None)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
     @single
@@ -126,7 +132,7 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
                 updates=jnp.zeros((), jnp.int32),
             )
         )
-        return state if hook is None else hook.seated(dataclasses.replace(state, extra=hook.begin(state)))
+        return state if league is None else league.seat(dataclasses.replace(state, extra=league.begin(state)))
 
     @single
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
@@ -143,11 +149,10 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
             config.rollout_steps,
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
-            trace_step=trace_step,
         )
         batch, value_normalizer, batch_metrics = _prepare(network, config, now, state, transitions)
-        if config.imitation.teacher is not None:
-            shown = _teacher_actions(env, transitions.obs) / config.action_scale
+        if teacher is not None:
+            shown = _teacher_actions(teacher, transitions.obs) / config.action_scale
             batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
         params, optimizer_state, learning_rate, loss_metrics = _learn(
             network, optimizer, config, now, state, value_normalizer, batch, epoch_key
@@ -175,8 +180,8 @@ def make_ppo(env: VectorEnv, config: TrainConfig, trace_step: TraceStep | None =
             updates=state.updates + 1,
             extra=state.extra,
         )
-        if hook is not None:
-            new_state, counted = hook.after(new_state)
+        if league is not None:
+            new_state, counted = league.after(new_state)
             metrics |= counted
         metrics |= {"assistance": now.assistance, "entropy_coef": now.entropy_coef}
         return _strongly_typed(new_state), {**metrics, **batch_metrics, **loss_metrics}
@@ -203,9 +208,8 @@ def _strongly_typed(state: TrainState) -> TrainState:
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), state)
 
 
-def _teacher_actions(env: VectorEnv, obs: jax.Array) -> jax.Array:
+def _teacher_actions(teacher: Any, obs: jax.Array) -> jax.Array:
     """Returns the teacher's actions (T, N, A, D) for observations (T, N, A, O)."""
-    teacher: Any = getattr(env, "teacher")  # noqa: B009
     flat = obs.reshape(-1, *obs.shape[2:])
     action, _ = teacher.act(flat, teacher.initial_memory(len(flat)), jax.random.PRNGKey(0))
     return action.reshape(*obs.shape[:2], *action.shape[1:])

@@ -11,7 +11,7 @@ from mqe_jax.train import devices
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network, reset_memory
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Batch, NetworkMemory, Params, TraceStep, Transition, VectorEnv, is_per_episode
+from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, is_per_episode
 
 
 class RolloutState(NamedTuple):
@@ -54,25 +54,22 @@ def rollout(
     *,
     normalize: bool,
     action_scale: float,
-    trace_step: TraceStep | None = None,
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
     The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
     steps and environments, but those that are `is_per_episode` are means over ended episodes (0 without any), and
-    `episodes`, `diverged` and `overflow` are counts. With `trace_step`, they also hold `trace`, a `Trace` of all steps.
+    `episodes`, `diverged` and `overflow` are counts.
     """
 
-    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
+    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, jax.Array]]:
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
         obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, normalize)
         action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None])
-        scaled = action_scale * action
-        after = env.step(before, scaled)
-        trace = () if trace_step is None else trace_step(before, scaled, after)
+        after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
         transition = Transition(
             memory=memory,
@@ -98,13 +95,12 @@ def rollout(
             episode_steps=jnp.where(done, 0, episode_steps),
             episode_return=jnp.where(done, 0.0, episode_return),
         )
-        return state, (transition, jnp.stack([sums[name].astype(jnp.float32) for name in names]), trace)
+        return state, (transition, jnp.stack([sums[name].astype(jnp.float32) for name in names]))
 
     names = sorted({*state.env_state.metrics, "episode_length", "episode_return", "episodes"})
-    state, (transitions, sums, trace) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    state, (transitions, sums) = jax.lax.scan(one_step, state, jax.random.split(key, length))
     totals = devices.total(jnp.sum(sums, axis=0))
-    metrics: dict[str, Any] = _means(dict(zip(names, totals, strict=True)), length * env.num_envs * devices.size())
-    return state, transitions, metrics if trace_step is None else {**metrics, "trace": trace}
+    return state, transitions, _means(dict(zip(names, totals, strict=True)), length * env.num_envs * devices.size())
 
 
 def _sums(metrics: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array]:

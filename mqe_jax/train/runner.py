@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,7 +27,7 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
-from mqe_jax.train.types import AnyBatch, Recorder, VectorEnv, generator, join_traces
+from mqe_jax.train.types import AnyBatch, Matchmaker, VectorEnv, generator
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 
@@ -38,7 +39,8 @@ def train(
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
-    recorder: Recorder | None = None,
+    league: Matchmaker | None = None,
+    teacher: Any = None,
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state.
 
@@ -50,7 +52,8 @@ def train(
         on_update: called after every update with the state and its row of metrics.csv.
         eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
             `config.evaluation.every` is set.
-        recorder: receives the steps of every rollout, not those of evaluations.
+        league: gives the environments their opponents between updates.
+        teacher: the policy that `config.imitation` imitates.
 
     Raises:
         InputError: before anything in the folder is changed: where it cannot be written, is in use by another
@@ -58,7 +61,7 @@ def train(
         NonFiniteError: after the first update with a non-finite loss or weight. Checkpoints and policy
             on disk are from before that update.
     """
-    return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, recorder)[0]
+    return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, league, teacher)[0]
 
 
 def train_seeds(
@@ -68,16 +71,16 @@ def train_seeds(
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
-    recorder: Recorder | None = None,
+    league: Matchmaker | None = None,
+    teacher: Any = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
 
     `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all.
-    The recorder receives the environments of all seeds as one batch. Where `stop()` is true before an update, the runs
-    are saved and end there, to be resumed.
+    Where `stop()` is true before an update, the runs are saved and end there, to be resumed.
     """
-    with open_training(env, configs, run_dirs, resume, eval_env, recorder) as training:
+    with open_training(env, configs, run_dirs, resume, eval_env, league, teacher) as training:
         return training.run(on_update, stop)
 
 
@@ -88,7 +91,8 @@ def open_training(
     run_dirs: Sequence[str | Path | None],
     resume: bool = False,
     eval_env: VectorEnv | None = None,
-    recorder: Recorder | None = None,
+    league: Matchmaker | None = None,
+    teacher: Any = None,
 ) -> Iterator[Training]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
@@ -107,7 +111,7 @@ def open_training(
         check_loggers(configs[0].loggers)
     elif resume:
         fail("resume", True, "false without a run_dir")
-    learner, processes = own_learner(env, configs[0], recorder)
+    learner, processes = own_learner(env, configs[0], league, teacher)
     with connected(), open_folders(folders, resume) if processes.leads else contextlib.nullcontext():
         processes.gather([0])  # the others wait for these checks
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
@@ -115,7 +119,7 @@ def open_training(
         total = configs[0].num_updates * configs[0].steps_per_update
         with ProgressLog(configs[0].task or env.name, total, shown=processes.leads) as progress:
             with progress.doing("compiling"):
-                own = Training(env, learner, processes, configs, folders, checkpoints, eval_env, recorder, progress)
+                own = Training(env, learner, processes, configs, folders, checkpoints, eval_env, league, progress)
             yield own
 
 
@@ -140,14 +144,14 @@ class Training:
         folders: Sequence[Path],
         checkpoints: Sequence[Path | None],
         eval_env: VectorEnv | None,
-        recorder: Recorder | None,
+        league: Matchmaker | None,
         progress: ProgressLog,
     ) -> None:
-        self._env, self._configs, self._folders, self._recorder = env, configs, folders, recorder
+        self._env, self._configs, self._folders = env, configs, folders
         self._config, self._processes, self._progress = configs[0], processes, progress
         self._seeds = seeds = Seeds(learner.init, len(configs))
         first = [
-            first_state(env, learner, processes, own, path, seeds.shared)
+            first_state(env.name, learner, processes, own, path, seeds.shared, league)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stacked(seeds.shared)
@@ -248,8 +252,6 @@ class Training:
         """Performs and logs one update of every seed; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)
-        if self._recorder is not None:
-            self._recorder.add(join_traces(metrics.pop("trace")))
         metrics, finite = jax.device_get((metrics, all_finite(learned(after))))
         updates, rows = self.env_steps // self._config.steps_per_update + 1, []
         for i in range(len(self._configs)):

@@ -17,10 +17,10 @@ from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.devices import Processes
 from mqe_jax.train.folder import CONFIG_FILE
-from mqe_jax.train.learner import Learner, TrainState, make_ppo
+from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.types import LearnerHook, Params, PyTree, Recorder, VectorEnv, generator
+from mqe_jax.train.types import Matchmaker, Params, PyTree, VectorEnv, generator
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 _MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
@@ -32,45 +32,50 @@ def initial_key(config: TrainConfig) -> jax.Array:
     return jax.random.PRNGKey(config.seed)
 
 
-def own_learner(env: VectorEnv, config: TrainConfig, recorder: Recorder | None) -> tuple[Learner, Processes]:
+def own_learner(
+    env: VectorEnv, config: TrainConfig, league: Matchmaker | None = None, teacher: Any = None
+) -> tuple[Learner, Processes]:
     """Returns the learner of this process, which has its share of the environments, and all processes."""
-    trace, count = None if recorder is None else recorder.trace, jax.process_count()
-    whole = own = make_ppo(env, config, trace)
+    count = jax.process_count()
+    whole = own = make_learner(env, config, league=league, teacher=teacher)
     if count > 1:
-        if recorder is not None:
-            raise InputError(f"recorder: not allowed in {count} processes; start the same training in one")
         share: Any = getattr(env, "share", None)
         if share is None:
             raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
-        own = make_ppo(share(count), config, processes=count)
+        own = make_learner(share(count), config, league=league, teacher=teacher, processes=count)
     return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
 
 
 def first_state(
-    env: VectorEnv, learner: Learner, processes: Processes, config: TrainConfig, checkpoint: Path | None, shared: PyTree
+    task: str,
+    learner: Learner,
+    processes: Processes,
+    config: TrainConfig,
+    checkpoint: Path | None,
+    shared: PyTree,
+    league: Matchmaker | None = None,
 ) -> tuple[TrainState, float]:
     """Returns this process's initial or restored state and the seconds already spent.
 
-    `env` has the environments of all processes, `learner` the share of one; `shared` as in `Seeds`.
+    `learner` has the environments of one process; `shared` as in `Seeds`.
     """
     start = processes.compile(learner.init, start=True)
-    hook: LearnerHook | None = getattr(env, "learner_hook", None)
 
     def init(key: jax.Array) -> TrainState:
         return processes.own(start(key))
 
     if checkpoint is None:
-        policy = None if config.start is None else policy_to_start(env.name, processes.whole.params, config)
+        policy = None if config.start is None else policy_to_start(task, processes.whole.params, config)
         state = init(initial_key(config))
         if policy is not None:
             normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
             state = dataclasses.replace(state, params={**state.params, **policy.params}, obs_normalizer=normalizer)
-            if hook is not None:
-                state = hook.seated(dataclasses.replace(state, extra=hook.begin(state)))
+            if league is not None:
+                state = league.seat(dataclasses.replace(state, extra=league.begin(state)))
         return state, 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
-    if metadata.get("task") != env.name:
-        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
+    if metadata.get("task") != task:
+        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {task}")
     if (theirs := metadata.get("generator", generator())) != generator():
         fail(
             "jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {checkpoint.parent.parent}"
@@ -92,7 +97,7 @@ def first_state(
     if not whole:
         fresh = init(jax.random.fold_in(tree["key"], tree["updates"]))
         state = jax.tree.map(jnp.asarray, dataclasses.replace(fresh, **tree))
-        return (state if hook is None else hook.seated(state)), float(seconds)
+        return (state if league is None else league.seat(state)), float(seconds)
     tree = processes.part(tree)
     if any(jax.tree.leaves(shared)):
         tree = with_shared(tree, shared, init(initial_key(config)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
@@ -111,9 +110,8 @@ class VectorEnv(Protocol):
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
-    which `curriculum.assistance` sets (see `replace_fields`); `teacher`, a `Policy` without recurrent state, which
-    `imitation` needs; `learner_hook` (a `LearnerHook`). In several processes, `share(parts)` returns the batch of one,
-    whose states are consecutive rows of those of all (`devices.rows`).
+    which `curriculum.assistance` sets (see `replace_fields`). In several processes, `share(parts)` returns the batch of
+    one, whose states are consecutive rows of those of all (`devices.rows`).
     """
 
     @property
@@ -132,49 +130,16 @@ class VectorEnv(Protocol):
     def step(self, state: Any, action: jax.Array) -> Any: ...
 
 
-class LearnerHook(Protocol):
-    """What an environment does between updates with the learner state, a `TrainState`; pure, and compiled with them.
+class Matchmaker(Protocol):
+    """Gives the environments their opponents between updates of the learner state, a `TrainState`; pure.
 
-    `begin(state)` returns the first value of `TrainState.extra`; `seated(state)` makes new environments fit it;
-    `after(state) -> (state, metrics)` follows an update.
+    `begin(state)` returns the first value of `TrainState.extra`; `seat(state)` gives new environments the opponents
+    that it names; `after(state) -> (state, metrics)` follows an update.
     """
 
     def begin(self, state: Any) -> PyTree: ...
-    def seated(self, state: Any) -> Any: ...
+    def seat(self, state: Any) -> Any: ...
     def after(self, state: Any) -> tuple[Any, dict[str, jax.Array]]: ...
-
-
-class Trace(NamedTuple):
-    """Consecutive steps of all environments (T, N, ...), from which divergences are recorded."""
-
-    snapshot: PyTree
-    """Snapshots of the states before the actions."""
-    action: jax.Array
-    """Actions as the environment received them (T, N, A, D)."""
-    diverged: jax.Array
-    """Metric `diverged` after the action (T, N)."""
-
-
-class Recorder(Protocol):
-    """Records the steps before a divergence.
-
-    `trace(before, action, after)` returns one step, (N, ...), from the states before and after it, inside compiled
-    code; `add(trace)` receives the steps since the last call, and writes those of environments that diverged.
-    """
-
-    def trace(self, before: Any, action: jax.Array, after: Any) -> Trace: ...
-    def add(self, trace: Trace) -> None: ...
-
-
-TraceStep = Callable[[Any, jax.Array, Any], Trace]
-"""`Recorder.trace`."""
-
-
-def join_traces(traces: Trace) -> Trace:
-    """Merges the traces of B batches of environments: (B, T, N, ...) -> (T, B * N, ...)."""
-    return jax.tree.map(
-        lambda x: jnp.swapaxes(x, 0, 1).reshape(x.shape[1], x.shape[0] * x.shape[2], *x.shape[3:]), traces
-    )
 
 
 def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
@@ -221,6 +186,19 @@ def is_outcome(metric: str) -> bool:
 def is_per_episode(metric: str) -> bool:
     """Returns whether a training metric is a mean over ended episodes; it is unknown where none ended."""
     return is_outcome(metric) or metric in ("episode_length", "episode_return")
+
+
+class Cast(NamedTuple):
+    """The environments of a training, and who else plays in them."""
+
+    env: Any
+    """Environments in which the policy learns."""
+    eval_env: Any = None
+    """Environments of evaluations during training; None without."""
+    league: Matchmaker | None = None
+    """Gives the environments their opponents between updates."""
+    teacher: Any = None
+    """The policy that imitation imitates."""
 
 
 class NetworkMemory(NamedTuple):
