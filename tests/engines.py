@@ -1,4 +1,4 @@
-"""Agreement of two engines on the same episodes; `python -m tests.soak play` has random actions in many environments.
+"""Agreement of two engines on the same episodes.
 
 `python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`. With `c`,
 `agree` measures how fast trajectories of one engine separate from initial positions that differ by 1e-6. Options of
@@ -13,8 +13,7 @@ import itertools
 import json
 import pathlib
 import time
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +24,6 @@ from mqe_jax.control import MODES
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import PLANNERS, TASKS, State, VectorEnv, make
 from mqe_jax.planners import scripted_policy
-
-if TYPE_CHECKING:
-    from tests.soak.__main__ import Report
 
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 
@@ -151,41 +147,15 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     return figures
 
 
-# -- parts of the soak -------------------------------------------------------------------------------------------------
-
 ONE_STEP = 1e-3
 """Largest difference of a position, m, quaternion or angle, rad, after one environment step."""
 ENVS = 2
-
-
-def agreement(report: Report) -> None:
-    """Compares trajectories of all tasks with the C engine's; on the C engine, with positions shifted by 1e-6."""
-    options = report.options
-    for task in report.pending("agreement", options.tasks or list(TASKS)):
-        with jax.default_device(jax.devices("cpu")[0]):  # of the C engine
-            reference = record(task, seed=options.seed)
-        figures = disagreement(task, options.engine, reference)
-        first = {name: value for name, value in figures.items() if name.endswith("_1")}
-        wrong = [f"{name}: {value:.2g}" for name, value in first.items() if not value <= ONE_STEP]
-        report.add("agreement", task, {name: float(f"{value:.3g}") for name, value in figures.items()}, wrong)
-
-
-def combinations() -> Iterator[tuple[str, str, str]]:
-    """Yields every task, robot and control mode."""
-    yield from itertools.product(TASKS, robots.ROBOTS, MODES)
 
 
 def covering() -> list[tuple[str, str, str]]:
     """Returns one combination for every task, which has every pair of robot and control mode several times."""
     pairs = list(itertools.product(robots.ROBOTS, MODES))
     return [(task, *pairs[number % len(pairs)]) for number, task in enumerate(TASKS)]
-
-
-def pairs(report: Report) -> None:
-    """Steps every combination once, on the C engine from standing robots, and on the other engine from there."""
-    rows = {" ".join(combination): combination for combination in combinations()}
-    for name in report.pending("pairs", list(rows)):
-        report.add("pairs", name, *one_step(*rows[name], report.options.engine))
 
 
 def one_step(task: str, robot: str, control: str, engine: str) -> tuple[dict[str, float], list[str]]:

@@ -1,7 +1,4 @@
-"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; SIGKILL too leaves a run that resumes exactly.
-
-`python -m tests.soak kills` has signals at random moments.
-"""
+"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; SIGKILL too leaves a run that resumes exactly."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.motors import BAND, CLAMP, Motors, leg_response
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
-from tests.soak.play import MODES, drive, start_in_air
+from tests.driving import MODES, drive, start_in_air
 from tests.states import initial
 from tests.test_engines import QUICK
 

@@ -1,56 +1,140 @@
-"""The soak notices what it is for: growth, hangs, tracebacks, robots outside; its report is resumed."""
+"""Long trials: kills at random moments, full disks, random play and one step of every combination."""
 
 from __future__ import annotations
 
-import json
+import itertools
+import os
+import random
+import resource
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import pytest
 
-from mqe_jax.errors import InputError
-from tests.soak import play, processes
-from tests.soak.__main__ import Options, Report
-from tests.soak.processes import Outcome, Sample
+from mqe_jax import make, robots
+from mqe_jax.control import MODES
+from mqe_jax.envs import PLANNERS, TASKS
+from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.planners import scripted_policy
+from tests import driving, engines
 from tests.states import initial, made, placed
+from tests.test_interrupts import end, start, updates
+from tests.training import assert_same_run
+
+UPDATES = 120
+TRAIN = ["train", "go1gate", "--impl", "c", "--config", "demo", "--num-envs", "4", "--rollout-steps", "8"]
+TRAIN += ["--ppo.minibatches", "2", "--checkpoint.every", "7", "--total-steps", str(UPDATES * 32)]
+TRAIN += ["--evaluation.every", "30", "--evaluation.episodes", "2"]
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT)
+FULL = {"start": -1, "first checkpoint": 0, "a row": 10, "an evaluation": 29, "the end": UPDATES - 3}
+"""Updates after which the disk is full; -1 is the start of the process, 0 the first files."""
 
 
-def test_a_report_is_resumed_and_repeats_only_rows_that_were_cut_off(tmp_path: Path) -> None:
-    report = Report(tmp_path, Options(engine="c"), minutes=1.0)
-    report.begin(1)
-    report.add("play", "a", {"steps": 1200}, [])
-    report.add("play", "b", {"steps": 7, "partial": True}, ["outside in 3 steps"])
-    again = Report(tmp_path, Options(engine="c"), minutes=1.0)
-    again.begin(2)
-    assert 25.0 < again.seconds_left() <= 30.0
-    assert list(again.pending("play", ["a", "b", "c"])) == ["b", "c"]
-    assert again.wrong() == ["play b: outside in 3 steps"]
-    text = (tmp_path / "soak.md").read_text()
-    assert "- play b: outside in 3 steps" in text and "| a | 1,200 |" in text
-    late = Report(tmp_path, Options(), minutes=0.0)
-    late.begin(1)
-    assert list(late.pending("play", ["c"])) == []
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["soak.json", "soak.md"]
+def command(run: Path) -> list[str]:
+    """Returns the command that trains into a folder, or continues there."""
+    return [sys.executable, "-m", "mqe_jax.cli", *TRAIN, "--resume", "--run-dir", str(run)]
 
 
-def test_rows_of_fewer_steps_are_repeated_and_those_of_another_engine_are_not_continued(tmp_path: Path) -> None:
-    Report(tmp_path, Options(engine="c"), minutes=1.0).add("play", "a", {"steps": 1200}, [])
-    more = Report(tmp_path, Options(engine="c"), minutes=1.0)
-    assert [list(more.pending("play", ["a"], steps)) for steps in (1000, 1200, 1201)] == [[], [], ["a"]]
-    with pytest.raises(InputError, match=r"soak\.json: has rows of the engine c; name another --folder"):
-        Report(tmp_path, Options(engine="warp"), minutes=1.0)
+def assert_resumes(run: Path, whole: Path) -> None:
+    """Resumes a run to its end, and compares it with one that nothing interrupted."""
+    subprocess.run(command(run), check=True, capture_output=True)
+    assert_same_run(whole, run)
+    assert (whole / "evaluations.json").read_text() == (run / "evaluations.json").read_text()
+    files = [{path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} for folder in (whole, run)]
+    assert not {name for name in files[0] ^ files[1] if "tfevents" not in name}
 
 
-@pytest.mark.parametrize(("grown", "files", "wrong"), [(1.02, 20, 0), (1.2, 20, 1), (1.0, 40, 1)])
-def test_memory_and_descriptors_may_not_grow_after_the_warm_up(grown: float, files: int, wrong: int) -> None:
-    rows = [Sample(2.0 * i, int(5e8 * min(1.0, 0.5 + i / 60)), 20, 9) for i in range(300)]
-    rows += [Sample(600.0 + 2.0 * i, int(5e8 * grown), files, 9) for i in range(60)]
-    row, found = processes.judged(rows, [])
-    assert row["minutes"] == 12.0 and row["descriptors_late"] == files
-    assert len(found) == wrong
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+    """A training that nothing interrupts, and its duration, s, with compiled programs."""
+    run, again = (tmp_path_factory.mktemp("whole") / name for name in ("run", "again"))
+    subprocess.run(command(run), check=True, capture_output=True)
+    began = time.monotonic()
+    subprocess.run(command(again), check=True, capture_output=True)
+    return run, time.monotonic() - began
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(5))
+def test_kills_at_random_moments_change_nothing(seed: int, whole: tuple[Path, float], tmp_path: Path) -> None:
+    run, moments = tmp_path / "run", random.Random(seed)
+    for number in range(8):
+        process = start(command(run))
+        try:
+            process.wait(moments.uniform(0.0, 0.8 * whole[1]))
+        except subprocess.TimeoutExpired:
+            kind = SIGNALS[number % len(SIGNALS)]
+            if kind is signal.SIGKILL or not (run / "config.yaml").exists():  # before it has its handlers
+                process.kill()
+            else:
+                end(process, kind, seconds=30)
+        process.communicate()
+    assert_resumes(run, whole[0])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("moment", FULL)
+def test_a_full_disk_is_one_line(moment: str, whole: tuple[Path, float], tmp_path: Path) -> None:
+    run, after = tmp_path / "run", FULL[moment]
+    process = start(command(run))
+    while process.poll() is None and ((after >= 0 and not (run / "config.yaml").exists()) or updates(run) < after):
+        time.sleep(0.002)
+    limit = 1000 if after < 1 else 1  # bytes: files are cut within, or nothing can be appended
+    hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, hard))
+    said = process.communicate(timeout=600)[1].splitlines()
+    lines = [line for line in said if line.startswith("mqe: ") and "a new run" not in line]
+    assert process.returncode == 2 and len(lines) == 1 and "File too large" in lines[0], said
+    assert not [name for _, _, names in os.walk(run) for name in names if name.startswith(".")]
+    assert_resumes(run, whole[0])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("impl", ["c", pytest.param("warp", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize("mode", ["random-command", "saturated-command", "scripted-command", "saturated-torque"])
+@pytest.mark.parametrize("robot", robots.ROBOTS)
+@pytest.mark.parametrize("task", TASKS)
+def test_play_stays_on_the_track(task: str, robot: str, mode: str, impl: str) -> None:
+    """Nothing diverges, leaves the track or overflows a contact buffer."""
+    if mode == "scripted-command" and task not in PLANNERS:
+        pytest.skip("no scripted policy")
+    count, steps = (64, 300) if impl == "c" else (4096, 2000)
+    how, control = mode.split("-")
+    env: Any = make(task, impl=impl, robot=robot, control=control, num_envs=count)
+    plan = jax.vmap(scripted_policy(env)) if how == "scripted" else None
+
+    def advance(carry: Any, key: jax.Array) -> Any:
+        state, action = carry
+        action = plan(state.obs) if plan is not None else driving.next_action(how, action, key)
+        state = jax.vmap(env.step)(state, action)
+        wrong = state.metrics["diverged"] + state.metrics["overflow"]
+        wrong += jax.vmap(lambda data: outside(env, data))(state.data)
+        state = jax.vmap(lambda ended: autoreset(env, ended))(state)
+        finite = jnp.array([jnp.all(jnp.isfinite(x)) for x in (state.obs, state.reward, state.data.qpos)])
+        return (state, action), (jnp.sum(wrong > 0), jnp.all(finite))
+
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count))
+    carry = state, jnp.zeros((count, env.num_agents, env.action_size))
+    wrong, finite = jax.jit(lambda *x: jax.lax.scan(advance, *x)[1])(
+        carry, jax.random.split(jax.random.PRNGKey(1), steps)
+    )
+    assert int(jnp.sum(wrong)) == 0 and bool(jnp.all(finite))
+
+
+def outside(env: Any, data: Any) -> jax.Array:
+    """Returns whether a trunk is behind a wall of the track, below the ground, or not a finite place, () bool."""
+    place = env.read(data).position_w
+    out = jnp.any(~(place[:, 2] > -0.2))
+    for barrier in env.compiled.layout.barriers:
+        ahead = (place[:, :2] - jnp.array(barrier.point)) @ jnp.array(barrier.normal)
+        out |= jnp.any(~(ahead > -0.1))
+    return out
 
 
 def test_a_robot_behind_a_wall_or_below_the_ground_is_outside() -> None:
@@ -59,37 +143,13 @@ def test_a_robot_behind_a_wall_or_below_the_ground_is_outside() -> None:
     places = {(1.0, 0.0, 0.3): False, (1.0, half + 0.3, 0.3): True, (-0.5, 0.0, 0.3): True, (1.0, 0.0, -1.0): True}
     for place, out in places.items():
         state = placed(env, [[1.0, 0.5, 0.3], place], state=initial(env))
-        assert bool(play.outside(env, state.data)) == out, place
+        assert bool(outside(env, state.data)) == out, place
     nowhere = initial(env).data.replace(qpos=jnp.full_like(initial(env).data.qpos, jnp.nan))
-    assert bool(play.outside(env, nowhere))
+    assert bool(outside(env, nowhere))
 
 
-PROGRAM = """
-import json, sys, time
-from pathlib import Path
-from tests.soak import processes as c
-c.SECONDS, c.WAITING, c.BYTES = 0.5, 8.0, 3 * 10**8
-def hangs(): time.sleep(60)
-def computes():
-    while time.process_time() < 0.7: pass  # of this process
-    return 2
-def grows(): return len([b"x" * (10**7 + i) for i in range(100)] + [time.sleep(60)])
-def fails(): raise KeyError("x")
-def leaves(): Path(".a.1.tmp").touch(); return 2
-def refuses(): print("mqe: a: 1 is not allowed", file=sys.stderr); return 2
-print(json.dumps([vars(c.contained(act)) for act in (hangs, computes, grows, fails, leaves, refuses)]))
-"""
-
-
-def test_a_contained_program_that_hangs_grows_fails_or_leaves_files_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=root)
-    assert done.returncode == 0, done.stderr
-    hangs, computes, grows, fails, leaves, refuses = (Outcome(**fields) for fields in json.loads(done.stdout))
-    monkeypatch.setattr(processes, "SECONDS", 0.5)
-    assert hangs.code is None and 4.0 < hangs.seconds < 12.0 and hangs.computing < 0.5
-    assert computes.code == 2 and "computing" in computes.failures(2)[0]
-    assert grows.code is None and grows.memory > 3 * 10**8 and grows.failures(2)
-    assert "a traceback" in fails.failures(1)
-    assert leaves.failures(2) == ["left .a.1.tmp"]
-    assert refuses.failures(2) == [] and refuses.failures(0) != []
+@pytest.mark.soak
+@pytest.mark.parametrize("impl", ["c", "jax", pytest.param("warp", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize(("task", "robot", "control"), itertools.product(TASKS, robots.ROBOTS, MODES), ids=str)
+def test_one_step_of_every_combination(task: str, robot: str, control: str, impl: str) -> None:
+    assert engines.one_step(task, robot, control, impl)[1] == []
