@@ -231,19 +231,3 @@ PICKLES = (
     b"ctorch._utils\n_rebuild_tensor_v2\n((NI9\nI9\ntI0\nI0\ntR.",
 )
 """Pickles that name foreign code, never end, or hold something else than tensors."""
-
-
-# -- the viewer's messages ---------------------------------------------------------------------------------------------
-
-
-def messages() -> Strategy:
-    """Values that a browser may send, packed by msgpack later: fields of the known messages with any values."""
-    value: Strategy = st.floats() | st.integers(-(2**63), 2**64 - 1) | st.text(max_size=70)
-    value |= st.none() | st.binary(max_size=9) | st.booleans()
-    vector = st.lists(value, max_size=5) | st.lists(st.floats(-9, 9), min_size=3, max_size=4)
-    kinds = ["ViewerCameraMessage", "GuiUpdateMessage", "GuiButtonHoldMessage", "CommandTriggerMessage", "Nothing"]
-    names = ["wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction"]
-    names += ["uuid", "updates", "frequency", "more"]
-    inner = st.fixed_dictionaries({"value": value})
-    fields = st.dictionaries(st.sampled_from(names), value | vector | inner, max_size=9)
-    return st.tuples(st.sampled_from(kinds), fields).map(lambda pair: {"type": pair[0], **pair[1]}) | value | vector

@@ -11,10 +11,9 @@ from typing import Any
 import fake_env
 import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import mqe_jax
@@ -38,8 +37,6 @@ from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train
-from mqe_jax.view import messages
-from mqe_jax.view.messages import RefusedError, UnparsableError
 from mqe_jax.viz import clips, recording, render
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
@@ -330,20 +327,3 @@ def test_a_damaged_torchscript_archive_is_refused(folder: Path, data: st.DataObj
     with refusing(file.name):
         weights = read_torchscript(file)
         assert all(value.size < 2**21 for value in weights.values())
-
-
-@inputs.CASES
-@given(inputs.messages())
-def test_a_message_to_the_viewer_is_understood_or_refused(message: Any) -> None:
-    frame = msgspec.msgpack.encode(message)
-    with contextlib.suppress(UnparsableError, RefusedError):
-        messages.check(frame, lambda uuid: None)
-        camera = msgspec.convert(message, messages.Camera)  # no widget has a name, so that nothing else is accepted
-        assert all(map(math.isfinite, (*camera.position, *camera.look_at, camera.fov)))
-
-
-@settings(inputs.CASES, max_examples=30)
-@given(st.binary(max_size=40))
-def test_a_frame_of_any_bytes_is_refused(frame: bytes) -> None:
-    with pytest.raises((UnparsableError, RefusedError)):
-        messages.check(frame, lambda uuid: None)

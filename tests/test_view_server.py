@@ -1,4 +1,4 @@
-"""The viewer's server: which requests it answers and which messages it accepts."""
+"""The viewer's server: which requests it answers, and what its panel does."""
 
 import http.client
 import time
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewer import CAMERA, Client, Driven, free_port, open_page, session
+from viewer import Client, Driven, free_port, open_page, session
 
 pytest.importorskip("viser")
 
@@ -16,9 +16,8 @@ import viser
 from websockets.exceptions import InvalidStatus
 
 from mqe_jax.errors import InputError
-from mqe_jax.view.messages import HOLD_RATE, authorities, refusal
-from mqe_jax.view.panel import Panel
-from mqe_jax.view.server import open_server
+from mqe_jax.view.panel import HOLD_RATE, Panel
+from mqe_jax.view.server import authorities, open_server, refusal
 
 
 @pytest.fixture(scope="module")
@@ -103,38 +102,6 @@ def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(shown: SimpleN
     assert lines[0].startswith("mqe: view: refused a connection: Origin is http://evil.org, allowed: http://127.0.0.1:")
 
 
-def test_a_refused_value_changes_nothing_and_is_logged_in_a_line(shown: SimpleNamespace, said: Any) -> None:
-    run, panel = shown.session, shown.panel
-    cases = (
-        ("Speed", 0.0, "Speed is 0.0, allowed: 0.1 to 4.0"),
-        ("Speed", float("nan"), "Expected `float`"),
-        ("Speed", "2", "Speed is '2', allowed: 0.1 to 4.0"),
-        ("Environment", "3", "Environment is '3', allowed: 1, 2"),
-        ("Camera", "x\n\x1b[2J", "Camera is 'x\\n\\x1b[2J', allowed: action, free, robot 1, robot 2"),
-        ("Driven", 1, "Driven is 1.0, allowed: none, robot 1, robot 2"),
-        ("Back", -1.0, "Back is -1.0, allowed: 0.0 to 20.0"),
-        ("Contacts", 1, "Contacts is 1.0, allowed: true, false"),
-        ("Pause", 0, "Pause is 0.0, allowed: true"),
-        ("state", "text", "no widget"),
-    )
-    with Client(shown.port) as client:
-        seen = client.panel()
-        for label, value, _ in cases:
-            client.update(seen.uuid(label), value)
-            time.sleep(0.2)  # below the limit of lines per second
-        client.update(seen.uuid("Speed"), 4)
-        client.update(seen.uuid("Environment"), "2")
-        until(lambda: (run.speed, panel.env) == (4.0, 1))
-        client.update(seen.uuid("Speed"), 1)
-        client.update(seen.uuid("Environment"), "1")
-        until(lambda: (run.speed, panel.env) == (1.0, 0))
-    assert (panel.camera, run.drive.robot, run.paused) == ("free", None, False)
-    lines = said()
-    assert len(lines) == len(cases), lines
-    for line, (_, _, words) in zip(lines, cases, strict=True):
-        assert line.startswith("mqe: view: ignored a message: ") and words in line and len(line) < 250
-
-
 def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> None:
     """The state, the bars and the observation are those of the chosen step; running on returns to the present."""
     run, panel = shown.session, shown.panel
@@ -162,26 +129,6 @@ def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> N
     run.drive.command, run.drive.robot = np.zeros(3), None
 
 
-def test_log_lines_are_limited(shown: SimpleNamespace, said: Any) -> None:
-    start = time.monotonic()
-    with Client(shown.port) as client:
-        for number in range(200):
-            client.send({"type": "x" * 1000, "number": number})
-        client.send("text")
-        assert client.closing_code() == 1003
-    seconds = int(time.monotonic() - start) + 2
-    lines = said()
-    assert 1 <= len(lines) <= 10 * seconds and max(map(len, lines)) < 250
-
-
-@pytest.mark.parametrize(("frame", "code"), [("text", 1003), (b"", 1007), (b"\xc1", 1007), (bytes(100_000), 1009)])
-def test_a_frame_that_is_no_message_closes_its_connection_only(shown: SimpleNamespace, frame: Any, code: int) -> None:
-    with Client(shown.port) as other, Client(shown.port) as client:
-        client.send(frame)
-        assert client.closing_code() == code
-        assert other.panel().widgets
-
-
 def test_keys_and_held_buttons_count_and_waiting_steps_are_limited(shown: SimpleNamespace) -> None:
     run, panel = shown.session, shown.panel
     with Client(shown.port) as client:
@@ -201,45 +148,11 @@ def test_keys_and_held_buttons_count_and_waiting_steps_are_limited(shown: Simple
     assert 1 <= panel.take_steps() <= 25 and panel.take_steps() == 0
 
 
-def test_no_message_opens_the_page_to_the_internet_or_buffers_an_upload(
-    shown: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(shown.server, "request_share_url", lambda *_: asked.append("share"))
-    with Client(shown.port) as client:
-        seen = client.panel()
-        client.send({"type": "ShareUrlRequest"})
-        upload = {"source_component_uuid": seen.uuid("Speed"), "transfer_uuid": "x", "filename": "x", "mime_type": ""}
-        client.send({"type": "FileTransferStartUpload", **upload, "part_count": 10**9, "size_bytes": 10**15})
-        client.send({"type": "GuiFormDirtyMessage", "uuid": "form"})
-        client.update(seen.uuid("Speed"), 2.0)
-        until(lambda: shown.session.speed == 2.0)
-    assert not asked and not shown.server.gui._current_file_upload_states
-    with Client(shown.port) as client:
-        assert client.panel().widgets.keys() == seen.widgets.keys()
-
-
-def test_a_camera_without_direction_is_refused(shown: SimpleNamespace) -> None:
-    """Otherwise the next change of the followed body would fail for all clients."""
-    with Client(shown.port) as client:
-        seen = client.panel()
-        client.send({**CAMERA, "position": [5.0, 0.0, 1.0]})
-        for bad in ({"look_at": CAMERA["position"]}, {"up_direction": [0.0, 0.0, 0.0]}, {"fov": float("nan")}):
-            client.send({**CAMERA, **bad})
-        client.update(seen.uuid("Camera"), "robot 2")
-        until(lambda: shown.panel.camera == "robot 2")
-        cameras = [one.camera for one in shown.server.get_clients().values()]
-        assert [camera.position.tolist() for camera in cameras] == [[5.0, 0.0, 1.0]]
-        client.update(seen.uuid("Camera"), "free")
-
-
 def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = []
 
     class Other:
         """A server that is not started by websockets.asyncio.server.serve."""
-
-        gui = SimpleNamespace(_gui_input_handle_from_uuid={}, _command_handle_from_uuid={})
 
         def __init__(self, **_: Any) -> None:
             pass

@@ -105,17 +105,6 @@ class Client:
     def update(self, uuid: str, value: Any) -> None:
         self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
 
-    def closing_code(self) -> int:
-        """Waits until the server has closed the connection; returns the code (RFC 6455, 7.4)."""
-        from websockets.exceptions import ConnectionClosed
-
-        try:
-            while True:
-                self.socket.recv(timeout=10.0)
-        except ConnectionClosed as closed:
-            assert closed.rcvd is not None
-            return closed.rcvd.code
-
     def panel(self) -> Panel:
         """Reads what every new client is sent first."""
         panel = Panel()

@@ -1,8 +1,11 @@
-"""viser's web server, restricted to connections and messages that `messages` accepts.
+"""viser's web server, restricted to requests to its own address, from its own page or from no page at all.
+
+Browsers let every page open a websocket to every address, and name the page's origin in the header `Origin`, which a
+page cannot change. A page whose name resolves to this machine (DNS rebinding) is of the same origin, with its own name
+in the header `Host`. Programs other than browsers send no `Origin`; they are accepted, since they could send any.
 
 viser has no setting for this. Written for viser 1.1.1, which starts its server by `websockets.asyncio.server.serve`.
-While viser starts, that name is replaced by a function that adds two documented arguments: `process_request` refuses
-requests, `create_connection` filters frames. All that depends on viser's internals is in this file.
+While viser starts, that name is replaced by a function that adds the documented argument `process_request`.
 """
 
 from __future__ import annotations
@@ -11,20 +14,19 @@ import contextlib
 import functools
 import http
 import io
+import ipaddress
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import viser
 import websockets.asyncio.server as websockets_server
 from websockets.asyncio.server import ServerConnection
-from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mqe_jax.errors import InputError
 from mqe_jax.literal import line
-from mqe_jax.view.messages import MAX_FRAME, RefusedError, UnparsableError, authorities, check, refusal
 
 _LINES = 10  # logged per second at most
 _LENGTH = 200  # of a logged line, characters
@@ -44,43 +46,13 @@ class _Log:
             print(f"mqe: view: {line(text[:_LENGTH])}", file=sys.stderr, flush=True)
 
 
-class _Connection(ServerConnection):
-    """A connection from which only acceptable frames are received."""
-
-    def __init__(self, find: Callable[[str], Any], log: _Log, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._find, self._log = find, log
-
-    async def recv(self, decode: bool | None = None) -> Any:
-        """Returns the next acceptable frame; closes the connection after a frame that is no message."""
-        while True:
-            frame = await super().recv(decode)
-            try:
-                check(frame, self._find)
-                return frame
-            except RefusedError as error:
-                self._log(f"ignored a message: {error}")
-            except UnparsableError as error:
-                self._log(f"closed a connection: its message is {error}")
-                text = isinstance(frame, str)
-                await self.close(CloseCode.UNSUPPORTED_DATA if text else CloseCode.INVALID_DATA)
-
-
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     """Returns a running server, without printing viser's banner.
 
     Raises an InputError for a version of viser in which the restrictions would have no effect.
     """
     log, original = _Log(), websockets_server.serve
-    servers: list[viser.ViserServer] = []
     serving = False
-
-    def find(uuid: str) -> Any:
-        """Returns the widget or command of a uuid, or None."""
-        if not servers:
-            return None
-        gui = servers[0].gui
-        return gui._gui_input_handle_from_uuid.get(uuid) or gui._command_handle_from_uuid.get(uuid)
 
     def answer(page: Any, connection: ServerConnection, request: Request) -> Response | None:
         """Returns the response to a request, or None if it opens a websocket; `page` serves the files of the page."""
@@ -98,7 +70,6 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         nonlocal serving
         serving = True
-        options |= {"max_size": MAX_FRAME, "create_connection": functools.partial(_Connection, find, log)}
         return original(*arguments, process_request=functools.partial(answer, process_request), **options)
 
     websockets_server.serve = serve  # type: ignore[misc]
@@ -107,9 +78,29 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
             server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     finally:
         websockets_server.serve = original  # type: ignore[misc]
-    private = (hasattr(server.gui, name) for name in ("_gui_input_handle_from_uuid", "_command_handle_from_uuid"))
-    if not (serving and all(private)):
+    if not serving:
         server.stop()
         raise InputError(f"view: viser {viser.__version__} cannot be restricted (pip install 'viser==1.1.1' can)")
-    servers.append(server)
     return server
+
+
+def authorities(host: str, address: str, port: int) -> frozenset[str]:
+    """Returns the values of the header `Host` that name this server, in lower case.
+
+    `host` is the host given to listen on, `address` the local IP address of the connection, `port` its port. On the
+    loopback interface the names localhost, 127.0.0.1 and [::1] are valid too.
+    """
+    names = {host.lower(), address}
+    if ipaddress.ip_address(address.partition("%")[0]).is_loopback:
+        names |= {"localhost", "127.0.0.1", "::1"}
+    names = {f"[{name}]" if ":" in name else name for name in names}
+    return frozenset(f"{name}:{port}" for name in names) | (names if port == 80 else set())
+
+
+def refusal(hosts: Sequence[str], origins: Sequence[str], allowed: frozenset[str]) -> str | None:
+    """Returns why a request is refused, or None; `hosts` and `origins` are all values of the two headers."""
+    if len(hosts) != 1 or hosts[0].lower() not in allowed:
+        return f"Host is {' and '.join(hosts) or 'missing'}, allowed: {', '.join(sorted(allowed))}"
+    if origins and [origin.lower() for origin in origins] != [f"http://{hosts[0].lower()}"]:
+        return f"Origin is {' and '.join(origins)}, allowed: http://{hosts[0]}"
+    return None
