@@ -1,26 +1,19 @@
-"""SIGINT and SIGTERM in the command line: a training is saved first, everything else ends at once.
+"""SIGINT and SIGTERM: a training ends after the update in progress, any other command at once.
 
-A signal raises no exception, which an import in C, a callback of JAX or a destructor could swallow. It wakes up a
-thread, also while the main thread computes or compiles, which runs the registered acts, prints one line and ends the
-process.
+Python runs a signal's handler between two of its own instructions, which compiled code may delay for minutes, and JAX
+loses an exception that is raised in a callback. So in the command line a thread waits for the signals.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-import select
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NoReturn
-
-from mqe_jax.errors import one_line
-from mqe_jax.literal import line
-
-Act = Callable[[], str | None]
 
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 _REPEATED = 1.0
@@ -29,8 +22,19 @@ _REPEATED = 1.0
 temporaries: set[os.PathLike[str]] = set()
 """Files that are removed when a signal ends the process."""
 
-_acts: list[Act] = []
-_ending = threading.Event()
+_deferring = _installed = False
+_noted, _since = 0, 0.0
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal after which everything was saved; the text says how to go on."""
+
+    def __init__(self, text: str = "", number: int = 0) -> None:
+        super().__init__(text)
+        self.number = number or _noted or signal.SIGINT
+
+    def __str__(self) -> str:
+        return "; ".join(filter(None, [_WORDS[signal.Signals(self.number)], str(self.args[0])]))
 
 
 def exit_code(number: int) -> int:
@@ -40,6 +44,7 @@ def exit_code(number: int) -> int:
 
 def install() -> None:
     """Ends the process on SIGINT and SIGTERM from now on. A signal that is ignored, as by `nohup`, stays ignored."""
+    global _installed
     if threading.current_thread() is not threading.main_thread():
         return
     wanted = [number for number in _WORDS if signal.getsignal(number) is not signal.SIG_IGN]
@@ -49,82 +54,60 @@ def install() -> None:
     signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
     for number in wanted:
         signal.signal(number, lambda number, frame: None)
+    _installed = True
+
+
+def installed() -> bool:
+    """Returns whether `install` was called: in the command line, not in a notebook."""
+    return _installed
 
 
 @contextlib.contextmanager
-def before_exit(act: Act) -> Iterator[None]:
-    """Registers what is done, by another thread, when a signal ends the process: the last registered act first.
+def deferred() -> Iterator[Callable[[], int]]:
+    """Yields a function that returns the signal that came since, or 0; a later one ends the process at once.
 
-    The text that an act returns, or the message of its exception, becomes part of the line on standard error. A second
-    signal ends the process without waiting for the acts.
+    Without `install`, as in a notebook, it defers SIGINT, and a later one raises KeyboardInterrupt.
     """
-    _acts.append(act)
+    global _deferring, _noted
+
+    def note(number: int, frame: object) -> None:
+        if not _note(number):
+            raise KeyboardInterrupt
+
+    restore = None
+    if not _installed and threading.current_thread() is threading.main_thread():
+        restore = signal.signal(signal.SIGINT, note)
+    _deferring, _noted = True, 0
     try:
-        yield
+        yield lambda: _noted
     finally:
-        _acts.remove(act)
+        _deferring = False
+        if restore is not None:
+            signal.signal(signal.SIGINT, restore)
 
 
-@contextlib.contextmanager
-def child(command: Sequence[str], **options: Any) -> Iterator[Any]:
-    """Starts a program as `subprocess.Popen` does, killed at an exception or when a signal ends this process."""
-    import subprocess  # 5 ms, which `install` should not wait for
-
-    with subprocess.Popen(command, **options) as process, before_exit(process.kill):
-        try:
-            yield process
-        except BaseException:
-            process.kill()
-            raise
-
-
-def settle() -> None:
-    """Does not return while a signal ends the process, so that the main thread reports no error of that."""
-    if _ending.is_set():
-        threading.Event().wait()
-
-
-def end() -> NoReturn:
-    """Ends the process as SIGTERM does, and its main thread here."""
-    if not _ending.is_set():
-        signal.raise_signal(signal.SIGTERM)  # `os.kill` of Windows runs no handler
-    while True:
-        threading.Event().wait()
+def _note(number: int) -> bool:
+    """Notes the first signal while signals are deferred; returns whether the process goes on."""
+    global _noted, _since
+    if not _deferring:
+        return False
+    if not _noted:
+        _noted, _since = number, time.monotonic()
+    return time.monotonic() - _since <= _REPEATED
 
 
 def _watch(reader: socket.socket, wanted: Sequence[int]) -> None:
     """Waits for signals; the wake-up socket has the number of each as a byte."""
-    began = 0.0
     while True:
         for number in reader.recv(64):
-            if number not in wanted:
-                continue
-            if not _ending.is_set():
-                began = time.monotonic()
-                _ending.set()
-                if not _acts:
-                    _exit(number)
-                threading.Thread(target=_end, args=(number,), daemon=True).start()
-            elif time.monotonic() - began > _REPEATED:
+            if number in wanted and not _note(number):
                 _exit(number)
 
 
-def _end(number: int) -> None:
-    said = []
-    for act in reversed(_acts[:]):
-        try:
-            said.append(act())
-        except Exception as error:
-            said.append(one_line(error))
-    _exit(number, *filter(None, said))
-
-
-def _exit(number: int, *said: str) -> None:
-    text = line("; ".join([f"mqe: {_WORDS[signal.Signals(number)]}", *said]))
+def _exit(number: int) -> None:
     with contextlib.suppress(OSError):
-        # A reader that has stopped would block for ever; Windows selects sockets only.
-        if os.name != "posix" or select.select([], [2], [], 1.0)[1]:
-            os.write(2, f"{text}\n".encode())
+        cursor = "\x1b[?25h" if sys.stderr is not None and sys.stderr.isatty() else ""  # which a bar has hidden
+        os.write(2, f"{cursor}mqe: {_WORDS[signal.Signals(number)]}\n".encode())
     for path in tuple(temporaries):
         with contextlib.suppress(OSError):
             os.unlink(path)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: one line, exit code 130 or 143, at any time; SIGKILL too leaves a run that resumes exactly."""
+"""SIGINT and SIGTERM: one line, exit code 130 or 143; SIGKILL too leaves a run that resumes exactly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mqe_jax import cli
+from mqe_jax import cli, interrupts
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
 from tests.training import assert_same_run, rows, without_progress
@@ -116,65 +116,54 @@ def test_a_long_computation_in_c_delays_nothing(number: signal.Signals, tmp_path
     assert end(run(body, tmp_path, tmp_path / "ready"), number, seconds=5) == [ENDS[number][1]]
 
 
-def test_children_and_unfinished_files_go(tmp_path: Path) -> None:
+def test_unfinished_files_go(tmp_path: Path) -> None:
     body = """
-with interrupts.child(["sleep", "1000"]) as child, files.replacing(folder / "clip.mp4") as temporary:
+with files.replacing(folder / "clip.mp4") as temporary:
     temporary.write_text("half")
-    (folder / "ready").write_text(str(child.pid))
+    (folder / "ready").touch()
     time.sleep(1000)
 """
-    process = run(body, tmp_path, tmp_path / "ready")
-    wait_for(lambda: (tmp_path / "ready").read_text() != "", process)
-    end(process, signal.SIGTERM)
+    end(run(body, tmp_path, tmp_path / "ready"), signal.SIGTERM)
     assert [path.name for path in tmp_path.iterdir()] == ["ready"]
-    child = Path(f"/proc/{(tmp_path / 'ready').read_text()}/stat")
-    deadline = time.monotonic() + 10.0
-    while child.exists() and child.read_text().split()[2] != "Z":
-        assert time.monotonic() < deadline, "the child lives on"
-        time.sleep(0.05)
+
+
+SAVING = """
+with interrupts.deferred() as signalled:
+    (folder / "ready").touch()
+    while not signalled():
+        time.sleep(0.01)
+    (folder / "saving").touch()
+    time.sleep(SECONDS)
+print(interrupts.Interrupted("saved"), file=sys.stderr)
+"""
 
 
 def test_a_signal_sent_twice_at_once_counts_once(tmp_path: Path) -> None:
     """As `timeout` and schedulers do; the second one does not break off the saving."""
-    body = """
-def save():
-    (folder / "saving").touch()
-    time.sleep(0.3)
-    (folder / "saved").touch()
-    return "saved"
-with interrupts.before_exit(save):
-    (folder / "ready").touch()
-    time.sleep(1000)
-"""
-    process = run(body, tmp_path, tmp_path / "ready")
+    process = run(SAVING.replace("SECONDS", "0.3"), tmp_path, tmp_path / "ready")
     process.send_signal(signal.SIGTERM)
     wait_for((tmp_path / "saving").exists, process)
-    assert end(process, signal.SIGTERM) == ["mqe: terminated; saved"]
-    assert (tmp_path / "saved").exists()
-
-
-def test_a_second_signal_does_not_wait_for_the_saving(tmp_path: Path) -> None:
-    body = """
-with interrupts.before_exit(lambda: time.sleep(1000)):
-    (folder / "ready").touch()
-    time.sleep(1000)
-"""
-    process = run(body, tmp_path, tmp_path / "ready")
     process.send_signal(signal.SIGTERM)
-    time.sleep(1.1)
+    assert process.communicate(timeout=10)[1] == "terminated; saved\n" and process.returncode == 0
+
+
+def test_a_later_signal_does_not_wait_for_the_saving(tmp_path: Path) -> None:
+    process = run(SAVING.replace("SECONDS", "1000"), tmp_path, tmp_path / "ready")
+    process.send_signal(signal.SIGTERM)
+    time.sleep(1.2)
     assert end(process, signal.SIGINT, seconds=5) == ["mqe: interrupted"]
 
 
-def test_a_saving_that_fails_is_reported(tmp_path: Path) -> None:
-    body = """
-def save():
-    raise OSError(28, "No space left on device", "run/checkpoint")
-with interrupts.before_exit(save):
-    (folder / "ready").touch()
-    time.sleep(1000)
-"""
-    process = run(body, tmp_path, tmp_path / "ready")
-    assert end(process, signal.SIGTERM) == ["mqe: terminated; run/checkpoint: No space left on device"]
+def test_without_the_command_line_only_sigint_is_deferred() -> None:
+    """As in a notebook, where a later one raises KeyboardInterrupt."""
+    with interrupts.deferred() as signalled:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        assert signalled() == signal.SIGINT
+        time.sleep(1.1)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:

@@ -265,7 +265,7 @@ def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: 
     both = [launch._Process([program], {}, "", True) for program in (survivor, killed)]
     for process in both:
         process.popen.wait(60)
-    assert launch._wait(both) == 137
+    assert launch._wait(both, lambda: None) == 137
     assert capfd.readouterr().err == "mqe: a process of the training was killed by SIGKILL; " + launch._RESUME + "\n"
 
 

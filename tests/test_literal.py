@@ -1,9 +1,5 @@
 """Paths, names and errors of others are shown as they are: nothing in them is markup, or a control character."""
 
-import os
-import signal
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -61,11 +57,3 @@ def test_names_are_no_formulas_in_pictures(tmp_path: Path) -> None:
 def test_a_terminal_gets_one_printable_line() -> None:
     said = one_line(InputError("runs/\x1b]0;title\x07\n\u202egnp.\udcff: damaged"))
     assert said == "runs/\\x1b]0;title\\x07 \\u202egnp.\\udcff: damaged"
-
-
-def test_a_signal_ends_a_program_whose_run_folder_is_no_text() -> None:
-    program = "import os, signal; from mqe_jax import interrupts; interrupts.install()\n"
-    program += "with interrupts.before_exit(lambda: 'run is in runs/\\udcff'):\n"
-    program += "    os.kill(os.getpid(), signal.SIGTERM); signal.pause()"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=20, env=os.environ)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "mqe: terminated; run is in runs/\\udcff\n")

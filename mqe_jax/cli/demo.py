@@ -49,10 +49,9 @@ def demo(arguments: Demo) -> None:
     echo("mqe demo: evaluating the untrained policy")
     table = {"before": evaluate(DEMO_TASK, before, **measure).to_dict()}
     print(f"before training: {_summary(table['before'])}", flush=True)
-    with interrupts.before_exit(lambda: "the same command resumes from here"):
-        run = learn(DEMO_TASK, config, impl=arguments.impl, run_dir=run_dir, resume=resume)
+    run = learn(DEMO_TASK, config, impl=arguments.impl, run_dir=run_dir, resume=resume)
     if not run.finished:
-        raise KeyboardInterrupt
+        raise interrupts.Interrupted("the same command resumes from here")
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
     curves.save_figure(curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU"), run_dir / "curve.png")

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
@@ -263,20 +263,23 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
     """Runs the processes of this host, which end when one fails if they are `together`; returns the exit code."""
     processes: list[_Process] = []
 
-    def forward() -> str:
-        for process in processes:
-            process.muted = True
-            process.popen.send_signal(signal.SIGTERM)
-        for process in processes:
-            process.popen.wait()
-        return _RESUME if together else _REPEAT
+    with interrupts.deferred() as signalled:
 
-    with interrupts.before_exit(forward):
+        def pause() -> None:
+            if number := signalled():
+                for process in processes:
+                    process.muted = True
+                    process.popen.send_signal(signal.SIGTERM)
+                for process in processes:
+                    process.popen.wait()
+                raise interrupts.Interrupted(_RESUME if together else _REPEAT, number)
+            time.sleep(0.05)
+
         try:
             for i, variables in enumerate(members):
                 prefix = "" if together else f"[{i}] "
                 processes.append(_Process(command, variables, prefix, not together or i == 0))
-            return _wait(processes) if together else max(map(_code, _each(processes)))
+            return _wait(processes, pause) if together else max(map(_code, _each(processes, pause)))
         finally:
             for process in processes:
                 if process.popen.poll() is None:
@@ -284,7 +287,7 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
                     process.popen.wait()
 
 
-def _wait(processes: Sequence[_Process]) -> int:
+def _wait(processes: Sequence[_Process], pause: Callable[[], None]) -> int:
     """Waits until all processes have ended, or the others `_GRACE` after one that failed; returns the exit code."""
     failed, since = None, 0.0
     while any(process.popen.poll() is None for process in processes):
@@ -294,11 +297,10 @@ def _wait(processes: Sequence[_Process]) -> int:
                 process.muted |= failed.popen.returncode < 0
         if failed is not None and (failed.popen.returncode < 0 or time.monotonic() - since > _GRACE):
             break
-        time.sleep(0.05)
+        pause()
     failed = failed or _cause(processes)
     if failed is None:
         return 0
-    interrupts.settle()
     message = failed.verdict(_RESUME)
     processes[0].read()
     if message and message != processes[0].last:  # they may have found the same mistake
@@ -314,17 +316,16 @@ def _cause(processes: Sequence[_Process]) -> _Process | None:
     return min(ended, key=lambda process: process.peer, default=None)
 
 
-def _each(processes: Sequence[_Process]) -> Iterator[_Process]:
+def _each(processes: Sequence[_Process], pause: Callable[[], None]) -> Iterator[_Process]:
     """Yields the processes of a sweep as they end, after saying which signal has killed one."""
     running = list(processes)
     while running:
         for process in [process for process in running if process.popen.poll() is not None]:
             running.remove(process)
-            interrupts.settle()
             if message := process.verdict(_REPEAT):
                 echo(message)
             yield process
-        time.sleep(0.05)
+        pause()
 
 
 def _code(process: _Process) -> int:

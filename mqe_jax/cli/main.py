@@ -13,6 +13,7 @@ from typing import Any
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError, NonFiniteError, one_line
+from mqe_jax.literal import line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     exception is a defect and keeps its traceback.
 
     As a program (`arguments` is None), SIGINT (Ctrl-C) ends the process with 130 and SIGTERM with 143, with one line on
-    standard error, at any time from here on: a training after saving, everything else at once.
+    standard error: a training after the update in progress, everything else at once.
     """
     if arguments is None:
         interrupts.install()
@@ -32,10 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         programs.hasten()
         programs.keep()
         warnings.formatwarning = lambda message, *_, **__: f"mqe: warning: {message}\n"
-    try:
-        code, message = _attempt(sys.argv[1:] if arguments is None else arguments)
-    finally:
-        interrupts.settle()
+    code, message = _attempt(sys.argv[1:] if arguments is None else arguments)
     if message:
         with contextlib.suppress(OSError):  # standard error may be a file on a full disk
             print(f"mqe: {message}", file=sys.stderr, flush=True)
@@ -68,6 +66,8 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         if not stop.code:
             raise
         return int(stop.code), ""  # after tyro's message, or that of `mqe launch`
+    except interrupts.Interrupted as stop:
+        return interrupts.exit_code(stop.number), line(str(stop))
     except KeyboardInterrupt:  # where `main` was called with arguments, from Python
         return interrupts.exit_code(signal.SIGINT), "interrupted"
     except BrokenPipeError:

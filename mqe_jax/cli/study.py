@@ -80,9 +80,12 @@ class Sweep:
         cells = "".join(f" --cells {shlex.quote(cell)}" for cell in self.cells)
         cells += "".join(f" --seeds {seed}" for seed in self.seeds)
         part = "" if self.part is None else f" --part {shlex.quote(self.part)}"
-        with interrupts.before_exit(lambda: f"resume with: mqe sweep {self.file}{part} --folder {folder}{cells}"):
-            make = functools.partial(environments, self.impl)
+        make = functools.partial(environments, self.impl)
+        try:
             others, failed = sweeps.run(folder, jobs, make, on_failure=_tell_failure, stop=stop)
+        except KeyboardInterrupt:
+            resume = f"resume with: mqe sweep {self.file}{part} --folder {folder}{cells}"
+            raise interrupts.Interrupted(resume) from None
         if others:
             skipped = ", ".join(job.cell.path.as_posix() for job in others)
             echo(f"mqe: skipped, in use by other processes: {skipped}")

@@ -76,15 +76,14 @@ class Train(TaskOptions):
         run_dir, seed = self.run_dir or Path("runs") / self.target, self.settings.seed
         options: dict[str, Any] = {"env": self.overrides(), "impl": self.impl, "resume": self.resume}
         options |= {"run_dir": run_dir, "dump_diverged": self.dump_diverged}
-        with interrupts.before_exit(lambda: _HINT.format(run_dir)):
-            if self.num_seeds == 1:
-                folders, runs = [run_dir], [learn(self.target, self.settings, **options)]
-            else:
-                seeds = range(seed, seed + self.num_seeds)
-                folders = [run_dir / f"seed{number}" for number in seeds]
-                runs = learn_seeds(self.target, self.settings, seeds=seeds, **options)
+        if self.num_seeds == 1:
+            folders, runs = [run_dir], [learn(self.target, self.settings, **options)]
+        else:
+            seeds = range(seed, seed + self.num_seeds)
+            folders = [run_dir / f"seed{number}" for number in seeds]
+            runs = learn_seeds(self.target, self.settings, seeds=seeds, **options)
         if not all(run.finished for run in runs):
-            raise KeyboardInterrupt  # which ended the training in Python, not in the command line
+            raise interrupts.Interrupted(_HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
         curves.save_figure(curves.plot_curves([run.metrics for run in runs], self.target), run_dir / "curve.png")
@@ -119,8 +118,10 @@ class SkillTrain:
         if self.weights is not None:
             config.network.form().networks.load(robot, self.weights)
             config = override(config, {"network.weights": str(self.weights.resolve())})
-        with interrupts.before_exit(lambda: _HINT.format(run_dir)):
+        try:
             train_skill(self.skill, robot, run_dir, config, self.task, impl=self.impl, resume=self.resume)
+        except KeyboardInterrupt:
+            raise interrupts.Interrupted(_HINT.format(run_dir)) from None
         if jax.process_index() == 0:
             echo(f"mqe: {run_dir} holds {self.skill}.safetensors, metrics.csv and checkpoints")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from mqe_jax import interrupts
 from mqe_jax.build import Config, Task, prepare
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Seed, Seeds
@@ -195,7 +196,8 @@ def _train(
         try:
             training.run()
         except KeyboardInterrupt:
-            echo(f"mqe: interrupted after {training.env_steps:,} environment steps")
+            if not interrupts.installed():
+                echo(f"mqe: interrupted after {training.env_steps:,} environment steps")
         written = [folder for folder in folders if folder is not None]
         if written and jax.process_index() == 0:  # one process writes the files
             return [load_run(folder) for folder in written]

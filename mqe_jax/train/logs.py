@@ -25,7 +25,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.text import Text
 
-from mqe_jax import interrupts
 from mqe_jax.errors import InputError
 from mqe_jax.files import append, make_folder, parsing, read_rows, write_atomically
 from mqe_jax.settings import PathText, check
@@ -218,7 +217,6 @@ class ProgressLog:
         self._doing, self._active, self._began = "", False, 0.0
         self._since, self._seconds = time.perf_counter(), 0.0  # start of this update, time of those before
         self._last_line = -math.inf
-        self._open = contextlib.ExitStack()
         self._bar: Progress | None = None
         self._output: Any = None  # of a notebook's cell
         console = Console(stderr=True)
@@ -232,12 +230,12 @@ class ProgressLog:
 
     def __enter__(self) -> Self:
         if self._bar is not None:
-            self._open.enter_context(self._bar)
-            self._open.enter_context(interrupts.before_exit(self._bar.stop))
+            self._bar.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._open.close()
+        if self._bar is not None:
+            self._bar.stop()
 
     def start(self, env_steps: int) -> None:
         """Begins the first update of a run, after `env_steps`."""

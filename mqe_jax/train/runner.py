@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -165,9 +164,6 @@ class Training:
         if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
             self._monitor = Monitor(eval_env, self._config)
         self.rows, self.evaluations = [[] for _ in configs], []
-        self._logs = contextlib.ExitStack()
-        self._writing = threading.RLock()  # held while files are written and the state is exchanged
-        self._signal, self._ended = threading.Event(), threading.Event()  # in one of several processes
 
     def run(self, on_update: OnUpdate | None = None, stop: Callable[[], bool] = lambda: False) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
@@ -179,7 +175,7 @@ class Training:
             places = self._folders or [None] * len(self._configs)
             self.evaluations = [EvaluationLog(place, self.env_steps) for place in places]
         total_steps = config.num_updates * config.steps_per_update
-        with self._logs as logs:
+        with contextlib.ExitStack() as logs:
             files: list[list[MetricsLog]] = [[] for _ in self._configs]
             for folder, own, own_logs in zip(self._folders, self._configs, files, strict=False):
                 if not self._processes.leads:
@@ -188,34 +184,29 @@ class Training:
                 for make_log in (CsvLog, *(LOGGERS[name] for name in config.loggers)):
                     own_logs.append(make_log(folder, self.env_steps))
                     logs.callback(own_logs[-1].close)
-            logs.enter_context(interrupts.before_exit(self._end))
             try:
                 self._evaluate_if_due()  # left out by a run that ended during this evaluation
                 if self.env_steps < total_steps:
                     with self._progress.doing("compiling"):
                         self._update.lower(self._state).compile()
                 self._progress.start(self.env_steps)
-                while self.env_steps < total_steps and not self._stopped(stop):
-                    rows = self._step(files)
-                    self._progress.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
-                    if on_update is not None:
-                        for state, row in zip(self._own(), rows, strict=True):
-                            on_update(state, row)
-                    if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
-                        self._save()
-                self._save()
+                with interrupts.deferred() as signalled:
+                    while self.env_steps < total_steps and not self._stopped(stop, signalled):
+                        rows = self._step(files)
+                        self._progress.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                        if on_update is not None:
+                            for state, row in zip(self._own(), rows, strict=True):
+                                on_update(state, row)
+                        if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
+                            self._save()
+                    self._save()
                 if self.env_steps >= total_steps:
                     self._measure_best()
                 self._processes.gather([0])  # the others wait for the one that evaluates
-            except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
-                if self._processes.count > 1:
-                    raise
-                if isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" not in str(error):
-                    raise
-                self._save()
-                raise KeyboardInterrupt from None  # JAX wraps one that is raised in a callback of the C engine
-            finally:
-                self._ended.set()
+            except KeyboardInterrupt:
+                if self._processes.count == 1:
+                    self._save()
+                raise
         return self._own()
 
     def _own(self) -> list[TrainState]:
@@ -223,29 +214,13 @@ class Training:
         own = self._stacked.own(self._state)
         return [self._seeds.take(own, i) for i in range(len(self._configs))]
 
-    def _end(self) -> None:
-        """Saves the last complete update and closes the logs, in another thread, before a signal ends the process.
-
-        The update that the main thread computes is left out: neither a long one nor an evaluation is waited for.
-        Several processes finish it, where the one before is not saved, to save the same one.
-        """
-        if self._processes.count > 1 and self._saved != self.env_steps:
-            self._signal.set()
-            self._ended.wait()
-        self._writing.acquire()  # for ever, so that the main thread writes nothing more
-        try:
-            self._save()
-        finally:
-            self._logs.close()
-
-    def _stopped(self, stop: Callable[[], bool]) -> bool:
-        """Returns whether the run ends here, for all processes; ends them all, after saving, for a signal to one."""
-        asked = self._processes.gather([stop(), self._signal.is_set()])
-        if asked[:, 1].any():
+    def _stopped(self, stop: Callable[[], bool], signalled: Callable[[], int]) -> bool:
+        """Returns whether the run ends here, for all processes; after a signal to one of them, all save and end."""
+        asked = self._processes.gather([int(stop()), signalled()])
+        if number := int(asked[:, 1].max()):
             self._save()
             self._processes.gather([0])
-            self._ended.set()
-            interrupts.end()
+            raise interrupts.Interrupted(number=number)
         return bool(asked[:, 0].any())
 
     def _step(self, files: Sequence[Sequence[MetricsLog]]) -> list[dict[str, float]]:
@@ -262,13 +237,12 @@ class Training:
                 folder = self._folders[i] if self._folders else None
                 check_finite(learned(self._seeds.take(self._stacked.own(after), i)), row, folder)
             rows.append(row)
-        with self._writing:
-            for logs, done, row in zip(files, self.rows, rows, strict=True):
-                for log in logs:
-                    log.write(row)
-                done.append(row)
-            # Assigned after logging, so that an interrupted run saves no update that is not logged.
-            self._state, self.env_steps = after, int(rows[0]["env_steps"])
+        for logs, done, row in zip(files, self.rows, rows, strict=True):
+            for log in logs:
+                log.write(row)
+            done.append(row)
+        # Assigned after logging, so that an interrupted run saves no update that is not logged.
+        self._state, self.env_steps = after, int(rows[0]["env_steps"])
         return rows
 
     def policies(self) -> list[TrainedPolicy]:
@@ -281,26 +255,25 @@ class Training:
 
     def _save(self) -> None:
         """Writes checkpoint and policy of every seed, once per update."""
-        with self._writing:
-            if self._saved == self.env_steps or not self._folders:
-                return
-            seconds = time.perf_counter() - self._start_time
-            # A process killed between two seeds' checkpoints has the older one in common.
-            kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
-            for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
-                metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-                metadata["generator"] = generator()
-                metadata["environments"] = config.checkpoint.environments
-                if config.checkpoint.environments:
-                    tree = self._processes.join(without_shared(state, self._seeds.shared))
-                else:
-                    tree = without_environments(state)
-                if self._processes.leads:
-                    save_checkpoint(folder, tree, self.env_steps, metadata, kept)
-            self._save_policies()
-            self._saved = self.env_steps
-            for log in self.evaluations:
-                log.prune()
+        if self._saved == self.env_steps or not self._folders:
+            return
+        seconds = time.perf_counter() - self._start_time
+        # A process killed between two seeds' checkpoints has the older one in common.
+        kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
+        for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
+            metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
+            metadata["generator"] = generator()
+            metadata["environments"] = config.checkpoint.environments
+            if config.checkpoint.environments:
+                tree = self._processes.join(without_shared(state, self._seeds.shared))
+            else:
+                tree = without_environments(state)
+            if self._processes.leads:
+                save_checkpoint(folder, tree, self.env_steps, metadata, kept)
+        self._save_policies()
+        self._saved = self.env_steps
+        for log in self.evaluations:
+            log.prune()
 
     def _save_policies(self) -> None:
         if not self._processes.leads:
@@ -325,9 +298,8 @@ class Training:
         steps = [self.env_steps] * len(policies)
         with self._progress.doing("evaluating"):
             results = self._monitor.evaluate(policies, steps, self._config.evaluation.episodes)
-        with self._writing:
-            for log, result, policy in zip(self.evaluations, results, policies, strict=True):
-                log.add(result, policy)
+        for log, result, policy in zip(self.evaluations, results, policies, strict=True):
+            log.add(result, policy)
 
     def _measure_best(self) -> None:
         """Measures the absolute metric of every seed's best policy, once."""
@@ -338,6 +310,5 @@ class Training:
         episodes = ABSOLUTE_FACTOR * self._config.evaluation.episodes
         with self._progress.doing("evaluating"):
             results = self._monitor.evaluate(policies, steps, episodes, absolute=True)
-        with self._writing:
-            for log, result in zip(self.evaluations, results, strict=True):
-                log.end(result, self.env_steps)
+        for log, result in zip(self.evaluations, results, strict=True):
+            log.end(result, self.env_steps)

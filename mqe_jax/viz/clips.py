@@ -16,7 +16,6 @@ from PIL import Image
 from mqe_jax import files
 from mqe_jax.errors import InputError
 from mqe_jax.files import replacing
-from mqe_jax.interrupts import child
 from mqe_jax.settings import PathText, checked, fail
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
@@ -79,7 +78,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
     encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
-    with child(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stderr is not None
         try:
             for frame in itertools.chain([first], frames):

@@ -18,7 +18,6 @@ from mqe_jax.appearance import GROUND_GROUP
 from mqe_jax.appearance.grounds import GROUND_MATERIAL
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
-from mqe_jax.interrupts import child
 from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
 from mqe_jax.settings import PathText, checked
 from mqe_jax.train.types import AnySingle
@@ -62,11 +61,11 @@ def _working_backend() -> str | None:
         environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": name}
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            with child([sys.executable, "-c", _PROBE], env=environment, **quiet) as process:
-                if process.wait(60) == 0:
-                    if chosen not in ("", name):
-                        print(f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead", file=sys.stderr)
-                    return name
+            done = subprocess.run([sys.executable, "-c", _PROBE], env=environment, timeout=60, check=False, **quiet)
+            if done.returncode == 0:
+                if chosen not in ("", name):
+                    print(f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead", file=sys.stderr)
+                return name
     return None
 
 
