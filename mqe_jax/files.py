@@ -190,6 +190,8 @@ class _Loader(yaml.SafeLoader):
         self.depth -= 1
         if node is not None and node.tag not in _TAGS:
             raise yaml.YAMLError(f"the tag {node.tag} is not allowed")
+        if node is not None and node.tag.endswith((":int", ":float")) and re.search(r"^[-+]?0[0-7_]|:", node.value):
+            node.tag = "tag:yaml.org,2002:str"  # 010 and 1:30, which YAML 1.1 reads as 8 and 90
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:

@@ -22,13 +22,14 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import itertools
 import math
 import os
 import re
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar, dataclass_transform
 
@@ -282,8 +283,8 @@ def _lenient(hint: Any) -> Any:
         return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
-    if origin is Mapping:
-        return Mapping[parts[0], _lenient(parts[1])]  # type: ignore[valid-type]
+    if origin in (Mapping, Sequence, list):
+        return origin[tuple(map(_lenient, parts))]  # type: ignore[index]
     if hint in (int, float):
         return _bounded(Annotated[hint, None])
     before = {bool: _boolean, str: _text, Path: _text}.get(hint)
@@ -331,7 +332,17 @@ def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Returns values with dotted names resolved into mappings."""
     if not isinstance(values, Mapping):
         fail(kind.__name__, values, "a mapping of names to values")
-    return joined({}, values)
+    made = joined({}, values)  # which refuses what is nested too deep
+    for name, following in itertools.pairwise(sorted(_names(values))):
+        if name == following:
+            raise InputError(f"{name}: is given twice")
+    return made
+
+
+def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the dotted names of all values that are no mappings."""
+    for key, value in values.items():
+        yield from _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
 
 
 def _fields(value: Any) -> Mapping[str, Any]:

@@ -108,6 +108,8 @@ def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
         ({"inner.kind": "agnet"}, "inner.kind: 'agnet' is not allowed; it must be 'agent' or 'joint' (did you"),
         ({"inner": {"clp": 1}}, "inner.clp: unknown name (value 1) (did you mean 'clip'?)"),
         ({"inner": {"clip": 6, "kind": "joint"}}, "inner.clip: 6.0 is not allowed; it must be at most 5 when"),
+        ({"inner.clip": 0.1, "inner": {"clip": 0.2}}, "inner.clip: is given twice"),
+        ({"free.a.b": 1, "free": {"a": {"b": 1}}}, "free.a.b: is given twice"),
     ],
 )
 @pytest.mark.parametrize("way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"])
@@ -172,6 +174,8 @@ def test_files(tmp_path: Path) -> None:
     assert load_yaml(path) == {"a": 1}
     path.write_text("")
     assert load_yaml(path) == {}
+    path.write_text("a: [1_000, -0.5, 010, 0o7, 1:30, 1:30.5, 0x1F]")
+    assert load_yaml(path) == {"a": [1000, -0.5, "010", "0o7", "1:30", "1:30.5", 31]}
     for text, message in (
         ("a: [", "file.yaml: damaged, or not YAML"),
         ("3", "file.yaml: holds int; it must be"),
