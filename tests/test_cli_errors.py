@@ -158,6 +158,7 @@ def test_errors_leave_no_folders(arguments: list[str], tmp_path: Path, capfd: py
         (["train", "fake", "--num-seeds", "0"], ["num_seeds: 0", "greater than 0"]),
         (["view", "go1gate", "--num-envs", "17"], ["num_envs: 17", "less than or equal to 16"]),
         (["view", "go1gate", "--port", "99999"], ["port: 99999", "less than 65536"]),
+        (["launch", "--devices", "-1", "train", "go1plane"], ["devices.0: -1", "greater than or equal to 0"]),
         (["eval", "fake", "--episodes", "many"], ["episodes", "many"]),
         (["train", "fake", "--ppo.gamma", "2"], ["ppo: gamma: 2.0", "less than or equal to 1"]),
         (["train", "fake", "--ppo.clip", "much"], ["ppo.clip", "'much'"]),

@@ -63,7 +63,10 @@ def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.Captur
     [
         ({"SLURM_PROCID": "0", "SLURM_LOCALID": "y"}, "SLURM_LOCALID: 'y' is not allowed; it must be a number"),
         ({"OMPI_COMM_WORLD_RANK": "-1"}, "OMPI_COMM_WORLD_RANK: '-1' is not allowed; it must be a number"),
-        ({launch.MEMBER: "0/2"}, f"{launch.MEMBER}: '0/2' is not allowed; it must be left out"),
+        *(
+            ({launch.MEMBER: wrong}, f"{launch.MEMBER}: {wrong!r} is not allowed; it must be left out")
+            for wrong in ("0/2", "2/2@7", "0/2@0", "0/2@65536")
+        ),
     ],
 )
 def test_variables_that_srun_and_mpirun_do_not_set(

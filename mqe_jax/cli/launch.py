@@ -20,7 +20,7 @@ import tyro
 
 from mqe_jax import interrupts
 from mqe_jax.errors import InputError
-from mqe_jax.limits import PositiveInt
+from mqe_jax.limits import NonNegativeInt, PositiveInt
 from mqe_jax.literal import echo
 from mqe_jax.settings import fail, record
 from mqe_jax.train.devices import PEER, PEER_ENDED
@@ -64,7 +64,7 @@ class Launch:
 
     processes: PositiveInt | None = None
     """Number of processes of this host."""
-    devices: Annotated[list[int], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
+    devices: Annotated[list[NonNegativeInt], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
     """GPUs of this host, one per process. Default: the first ones."""
     command: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
     """Arguments of the command."""
@@ -174,7 +174,8 @@ def join() -> None:
         return
     member = os.environ[MEMBER]
     match = _MEMBER.fullmatch(member)
-    if match is None and member not in (AUTO, ALONE):
+    possible = match is not None and int(match[1]) < int(match[2]) and 1 <= int(match[3]) <= 65535
+    if not possible and member not in (AUTO, ALONE):
         fail(MEMBER, member, "left out: `mqe launch` sets it")
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if member == ALONE:
