@@ -21,7 +21,7 @@ from mqe_jax.league.sides import BothSides
 from mqe_jax.limits import Seeds
 from mqe_jax.literal import echo
 from mqe_jax.opponents import Mirror, versus
-from mqe_jax.policies import all_agents, load_as, load_policy
+from mqe_jax.policies import actions_of, all_agents, load_as, load_policy
 from mqe_jax.settings import Parameters, PathText, check, checked, differences, fail, joined, load_yaml, override
 from mqe_jax.train import learner
 from mqe_jax.train.config import TrainConfig, load_config
@@ -45,7 +45,7 @@ Player = str | Path | Policy | Act | None
 CONFIG_FOLDER = Path(__file__).parent / "configs"
 
 
-@checked(env=Mapping | None)
+@checked(env=Mapping[str, Any] | None, impl=str)
 def prepare(
     task: Task,
     config: Config = None,
@@ -66,6 +66,8 @@ def prepare(
         for name, value in theirs.items():
             if value:
                 fail(name, value, "left out for a batch of environments, which has its own")
+        if isinstance(inner := getattr(task, "env", None), QuadrupedEnv):
+            settings = for_task(settings, inner)
         settings = override(settings, {"num_envs": task.num_envs, "evaluation.every": None})
     else:
         fail("task", task, "a task's id, an environment such as that of mqe_jax.make, or a batch of environments")
@@ -188,16 +190,13 @@ def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None
 
 def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv) -> None:
     """Raises an InputError where a policy that is trained in a task could not act in it as it is evaluated."""
-    for name, own, other in (
-        ("control", training.control, env.control),
-        ("robot", training.robot.name, env.robot.name),
-        ("skill", training.params.skill, env.params.skill),
-        ("commands", training.params.commands, env.params.commands),
-        ("command_ranges", training.params.command_ranges, env.params.command_ranges),
-        ("size of the observation", training.observation_size, env.observation_size),
-    ):
-        if own != other:
-            fail(f"train_env.{name}", own, f"that of env, {other!r}, in which the policy is evaluated")
+    own, other = (
+        {**actions_of(each.control, each.params), "size of the observation": each.observation_size}
+        for each in (training, env)
+    )
+    for name, value in own.items():
+        if value != other[name]:
+            fail(f"train_env.{name}", value, f"that of env, {other[name]!r}, in which the policy is evaluated")
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
@@ -238,7 +237,7 @@ class Players(NamedTuple):
     """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
 
 
-@checked(env=Mapping | None)
+@checked(env=Mapping[str, Any] | None, impl=str, deterministic=bool)
 def players(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,

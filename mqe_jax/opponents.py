@@ -20,7 +20,7 @@ from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
-from mqe_jax.train.types import AnyBatch, AnyPolicy, Memory, PyTree, RandomKey, where_rows
+from mqe_jax.train.types import AnyBatch, AnyPolicy, Memory, PyTree, RandomKey, check_act, where_rows
 
 OUTCOMES = ("win", "draw", "loss")
 """Outcomes of an episode for team 0, in the order of `Opponent.outcomes`."""
@@ -124,13 +124,13 @@ class Versus(OneTeam):
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
         self.check_step(state, action, TeamState)
+        self._check_opponents(state)
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
         others, opponents = [], []
         for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
             obs = state.match.obs[self._block(i), self.num_agents :]
-            other, memory = _act(policy, opponent, obs, keys[i])
-            if jnp.shape(other) != (shape := (self._size, self.num_agents, self.action_size)):
-                fail("opponents", f"one that returns actions {jnp.shape(other)}", f"one that returns {shape}")
+            shape = (self._size, self.num_agents, self.action_size)
+            other, memory = check_act("opponents", _act(policy, opponent, obs, keys[i]), shape, opponent.memory)
             others.append(jnp.asarray(other, jnp.float32))
             opponents.append(dataclasses.replace(opponent, memory=memory))
         theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
@@ -159,8 +159,10 @@ class Versus(OneTeam):
         Raises:
             InputError: for a block whose opponent is not a trained policy, or a policy of another architecture.
         """
-        if not block < len(self.opponents) == len(state.opponents):
-            fail("block", block, f"one of the {len(self.opponents)} blocks of this batch and the state")
+        self._check_opponents(state)
+        if not block < len(self.opponents):
+            fail("block", block, f"below {len(self.opponents)}, the number of blocks")
+        check_policy(policy, self.inner)
         first, opponent = self.opponents[block], state.opponents[block]
         if not isinstance(first, TrainedPolicy):
             raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
@@ -169,6 +171,12 @@ class Versus(OneTeam):
             raise InputError(f"policy: of another architecture than block {block}: {other}")
         changed = exchange(opponent, _arrays(policy), at_once=at_once)
         return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
+
+    def _check_opponents(self, state: TeamState) -> None:
+        """Raises an InputError for a state against opponents of other kinds."""
+        ours = [(_arrays(policy), policy.initial_memory(1)) for policy in self.opponents]
+        if jax.tree.structure(ours) != jax.tree.structure([(each.arrays, each.memory) for each in state.opponents]):
+            fail("state", "one against other opponents", f"one that `reset` of this {type(self).__name__} returns")
 
     @property
     def _size(self) -> int:

@@ -18,10 +18,10 @@ from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.planners import scripted_policy
 from mqe_jax.precision import single
-from mqe_jax.settings import PathText, check, checked
+from mqe_jax.settings import PathText, check, checked, override
 from mqe_jax.train import devices
-from mqe_jax.train.policy import Policy, TrainedPolicy, read_policy
-from mqe_jax.train.types import AnyEnvironment, AnyPolicy, Memory, PolicyOrAct
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, read_policy
+from mqe_jax.train.types import AnyEnvironment, AnyPolicy, Memory, PolicyOrAct, RandomKey
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -50,7 +50,7 @@ class SimplePolicy:
     @single
     def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
-        return self.plan(obs, key), memory
+        return self.plan(check_obs(obs, self.agents), check("key", key, RandomKey)), memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,22 +129,20 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
 def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
     """Returns the policy of a setting or argument, which errors name: a policy, its `act`, or what `load_policy` takes.
 
-    A function has no recurrent state, and acts for one team. A policy that acts beside another one must have the same
-    skill and command ranges.
+    A function has no recurrent state, and acts for one team.
     """
     try:
         if isinstance(source, str | Path):
             policy: Any = load_policy(source, env, deterministic=deterministic)
         else:
             policy = check("policy", source, PolicyOrAct)
-            if isinstance(policy, TrainedPolicy):
+            if hasattr(policy, "task"):
                 check_policy(policy, env, repr(policy))
+            if isinstance(policy, TrainedPolicy):
                 policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
     except InputError as error:
         optional = ", or none" if "." in field else ""
         raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
-    if field != "policy" and isinstance(policy, TrainedPolicy) and (other := _other_commands(policy, env)):
-        raise InputError(f"{field}: {source} was trained with {other}; its actions mean other commands there")
     act: Any = policy
     if not hasattr(act, "act"):
         return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: act(obs, (), key)[0])
@@ -152,12 +150,12 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
 
 
 def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
-    """Checks that a policy is of one team of this task; a trained one, that its robot and its sizes are the task's.
+    """Checks that a policy is of one team of this task; a trained one, that its sizes and `actions_of` are the task's.
 
-    `env` is the task, or a batch of it.
+    `env` is the task, or a batch of it. Settings without a task do not tell what the actions of a policy mean.
 
     Raises:
-        InputError: naming both tasks, numbers of agents, robots, or sizes.
+        InputError: naming both tasks, numbers of agents, parameters, or sizes.
     """
     check("policy", policy, AnyPolicy)
     if policy.task != env.name:
@@ -168,10 +166,15 @@ def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
         )
     if not isinstance(policy, TrainedPolicy):
         return
-    robot = policy.config.training_env.get("robot", TaskParams.robot)
-    ours = getattr(getattr(getattr(env, "env", env), "params", None), "robot", robot)
-    if ours != robot:
-        raise InputError(f"policy: {name} was trained with the robot {robot!r}; {env.name} has {ours!r} here")
+    task = getattr(env, "env", env)
+    if policy.config.task is not None and isinstance(task, QuadrupedEnv):
+        given, ours = policy.config.training_env, actions_of(task.control, task.params)
+        read = {field.name: given[field.name] for field in dataclasses.fields(TaskParams) if field.name in given}
+        theirs = actions_of(given.get("control", "command"), override(task.Params(), read))
+        for field, value in theirs.items():
+            if value != ours[field]:
+                here = f"{env.name} has {ours[field]!r} here"
+                raise InputError(f"policy: {name} was trained with {field} {value!r}; {here}")
     sizes = (len(env.teams[0]), env.observation_size, env.action_size)
     trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
     if sizes != trained:
@@ -180,14 +183,10 @@ def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
         )
 
 
-def _other_commands(policy: TrainedPolicy, env: QuadrupedEnv) -> str:
-    """Returns how skill or command ranges of a policy's training differ from those of a task; empty if they do not."""
-    given, ours = policy.config.training_env, env.params
-    ranges = {name: tuple(map(float, pair)) for name, pair in given.get("command_ranges", {}).items()}
-    for field, theirs in (("skill", given.get("skill", TaskParams.skill)), ("command_ranges", ranges)):
-        if env.control == "command" and theirs != getattr(ours, field):
-            return f"{field} {theirs}, not {getattr(ours, field)}"
-    return ""
+def actions_of(control: str, params: TaskParams) -> dict[str, Any]:
+    """Returns what an agent's actions mean in a control mode: the mode, the robot, and the task parameters it reads."""
+    read = {"command": ("skill", "commands", "command_ranges"), "position": ("position_scale",)}.get(control, ())
+    return {"control": control, **{name: getattr(params, name) for name in ("robot", *read)}}
 
 
 def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import agile, make
+from mqe_jax import VectorEnv, agile, cli, learn, make
 from mqe_jax.control import Controller
 from mqe_jax.errors import InputError
 from mqe_jax.export.task import TaskFunctions
 from mqe_jax.policies import load_as, load_policy
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.skills import make as make_skill
+from mqe_jax.train.policy import save_policy
 from mqe_jax.walk_policy import WalkPolicy
 
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -137,10 +139,44 @@ def test_ranges_beyond_training_warn() -> None:
         make("go1gate", impl="c", num_envs=1, command_ranges={"vx": (-1.5, 2), "vy": (-0.6, 0.6)})
 
 
-@pytest.mark.parametrize("parameters", [{"command_ranges": {"vx": (-1.0, 1.2)}}, {"skill": "agile"}])
-def test_opponents_of_other_skills_or_ranges_are_refused(parameters: Any, weights: str) -> None:
+@pytest.mark.parametrize("field", ["policy", "opponent"])
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"command_ranges": {"vx": (-1.0, 1.2)}}, "command_ranges"),
+        ({"commands": ("yaw_rate", "vy", "vx")}, "commands"),
+        ({"robot": "go2"}, "robot 'go1'"),
+        ({"control": "position"}, "control 'command'"),
+        ({"skill": "agile"}, "skill 'walk'"),
+    ],
+)
+def test_policies_whose_actions_mean_something_else_are_refused(
+    field: str, parameters: Any, said: str, weights: str
+) -> None:
     if "skill" in parameters:
         parameters = {**parameters, "skill_weights": weights}
     env = make("go1football-1vs1", impl="c", num_envs=1, **parameters)
-    with pytest.raises(InputError, match=r"opponent: go1football-1vs1 was trained with (skill|command_ranges)"):
-        load_as("opponent", "go1football-1vs1", env)
+    policy = load_policy("go1football-1vs1")
+    for source in (policy, "go1football-1vs1"):
+        with pytest.raises(InputError, match=rf"{field}: .* was trained with {said}"):
+            load_as(field, source, env)
+
+
+@pytest.mark.parametrize("words", [["eval"], ["tournament", "go1tug"]])
+@pytest.mark.parametrize("changes", ["skill=agile", "command_ranges.vx=[-1.0, 1.2]", "robot=go2"])
+def test_commands_refuse_them_by_name(
+    words: list[str], changes: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = str(save_policy(tmp_path, load_policy("go1tug")))
+    assert cli.main([*words, file, "--impl", "c", "--set", changes]) == 2
+    assert f"{file} was trained with {changes.split('=')[0].split('.')[0]}" in capfd.readouterr().err
+
+
+def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
+    batch = VectorEnv(make("go1plane", impl="c", num_envs=2, control="position", position_scale=2.0), 2)
+    small = {"total_steps": 16, "rollout_steps": 8, "ppo.minibatches": 1}
+    policy = learn(batch, small).policy
+    assert policy.config.env == {"control": "position", "position_scale": 2.0}
+    load_as("policy", policy, batch.env)
+    with pytest.raises(InputError, match=r"policy: .* was trained with position_scale 2.0; go1plane has 1.0 here"):
+        load_as("policy", policy, make("go1plane", impl="c", num_envs=1, control="position"))

@@ -52,7 +52,8 @@ def matches(task: str = "go1revolvingdoor", num_envs: int = 4, **params: Any) ->
 
 def new_policy(env: Any, seed: int = 0, **settings: Any) -> TrainedPolicy:
     """An untrained policy of a team."""
-    config = build(TrainConfig, {**SETTINGS, "task": env.name, "num_envs": env.num_envs, **settings})
+    own = {"task": env.name, "env": {"control": env.env.control}, "num_envs": env.num_envs}
+    config = build(TrainConfig, {**SETTINGS, **own, **settings})
     dims = env_dims(env, config)
     network = config.network.build(dims)
     params = network.policy_params(random_params(network, seed))

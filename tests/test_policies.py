@@ -115,7 +115,7 @@ def test_an_outdated_policy_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) 
 def test_a_policy_of_another_robot_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     file = save_policy(tmp_path, load_policy("go1gate"))
     assert cli.main(["eval", str(file), "--robot", "go2", "--impl", "c"]) == 2
-    assert "was trained with the robot 'go1'; go1gate has 'go2' here" in capfd.readouterr().err
+    assert "was trained with robot 'go1'; go1gate has 'go2' here" in capfd.readouterr().err
 
 
 def test_a_policy_is_shipped_with_its_card(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.errors import InputError
-from mqe_jax.policies import SimplePolicy, check_policy, load_as
+from mqe_jax.policies import SimplePolicy, load_as
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked
 from mqe_jax.train.policy import Policy, TrainedPolicy
@@ -56,12 +56,8 @@ class TeamEnv:
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
         self.match = match
-        self.opponent = load_as("opponent", opponent, match) if isinstance(opponent, str | Path) else opponent
+        self.opponent = load_as("opponent", opponent, match)
         self.num_agents = len(match.teams[0])
-        try:
-            check_policy(self.opponent, match, "the opponent")
-        except InputError as error:
-            raise InputError(str(error).replace("policy:", "opponent:", 1)) from None
         self._source = str(opponent) if isinstance(opponent, str | Path) else None
 
     def __repr__(self) -> str:

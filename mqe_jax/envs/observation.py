@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs.returned import named, shaped
+from mqe_jax.settings import fail
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -80,7 +81,12 @@ class ObservationLayout:
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
     def split(self, observation: jax.Array) -> dict[str, jax.Array]:
-        """Returns the blocks (..., width) of observations (..., size) by name: the inverse of `pack`."""
+        """Returns the blocks (..., width) of observations (..., size) by name: the inverse of `pack`.
+
+        InputError for observations of another size.
+        """
+        if jnp.shape(observation)[-1:] != (self.size,):
+            fail("obs", f"of shape {jnp.shape(observation)}", f"of {self.size} numbers for each agent")
         return {name: observation[..., self.slice(name)] for name in self.names}
 
     def __str__(self) -> str:

@@ -21,6 +21,7 @@ from mqe_jax.files import replacing, write_atomically
 from mqe_jax.limits import NonNegativeInt
 from mqe_jax.literal import to_label
 from mqe_jax.opponents import OUTCOMES, Versus
+from mqe_jax.policies import check_policy
 from mqe_jax.precision import single
 from mqe_jax.settings import PathText, checked, fail
 from mqe_jax.train.policy import Policy
@@ -61,6 +62,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
 
     Every Kth environment has the same one of the K opponents as team 1 (`Versus`).
     """
+    check_policy(policy, matches)
     env = Versus(matches, opponents)
 
     def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
@@ -132,8 +134,10 @@ def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings
     """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
     if not isinstance(ratings, Ratings):
         fail("ratings", ratings, "those of rate")
-    if not len(names) == len(results) == len(ratings.value):
-        fail("names", names, f"one for each of the {len(results)} policies, as the ratings")
+    if [np.shape(values) for values in ratings] != [(len(results),)] * 3:
+        fail("ratings", ratings, f"those of the {len(results)} policies")
+    if len(names) != len(results):
+        fail("names", names, f"one for each of the {len(results)} policies")
     folder, text = Path(folder), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("team0", "team1", *OUTCOMES, "rating_of_team0", "low", "high"))

@@ -20,7 +20,7 @@ from mqe_jax.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.literal import line, to_html
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
-from mqe_jax.train.types import AnyBatch, Memory, PolicyOrAct, RandomKey, VectorEnv, teams_of, where_rows
+from mqe_jax.train.types import AnyBatch, Memory, PolicyOrAct, RandomKey, VectorEnv, check_act, teams_of, where_rows
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
@@ -150,7 +150,7 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     if not hasattr(either, "act"):
         if any(np.shape(leaf)[:1] != (num_envs,) for leaf in jax.tree.leaves(memory)):
             fail("memory", memory, f"arrays with a leading axis of {num_envs}, the environments")
-        return functools.partial(_given, either), memory
+        return functools.partial(_acted, either, (num_envs, env.num_agents, env.action_size)), memory
     if (trained := getattr(either, "task", "")) and trained != env.name:
         fail("policy", f"one of {trained}", f"one of {env.name}; its `act` may be given alone")
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
@@ -158,14 +158,14 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
         fail("policy", f"one of {agents} agents", allowed)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
-    return either.act, either.initial_memory(num_envs)
+    act = functools.partial(_acted, either.act, (num_envs, env.num_agents, env.action_size))
+    return act, either.initial_memory(num_envs)
 
 
-def _given(function: Act, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-    returned = function(obs, memory, key)
-    if not isinstance(returned, tuple | list) or len(returned) != 2:
-        fail("policy", f"a function that returns {type(returned).__name__}", "one that returns (action, memory)")
-    return returned
+def _acted(
+    act: Act, shape: tuple[int, ...], obs: jax.Array, memory: Memory, key: jax.Array
+) -> tuple[jax.Array, Memory]:
+    return check_act("policy", act(obs, memory, key), shape, memory)
 
 
 @checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)

@@ -76,6 +76,16 @@ class TrainedPolicy:
     deterministic: bool = False
     """Whether it acts with its mean actions; otherwise they are sampled."""
 
+    def __post_init__(self) -> None:
+        for name, kind in {"dims": EnvDims, "config": TrainConfig, "metadata": Mapping}.items():
+            if not isinstance(value := getattr(self, name), kind):
+                fail(name, value, f"of the type {kind.__name__}")
+        check("deterministic", self.deterministic, bool)
+        given = {"params": self.params, "normalizer": self.normalizer}
+        for name, expected in _template(self.dims, self.config.network).items():
+            if _shapes(given[name]) != _shapes(expected):
+                fail(name, given[name], f"arrays that fit the network and {self.dims}")
+
     def __repr__(self) -> str:
         mode = "mean" if self.deterministic else "sampled"
         return f"<TrainedPolicy of {self.task or 'no named task'}: {self.config.network.name}, {mode} actions>"
@@ -123,19 +133,29 @@ class TrainedPolicy:
         self, arrays: PolicyArrays, obs: Any, memory: Memory, key: jax.Array | None = None
     ) -> tuple[jax.Array, Memory]:
         """Returns what a policy of the same architecture with other arrays does; see `act`."""
-        try:
-            obs = jnp.asarray(obs, jnp.float32)
-        except (TypeError, ValueError):
-            fail("obs", obs, "an array of numbers")
-        agents, size = self.dims.agents, self.dims.observation
-        if obs.ndim < 2 or obs.shape[-2:] != (agents, size):
-            raise InputError(f"obs: shape {obs.shape} is not allowed; it must end in ({agents} agents, {size} numbers)")
+        obs = check_obs(obs, self.dims.agents, self.dims.observation)
         check("key", key, RandomKey | None)
         expected = jax.tree.structure(self.initial_memory())
         if jax.tree.structure(memory) != expected:
             fail("memory", memory, f"the recurrent state of this policy, {expected}")
         act = policy_act(self.dims, self.config.network, self.config.normalization.observations)
         return act(arrays, obs, memory, None if self.deterministic else key)
+
+
+@functools.lru_cache(maxsize=32)
+def _template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
+    """Returns the shapes of the parameters and the statistics of a network's policy."""
+    network = settings.build(dims)
+
+    def arrays() -> dict[str, Any]:
+        params = network.policy_params(network.init(jax.random.PRNGKey(0)))
+        return {"params": params, "normalizer": running_init(dims.observation)}
+
+    return jax.eval_shape(arrays)
+
+
+def _shapes(tree: Any) -> Any:
+    return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
 
 
 @functools.lru_cache(maxsize=32)
@@ -151,6 +171,19 @@ def policy_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any
         return jnp.clip(arrays.action_scale * action, -1.0, 1.0), memory
 
     return act
+
+
+def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
+    """Returns observations (..., agents, size) as an array; InputError for anything else."""
+    try:
+        obs = jnp.asarray(obs, jnp.float32)
+    except (TypeError, ValueError, OverflowError):
+        fail("obs", obs, "an array of numbers")
+    if obs.ndim < 2 or obs.shape[-2] != agents or size not in (None, obs.shape[-1]):
+        raise InputError(
+            f"obs: shape {obs.shape} is not allowed; it must end in ({agents} agents, {size or 'their'} numbers)"
+        )
+    return obs
 
 
 def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
@@ -208,11 +241,5 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
-    network = config.network.build(dims)
-
-    def template() -> dict[str, Any]:
-        params = network.policy_params(network.init(jax.random.PRNGKey(0)))
-        return {"params": params, "normalizer": running_init(dims.observation)}
-
-    tree = load_tree(path, jax.eval_shape(template), kind="policy", half=True).tree
+    tree = load_tree(path, _template(dims, config.network), kind="policy", half=True).tree
     return TrainedPolicy(tree["params"], tree["normalizer"], dims, config, metadata, deterministic)

@@ -8,9 +8,12 @@ from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pydantic
+from jax.core import Tracer
 
 from mqe_jax.errors import InputError
+from mqe_jax.settings import fail
 
 PyTree = Any
 Params = dict[str, Any]
@@ -20,9 +23,9 @@ Memory = Any
 
 
 def _key(value: Any) -> Any:
-    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", float)
     raw = _raw_key(generator())
-    if (shape, dtype) != (raw.shape, raw.dtype) and not (shape == () and jnp.issubdtype(dtype, jax.dtypes.prng_key)):
+    given = (value.shape, value.dtype) if isinstance(value, jax.Array | np.ndarray) else ()
+    if given != (raw.shape, raw.dtype) and not (given[:1] == ((),) and is_typed_key(value)):
         raise ValueError(
             f"a random key, such as jax.random.PRNGKey(0); a raw one of {generator()} is {raw.shape} uint32"
         )
@@ -41,8 +44,9 @@ def _raw_key(implementation: str) -> Any:
 
 
 def _level(value: Any) -> Any:
-    array = getattr(value, "shape", None) == () and jnp.issubdtype(value.dtype, jnp.number)
-    if not array and not (isinstance(value, int | float) and 0 <= value <= 1):
+    traced, dtype = isinstance(value, Tracer), getattr(value, "dtype", None)
+    number = isinstance(value, int | float) if dtype is None else jnp.issubdtype(dtype, jnp.number)
+    if isinstance(value, bool) or not number or np.shape(value) or not (traced or 0 <= value <= 1):
         raise ValueError("a number in [0, 1]")
     return value
 
@@ -160,6 +164,28 @@ def replace_fields(state: Any, **fields: jax.Array) -> Any:
             return getattr(state, method)(**fields)
     kind = type(state).__name__
     raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
+
+
+def check_act(name: str, returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
+    """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its `memory`.
+
+    Raises:
+        InputError: naming the argument that the policy is, for anything else.
+    """
+
+    def shapes(tree: Any) -> Any:
+        return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
+
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        found, expected = f"returns {type(returned).__name__}", "returns (action, memory)"
+    elif shapes(returned[0]) != shapes(jax.ShapeDtypeStruct(shape, jnp.float32)) or is_typed_key(returned[0]):
+        given = getattr(returned[0], "shape", type(returned[0]).__name__)
+        found, expected = f"returns actions {given}", f"returns {shape}"
+    elif shapes(returned[1]) != shapes(memory):
+        found, expected = "changes the structure of its memory", "keeps it"
+    else:
+        return returned[0], returned[1]
+    fail(name, f"a function that {found}", f"one that {expected}")
 
 
 def raw_keys(tree: PyTree) -> PyTree:
