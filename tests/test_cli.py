@@ -166,9 +166,8 @@ def test_the_best_of_several_episodes_is_rendered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """`--json` prints each of them, and which one it is."""
-    frames = np.zeros((6, 1))
     recorded = [
-        recording.Episode(frames[:n], frames[:n], frames[:n], 0.1, success, reward)
+        recording.Episode(np.zeros((n, 1)), np.zeros((n, 0, 3)), np.zeros((n, 0, 4)), 0.1, success, reward)
         for n, success, reward in ((6, 0.5, 2.0), (4, 1.0, 0.5), (5, 1.0, 1.0))
     ]
     rendered = []

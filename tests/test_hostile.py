@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,7 +25,7 @@ from mqe_jax.cli.arguments import parse
 from mqe_jax.cli.options import parse_overrides
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
-from mqe_jax.envs.replay import load_recording, replay
+from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.errors import InputError
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.league import tournament
@@ -37,12 +38,17 @@ from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train
-from mqe_jax.viz import clips, recording, render
+from mqe_jax.viz import clips, curves, recording, render
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 from tests.test_walk_policy import write_torchscript
 
 KEY, NAN = jax.random.PRNGKey(0), math.nan
+LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
+WALLS = np.full((3, 2, 3), NAN)
+FRAME = np.zeros((16, 16, 3), np.uint8)
+GAMES = np.ones((1, 1, 3), np.int64)
+RATINGS = tournament.Ratings(np.zeros(1), np.zeros(1), np.zeros(1))
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +60,7 @@ def made() -> dict[str, Any]:
     state, matches = jax.eval_shape(task.reset, KEY), VectorEnv(match, 2)
     team = versus(matches, "idle")
     return {
+        "sumo": make("go1wrestling", control="position"), "walks": make("go1tug", num_envs=2),
         "task": task, "state": state, "match": match, "fake": fake, "batch": fake_env.FakeVectorEnv(fake, 2),
         "config": config, "matches": matches, "team": team, "states": jax.eval_shape(matches.reset, KEY),
         "other": jax.eval_shape(match.reset, KEY), "teams": jax.eval_shape(team.reset, KEY),
@@ -114,12 +121,40 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("policy: ", lambda x, v: x["team"].change(x["teams"], 0, v), (None, 3, TrainedPolicy)),
     ("state: ", lambda x, v: x["task"].step(x.get(v, v), np.zeros((2, 12), np.float32)), (None, 3, "states", "other")),
     ("state: ", lambda x, v: x["matches"].step(x.get(v, v), np.zeros((2, 2, 12))), (None, 3, "state", "other")),
-    ("assistance: ", lambda x, v: x["task"].reset(KEY, v), (None, "x", [], 2, -0.5, NAN, np.zeros(2))),
+    ("assistance: ", lambda x, v: x["task"].reset(KEY, v), LEVELS),
     ("policy: ", lambda x, v: load_policy("go1tug", make("go1tug", impl="c", num_envs=1, robot=v)), ("go2",)),
     ("deterministic: ", lambda x, v: load_policy("idle", x["match"], deterministic=v), (None, 3, "x")),
+    ("parts: ", lambda x, v: x["matches"].share(v), (0, -1, True, NAN, np.zeros(3))),
+    ("num_envs: ", lambda x, v: x["task"].with_num_envs(v), (0, None, True, "x")),
+    ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
+    ("obs: ", lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY), (None, "x", np.zeros((2, 1, 9)), 3)),
+    ("key: ", lambda x, v: load_policy("random", x["match"]).act(jnp.zeros((2, 1, 10)), (), v), (None, 3, "x")),
+    ("dims: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), dims=v), (None, (1, 2, 3))),
+    ("config: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), config=v), (None, {})),
+    ("metadata: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), metadata=v), (None, "x")),
+    ("deterministic: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), deterministic=v), (None, 1)),
+    ("params: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), params=v), (None, {}, np.zeros(3))),
+    ("normalizer: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), normalizer=v), (None, 3)),
+    ("task: ", lambda x, v: mqe_jax.evaluate(v, "idle"), (None, 3, "x" * 300, [])),
+    ("env", lambda x, v: mqe_jax.evaluate("go1tug", "idle", env=v), (3, "x", [], {1: 2})),
+    ("impl: ", lambda x, v: mqe_jax.evaluate("go1tug", "idle", impl=v), (None, 3, np.zeros(3))),
+    ("deterministic: ", lambda x, v: mqe_jax.render("go1tug", "idle", deterministic=v), (None, 3, np.zeros(3))),
+    ("policy: ", lambda x, v: mqe_jax.evaluate(x["match"], load_policy("idle", x[v])), ("task", "fake")),
+    ("opponent: ", lambda x, v: mqe_jax.evaluate(x["match"], "idle", load_policy("idle", x[v])), ("task", "sumo")),
+    ("env", lambda x, v: mqe_jax.learn("go1plane", "demo", env=v), (3, "x", [], {1: 2})),
+    ("resume: ", lambda x, v: mqe_jax.learn("go1plane", "demo", resume=v), (None, 0, "x")),
+    ("start: ", lambda x, v: mqe_jax.learn("go1plane", {"start": v}), ("x" * 300, "")),
+    ("seeds", lambda x, v: mqe_jax.learn_seeds("go1plane", "demo", seeds=v), (None, 3, [], [-1], range(65), "ab")),
+    ("seeds: ", lambda x, v: mqe_jax.make_learner("go1plane", "demo", seeds=v), (None, 0, True, 10**12)),
+    ("actions: ", lambda x, v: Recording("a", {}, "c", "command", {"x": np.zeros(2)}, v), (None, np.zeros(2))),
+    ("states", lambda x, v: Recording("a", {}, "c", "command", v, np.zeros((2, 1, 1))), (None, {1: np.zeros(2)})),
+    ("params: ", lambda x, v: Recording("a", v, "c", "command", {}, np.zeros((2, 1, 1))), (None, {"control": "c"})),
+    ("states: ", lambda x, v: save_recording("a.npz", x["task"], x.get(v, v), jnp.zeros((2, 2, 12))), (None, "states")),
     ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
     ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
     ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
+    ("ratings: ", lambda x, v: tournament.save(Path("a"), ["b"], GAMES, v), (None, RATINGS._replace(low=3))),
+    ("names", lambda x, v: tournament.save(Path("a"), v, GAMES, RATINGS), (None, [3], ["a\n"], [b"a"], "ab")),
     ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones((2, 2)), np.full((2, 2, 3), NAN))),
     ("match: ", lambda x, v: TeamEnv(x.get(v, v), "idle"), (None, 3, "matches")),
     ("state: ", lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))), (None, "state")),
@@ -138,21 +173,33 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
     ("key: ", lambda x, v: _record(x, key=7), (None,)),
     ("policy: ", lambda x, v: _record(x, act=3), (None,)),
+    ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (v, memory)), (None, np.zeros((1, 2, 4)))),
+    ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (np.zeros((1, 2, 3)), v)), (3, None, [])),
     ("episodes: ", lambda x, v: recording.best([]), (None,)),
+    ("Episode: ", lambda x, v: dataclasses.replace(x["episode"], qpos=v), (None, 3, np.zeros(3))),
+    ("Episode: ", lambda x, v: dataclasses.replace(x["episode"], mocap_quat=v), (None, np.zeros((3, 2, 3)))),
+    ("dt: ", lambda x, v: dataclasses.replace(x["episode"], dt=v), (None, 0, NAN, "x")),
+    ("success: ", lambda x, v: dataclasses.replace(x["episode"], success=v), (None, "x")),
+    ("episode: ", lambda x, v: _render(x, episode=dataclasses.replace(x["episode"], **{v: WALLS})), ("mocap_pos",)),
+    ("episode: ", lambda x, v: render.render_frames(x["match"], x["episode"]), (None,)),
+    ("views: ", lambda x, v: render.render_frames(x["fake"], x["episode"], v, backend="egl"), ([], 3, [1, 2, 3])),
+    ("tables", lambda x, v: curves.plot_curves(v, "a"), (None, [], [3])),
+    ("title: ", lambda x, v: curves.plot_curves([{}], v), (None, 3)),
     ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
     ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),
     ("speed: ", lambda x, v: _render(x, speed=v), (0, -1, NAN)),
     ("at: ", lambda x, v: _render(x, path=Path("a.png"), at=v), (NAN, -1)),
     ("path: ", lambda x, v: _render(x, path=v), (None, 3, "")),
     ("backend: ", lambda x, v: _render(x, backend="x"), (None,)),
-    ("view: ", lambda x, v: _render(x, view="x", backend=None), (None,)),
+    ("view: ", lambda x, v: _render(x, view=v, backend=None), ("x", "")),
     ("episode: ", lambda x, v: _render(x, episode=x["episode"].cut(slice(0, 0))), (None,)),
     ("episode: ", lambda x, v: render.render_episode(x["match"], x["episode"], x["gif"]), (None,)),
     ("output: ", lambda x, v: _render(x, episode=x["long"], size=(4096, 4096), fps=50), (None,)),
     ("size", lambda x, v: list(render.render_frames(x["fake"], x["episode"], size=(-1, 3))), (None,)),
     ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([]), 25), (None,)),
     ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32))]), 25), (None,)),
-    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([v]), 25), ("x",)),
+    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([v]), 25), ("x", KEY, np.zeros((0, 8, 3), np.uint8))),
+    ("frames: ", lambda x, v: clips.write_clip(x["gif"], v, 25), (None, 3, [FRAME, FRAME[:8]])),
     ("fps: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32, 3), np.uint8)]), 0), (None,)),
     ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),

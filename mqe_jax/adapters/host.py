@@ -119,7 +119,7 @@ class HostEnvs:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("error")  # complex numbers
                 action = np.asarray(action, np.float32)
-        except (TypeError, ValueError, np.exceptions.ComplexWarning):
+        except (TypeError, ValueError, OverflowError, np.exceptions.ComplexWarning):
             fail("action", action, "an array of numbers")
         if action.shape != shape:
             raise InputError(f"action: shape {action.shape}; expected {shape} (environments, agents, action size)")

@@ -19,7 +19,7 @@ from mqe_jax.adapters import agent_names, missing, quietly, select, task_env
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, shown
 from mqe_jax.precision import single
 from mqe_jax.settings import checked
 from mqe_jax.train.types import RandomKey
@@ -126,7 +126,7 @@ class Env(MultiAgentEnv):
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step without a reset; the key replaces the state's own random key."""
         if not set(self.agents) <= set(actions):
-            raise InputError(f"actions: for {list(actions)}; expected one for each of {', '.join(self.agents)}")
+            raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
         action = jnp.stack([self._continuous(actions[agent]) for agent in self.agents])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated

@@ -17,8 +17,8 @@ from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
-from mqe_jax.settings import check
+from mqe_jax.errors import InputError, shown
+from mqe_jax.settings import check, checked
 
 try:
     import pettingzoo
@@ -104,6 +104,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         """Returns the space of an agent's action (action_size,), in [-1, 1]."""
         return self._action_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
+    @checked(options=Mapping | None)
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
@@ -121,7 +122,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         if not self.agents:
             return {}, {}, {}, {}, {}
         if set(check("actions", actions, Mapping)) != set(self.agents):
-            raise InputError(f"actions: for {list(actions)}; expected one for each of {', '.join(self.agents)}")
+            raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
         out = self._host.step([[actions[agent] for agent in self.agents]])
         terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.metrics.items()}

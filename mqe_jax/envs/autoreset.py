@@ -81,8 +81,9 @@ class Batch:
                 f"`reset` of this {type(self).__name__} returns"
             )
         shape = (self.num_envs, self.num_agents, self.action_size)
-        if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents, action size)")
+        if getattr(action, "shape", None) != shape:
+            given = getattr(action, "shape", type(action).__name__)
+            raise InputError(f"action: shape {given}; expected {shape} (environments, agents, action size)")
 
 
 class VectorEnv(Batch):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -186,6 +186,7 @@ class QuadrupedEnv(Task[S, P]):
         """Environment steps until the time limit."""
         return round(self.params.episode_length / self.dt)
 
+    @checked(num_envs=Environments)
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
         """Returns an environment whose engine holds `num_envs` environments: itself, or one with larger buffers."""
         if self.physics.holds(num_envs):
@@ -308,7 +309,8 @@ class QuadrupedEnv(Task[S, P]):
         return read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
-        """Returns the generalised coordinates of an object, as its class documents them."""
+        """Returns the generalised coordinates of an object, as its class documents them; InputError for no object."""
+        check("name", name, Literal[tuple(self.objects)])
         return data.qpos[self.objects[name].qpos]
 
     def fallen(self, robot_state: RobotState) -> jax.Array:
@@ -364,7 +366,7 @@ class QuadrupedEnv(Task[S, P]):
     def _checked(self, action: jax.Array) -> jax.Array:
         try:
             action = jnp.asarray(action)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             fail("action", action, "an array of numbers")
         shape = (self.num_agents, self.action_size)
         if action.shape != shape:

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -42,23 +43,43 @@ class Recording:
     actions: np.ndarray
     """Actions (T, A, D)."""
 
+    def __post_init__(self) -> None:
+        for name, kind in {"task": str, "impl": str, "control": str, "params": Parameters}.items():
+            check(name, getattr(self, name), kind)
+        if "control" in self.params:
+            raise InputError("params: the control mode is among them")
+        check("states", self.states, Mapping[str, Any])
+        for name, values in {"actions": self.actions, **self.states}.items():
+            if getattr(getattr(values, "dtype", None), "kind", "") not in (*"fiub",):
+                fail(name, values, "an array of numbers")
+        counts = {values.shape[:1] for values in (self.actions, *self.states.values())}
+        if self.actions.ndim != 3 or len(counts) > 1 or not len(self.actions):
+            fail("actions", f"of shape {self.actions.shape}", "(T, A, D), one for each of the T states")
+
     def make_env(self, impl: str | None = None) -> QuadrupedEnv:
         """Creates the recorded environment, on the recorded engine if `impl` is None."""
         from mqe_jax.envs import make
 
-        return make(self.task, impl=impl or self.impl, control=self.control, num_envs=1, **self.params)
+        impl = self.impl if impl is None else impl
+        return make(self.task, impl=impl, control=self.control, num_envs=1, **self.params)
 
 
 @checked(file=PathText, env=AnySingle)
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
-    shape = (*jnp.shape(states.step), env.num_agents, env.action_size)
+    nq = env.compiled.model.nq
+    try:
+        flat, shape = _flat(states), (*states.step.shape, env.num_agents, env.action_size)
+    except AttributeError:
+        fail("states", states, f"those of {env.name}")
+    if flat["data/qpos"].shape[1:] != (nq,):
+        fail("states", f"with qpos {flat['data/qpos'].shape}", f"those of {env.name}, with qpos (T, {nq})")
     if len(shape) != 3 or np.shape(actions) != shape:
         fail("actions", f"of shape {np.shape(actions)}", f"{shape}, one for each state")
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
     first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
     about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
-    arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
+    arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in flat.items()}
     arrays |= {"about": np.array(json.dumps(about)), "actions": np.asarray(actions)[first:]}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -72,16 +93,10 @@ def load_recording(file: str | pathlib.Path) -> Recording:
     with archive(path, limits.RECORDING_BYTES, "a recording"), np.load(path, allow_pickle=False) as arrays:
         about = parse_json(str(arrays["about"]), "about")
         states = {name.removeprefix("states/"): arrays[name] for name in arrays if name.startswith("states/")}
-        made = Recording(**about, states=states, actions=arrays["actions"])
-        if [type(about[name]) for name in ("task", "params", "impl", "control")] != [str, dict, str, str]:
-            raise ValueError("its task, parameters, engine or control are of another type")
-        if "control" in check("params", made.params, Parameters):
-            raise ValueError("its control mode is among the parameters")
-        if any(values.dtype.kind not in "fiub" for values in (made.actions, *states.values())):
-            raise ValueError("its arrays are not numbers")
-        if made.actions.ndim != 3 or not all(len(made.actions) == len(values) > 0 for values in states.values()):
-            raise ValueError("its arrays are not those of a sequence of states and actions")
-        return made
+        try:
+            return Recording(**about, states=states, actions=arrays["actions"])
+        except InputError as error:
+            raise ValueError(error) from None
 
 
 @checked(recording=Recording, env=AnySingle | None)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import numpy as np
+from annotated_types import MaxLen, MinLen
 
-from mqe_jax import interrupts
+from mqe_jax import interrupts, limits
 from mqe_jax.build import Config, Task, prepare
 from mqe_jax.files import check_folder
 from mqe_jax.limits import Seed, Seeds
@@ -172,12 +173,13 @@ def learn_seeds(
         seeds: random seeds.
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
-    check("seeds", len(seeds), Seeds)
-    configs, cast = prepare(task, config, env, impl=impl, seeds=seeds)
-    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in seeds]
+    numbers = check("seeds", seeds, Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(Seeds)[1]))])
+    configs, cast = prepare(task, config, env, impl=impl, seeds=numbers)
+    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
     return _train(configs, cast, folders, resume, dump_diverged)
 
 
+@checked(resume=bool, dump_diverged=PathText | None)
 def _train(
     configs: Sequence[TrainConfig],
     cast: Cast,

@@ -24,7 +24,7 @@ from mqe_jax.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.settings import Parameters, fail, joined, load_yaml, override, record
+from mqe_jax.settings import FileName, Parameters, fail, joined, load_yaml, override, record
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
@@ -210,7 +210,7 @@ class TrainConfig:
     """Whether the time limit ends the episode for the learner too: no value follows, and the privileged observation
     includes the time left. During training only."""
     league: LeagueSettings = LeagueSettings()
-    start: str | None = None
+    start: FileName | None = None
     """Run folder, policy file or, for its shipped policy, task whose policy the run starts from: its parameters and
     observation statistics; none starts from nothing."""
     seed: Seed = 0

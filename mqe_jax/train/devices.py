@@ -22,6 +22,8 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from mqe_jax.errors import InputError
+from mqe_jax.limits import PositiveInt
+from mqe_jax.settings import check
 from mqe_jax.train.types import PyTree
 
 AXIS = "processes"
@@ -120,7 +122,7 @@ def connected() -> Iterator[None]:
 
 def share(name: str, count: int, parts: int) -> int:
     """Returns a process's share of `count` environments; raises an InputError, naming the setting, for a fraction."""
-    if count % parts:
+    if count % check("parts", parts, PositiveInt):
         raise InputError(f"{name}: {count} is not allowed; it must be a multiple of the number of processes, {parts}")
     return count // parts
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,7 +45,7 @@ def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at
     return path
 
 
-@checked(path=PathText, fps=Annotated[float, Gt(0)])
+@checked(path=PathText, frames=Iterable, fps=Annotated[float, Gt(0)])
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
     path = check_output(Path(path))
@@ -58,14 +58,16 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
 
 
 def _checked_frames(frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields at least one frame, each (H, W, 3) uint8."""
-    index = -1
+    """Yields at least one frame, each (H, W, 3) uint8, as the first."""
+    first = None
     for index, frame in enumerate(frames):
-        frame = np.asarray(frame)
-        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-            raise InputError(f"frames: frame {index} is {frame.dtype} {frame.shape}; it must be uint8 (H, W, 3)")
-        yield frame
-    if index < 0:
+        shape, dtype = getattr(frame, "shape", ()), getattr(frame, "dtype", type(frame).__name__)
+        first = first or shape
+        if dtype != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape or shape != first:
+            expected = "(H, W, 3)" if shape == first else str(first)
+            raise InputError(f"frames: frame {index} is {dtype} {shape}; it must be uint8 {expected}")
+        yield np.asarray(frame)
+    if first is None:
         raise InputError("frames: there are none")
 
 

@@ -10,7 +10,7 @@ from annotated_types import MinLen
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
-from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength
+from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength, Positive
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.evaluate import Act, acting
@@ -38,9 +38,15 @@ class Episode:
     """Time from which `success` has its last value, s."""
 
     def __post_init__(self) -> None:
-        counts = [len(self.qpos), len(self.mocap_pos), len(self.mocap_quat)]
-        if len({*counts}) > 1:
-            raise InputError(f"Episode: qpos, mocap_pos and mocap_quat of {counts} frames; expected equally many")
+        shapes = [getattr(x, "shape", ()) for x in (self.qpos, self.mocap_pos, self.mocap_quat)]
+        bodies = (*shapes[0][:1], *shapes[1][1:2])
+        if len(shapes[0]) != 2 or shapes[1:] != [(*bodies, 3), (*bodies, 4)]:
+            allowed = "(T, nq), (T, M, 3) and (T, M, 4)"
+            raise InputError(f"Episode: qpos, mocap_pos and mocap_quat have the shapes {shapes}; expected {allowed}")
+        check("dt", self.dt, Positive)
+        for name in ("success", "reward", "settled"):
+            if not isinstance(value := getattr(self, name), int | float | np.number):
+                fail(name, value, "a number")
 
     def __len__(self) -> int:
         return len(self.qpos)

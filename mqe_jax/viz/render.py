@@ -19,7 +19,7 @@ from mqe_jax.appearance.grounds import GROUND_MATERIAL
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.errors import InputError
 from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
-from mqe_jax.settings import PathText, checked
+from mqe_jax.settings import PathText, checked, fail
 from mqe_jax.train.types import AnySingle
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
@@ -156,11 +156,25 @@ def render_frames(
 
     `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
+    _check_fits(env, episode)
     model = rendering_model(env.mj_model, episode)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
         return draw_top(model, episode, size)
-    return _draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
+    views = cameras(model, episode, "scene", size[0] / size[1]) if views is None else views
+    if not isinstance(views, Sequence) or len(views) != len(episode) or not all(isinstance(x, Camera) for x in views):
+        fail("views", views, f"a Camera for each of the {len(episode)} frames")
+    return _draw_gl(model, episode, views, size, backend)
+
+
+def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
+    """Raises an InputError for an episode without frames, of another task, or with numbers that are not finite."""
+    sizes, found = (env.mj_model.nq, env.mj_model.nmocap), (episode.qpos.shape[1:], episode.mocap_pos.shape[1:2])
+    if not len(episode) or found != (sizes[:1], sizes[1:]):
+        shape = f"{episode.qpos.shape} coordinates, {episode.mocap_pos.shape} of walls"
+        raise InputError(f"episode: {shape}; {env.name} needs (frames, {sizes[0]}) and (frames, {sizes[1]}, 3)")
+    if not all(np.isfinite(x).all() for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)):
+        raise InputError("episode: its coordinates hold NaN or infinite numbers")
 
 
 @checked(
@@ -194,12 +208,7 @@ def render_episode(
     Without GL, the packages required for 3-D rendering are printed to standard error.
     """
     path = check_output(Path(path), fps=fps, speed=speed, at=at)
-    sizes, found = (env.mj_model.nq, env.mj_model.nmocap), (episode.qpos.shape[1:], episode.mocap_pos.shape[1:2])
-    if not len(episode) or found != (sizes[:1], sizes[1:]):
-        shape = f"{episode.qpos.shape} coordinates, {episode.mocap_pos.shape} of walls"
-        raise InputError(f"episode: {shape}; {env.name} needs (frames, {sizes[0]}) and (frames, {sizes[1]}, 3)")
-    if not np.isfinite(episode.qpos).all():
-        raise InputError("episode: its coordinates hold NaN or infinite numbers")
+    _check_fits(env, episode)
     suffix = path.suffix.lower()
     size = size or {".mp4": (960, 540), ".png": (1280, 720)}.get(suffix, (480, 270))
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)
@@ -209,7 +218,7 @@ def render_episode(
         print(text, file=sys.stderr)
     aspect = size[0] / size[1]
     if suffix == ".png":
-        views = cameras(rendering_model(env.mj_model, episode), episode, view or "scene", aspect)
+        views = cameras(rendering_model(env.mj_model, episode), episode, "scene" if view is None else view, aspect)
         shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
         if backend is not None:
             views = views[shown : shown + 1]
@@ -220,6 +229,6 @@ def render_episode(
         if suffix != ".mp4" and 3 * len(episode) * size[0] * size[1] > CLIP_BYTES:
             text = f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
             raise InputError(f"output: {text}; give a smaller width, fewer frames per second, or .mp4")
-        views = cameras(rendering_model(env.mj_model, episode), episode, view or "follow", aspect)
+        views = cameras(rendering_model(env.mj_model, episode), episode, "follow" if view is None else view, aspect)
     write_clip(path, map(legend(env, size), render_frames(env, episode, views, size, backend)), fps)
     return backend or "matplotlib"
