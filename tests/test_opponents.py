@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -21,7 +22,6 @@ from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, Versus, versus
 from mqe_jax.policies import BothTeams, all_agents, load_policy
 from mqe_jax.settings import build
-from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import env_dims, make_learner
@@ -50,14 +50,14 @@ def matches(task: str = "go1revolvingdoor", num_envs: int = 4, **params: Any) ->
     return env
 
 
-def new_policy(env: Any, seed: int = 0, **settings: Any) -> TrainedPolicy:
+def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **settings: Any) -> TrainedPolicy:
     """An untrained policy of a team."""
-    own = {"task": env.name, "env": {"control": env.env.control}, "num_envs": env.num_envs}
+    own = {"task": env.name, "env": {"control": env.env.control, **params}, "num_envs": env.num_envs}
     config = build(TrainConfig, {**SETTINGS, **own, **settings})
     dims = env_dims(env, config)
     network = config.network.build(dims)
-    params = network.policy_params(random_params(network, seed))
-    return TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": env.name})
+    weights = network.policy_params(random_params(network, seed))
+    return TrainedPolicy(weights, running_init(dims.observation), dims, config, {"task": env.name})
 
 
 @pytest.fixture(scope="module")
@@ -177,8 +177,7 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
     env = versus(door, ["idle", policies[0]])
     with pytest.raises(InputError, match="block 0 is fixed"):
         env.change(env.reset(KEY), 0, policies[0])
-    config = dataclasses.replace(policies[0].config, network=ActorCritic(hidden_sizes=(16,)))
-    other = dataclasses.replace(policies[0], config=config)
+    other = new_policy(versus(door, ["idle"]), network={"hidden_sizes": [16]})
     with pytest.raises(InputError, match="another architecture"):
         env.change(env.reset(KEY), 1, other)
 
@@ -277,8 +276,9 @@ def even(task: str, episodes: int, num_envs: int) -> None:
 
     They set joint targets, since random walk commands decide hardly any match.
     """
-    env = matches(task, num_envs, episode_length=5.0, position_scale=3.0)
-    policy = new_policy(versus(env, ["idle"]), 3, network={"recurrent": False, "action_gain": 1.0})
+    scale = {"position_scale": 3.0}
+    env = matches(task, num_envs, episode_length=5.0, **scale)
+    policy = new_policy(versus(env, ["idle"]), 3, scale, network={"recurrent": False, "action_gain": 1.0})
     fight: Versus = versus(env, [policy])
     result = evaluate_batch(fight, policy, episodes, KEY)
     win, loss = result.match["win_rate"], result.match["loss_rate"]
