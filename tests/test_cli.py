@@ -245,11 +245,11 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
     parsed = parse_train(["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"])
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
     assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
-    flags = ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--task.vx", "-1", "2"]
+    flags = ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--task.shove-length", "0.1", "2"]
     for skill, (settings, task) in SETTINGS.items():
         parsed = parse_skill_train([skill, *flags])
         assert parsed.settings == override(settings, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0})
-        assert parsed.task == override(task, {"vx": (-1.0, 2.0)})
+        assert parsed.task == override(task, {"shove_length": (0.1, 2.0)})
 
 
 def test_walk_commands_are_those_of_the_skill_walk() -> None:

@@ -37,7 +37,7 @@ class Command(NamedTuple):
     mirror: float = 1.0
     """Sign under reflection of left and right."""
     trained: tuple[float, float] | None = None
-    """Lowest and highest value for which the skill was trained; None for the default +-limit."""
+    """Lowest and highest value for which the skill is trained; None for the default +-limit."""
 
 
 class Skill(abc.ABC):
@@ -52,7 +52,7 @@ class Skill(abc.ABC):
     period: ClassVar[float] = 0.02
     """Environment step, s."""
     turn: ClassVar[float | None] = None
-    """Maximum |vx x yaw_rate| for which the skill was trained, m/s^2; None sets no bound."""
+    """Maximum |vx x yaw_rate| for which the skill is trained, m/s^2; None sets no bound."""
     robot: Robot
     """Robot type."""
 
@@ -141,16 +141,20 @@ class Skill(abc.ABC):
             changes[i] = np.array([low, high], np.float32) - default[i]
         return changes
 
+    def trained(self, names: Sequence[str]) -> np.ndarray:
+        """Returns the lowest and the highest value of the named commands for which the skill is trained (n, 2)."""
+        default, commands = self.default_commands(), [self.commands[i] for i in self.index(names)]
+        around = zip(commands, default[self.index(names)], strict=True)
+        return np.array([x.trained or (at - x.limit, at + x.limit) for x, at in around], float).reshape(-1, 2)
+
     def untrained(self, ranges: Mapping[str, tuple[float, float]]) -> list[str]:
         """Returns the commands whose range exceeds that for which the skill was trained, each with both ranges."""
-        found = []
-        for name, (low, high) in ranges.items():
-            command = self.commands[int(self.index([name])[0])]
-            default = float(self.default_commands()[self.index([name])[0]])
-            least, most = command.trained or (default - command.limit, default + command.limit)
-            if low < least or high > most:
-                found.append(f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]")
-        return found
+        trained = zip(ranges.items(), self.trained(list(ranges)), strict=True)
+        return [
+            f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]"
+            for (name, (low, high)), (least, most) in trained
+            if low < least or high > most
+        ]
 
     def bounded(self, commands: jax.Array) -> jax.Array:
         """Returns commands (..., C) with the yaw rate reduced to the bound `turn`."""

@@ -24,7 +24,6 @@ from mqe_jax.skills.weights import Params
 from mqe_jax.walk import trainees
 from mqe_jax.walk.env import WalkEnv, heading_velocity
 from mqe_jax.walk.task import EpisodeSpec, WalkTask
-from mqe_jax.walk.training import AGILE_TASK
 
 WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 
@@ -36,7 +35,7 @@ class Scenario:
     duration: float = 20.0
     """Duration of an episode, s."""
     velocity: tuple[float, float, float] | None = None
-    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from the skill's `RANGES`."""
+    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from `Trainee.evaluated`."""
     period: float = 0.0
     """Interval at which commands are sampled anew, s; 0 keeps them."""
     gait: str = "trot"
@@ -76,11 +75,6 @@ SCENARIOS = {
     "turn": Scenario(velocity=(0.0, 0.0, 2.5), skills=("agile",)),
 }
 
-RANGES = {"walk": ((-1.0, 1.0), (-0.6, 0.6), (-1.0, 1.0)), "agile": (AGILE_TASK.vx, AGILE_TASK.vy, AGILE_TASK.yaw)}
-"""Ranges of the commands vx, vy (m/s) and yaw rate (rad/s) in which a skill is evaluated."""
-TURN = {"walk": math.inf, "agile": 3.0}
-"""Maximum product of forward velocity and yaw rate, m/s^2; commands beyond are sampled again."""
-
 
 def make_env(skill: str, robot: Robot, impl: str, episodes: int) -> WalkEnv:
     """Returns the evaluation environment: no randomisation; commands and disturbances are those of a scenario."""
@@ -88,16 +82,17 @@ def make_env(skill: str, robot: Robot, impl: str, episodes: int) -> WalkEnv:
     return WalkEnv(robot, task, skill=skill, impl=impl, num_envs=episodes)
 
 
-def sample_velocities(skill: str, scenario: Scenario, key: jax.Array, episodes: int) -> jax.Array:
-    """Samples commanded velocities (episodes, 3)."""
+def sample_velocities(trainee: trainees.Trainee, scenario: Scenario, key: jax.Array, episodes: int) -> jax.Array:
+    """Samples commanded velocities (episodes, 3); those beyond the skill's `turn` again."""
     if scenario.velocity is not None:
         return jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
-    low, high = jnp.array(RANGES[skill]).T
+    low, high = jnp.asarray(trainee.evaluated, jnp.float32).T
+    turn = trainee.skill.turn or math.inf
     velocity = jax.random.uniform(key, (episodes, 3), minval=low, maxval=high)
-    for _ in range(20 if math.isfinite(TURN[skill]) else 0):
+    for _ in range(20 if math.isfinite(turn) else 0):
         key, again = jax.random.split(key)
         other = jax.random.uniform(again, (episodes, 3), minval=low, maxval=high)
-        beyond = jnp.abs(velocity[:, 0] * velocity[:, 2]) > TURN[skill]
+        beyond = jnp.abs(velocity[:, 0] * velocity[:, 2]) > turn
         velocity = jnp.where(beyond[:, None], other, velocity)
     return velocity
 
@@ -109,7 +104,7 @@ def sample_specs(env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int
     """
     count = math.ceil(scenario.duration / scenario.period) if scenario.period else 1
     keys = [key, *jax.random.split(key, count)[1:]]
-    velocities = jnp.stack([sample_velocities(env.skill.name, scenario, each, episodes) for each in keys])
+    velocities = jnp.stack([sample_velocities(env.trainee, scenario, each, episodes) for each in keys])
     if isinstance(env.trainee, trainees.Agile):
         commands = jax.vmap(jax.vmap(env.trainee.commands))(velocities)
     else:

@@ -14,7 +14,7 @@ from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.limits import Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
 from mqe_jax.settings import Range, record
 from mqe_jax.walk.rewards import WalkRewards
-from mqe_jax.walk.trainees import Trainee
+from mqe_jax.walk.trainees import VELOCITY, Trainee
 from mqe_jax.walk_policy import WalkMemory
 
 if TYPE_CHECKING:
@@ -36,16 +36,8 @@ class WalkTask:
     """Time limit, s."""
     command_period: Time = 8.0
     """Interval at which commands, slope and force are resampled, s; 0 never resamples."""
-    vx: Range = (-1.2, 1.2)
-    """Range of the commanded forward velocity, m/s."""
-    vy: Range = (-0.7, 0.7)
-    """Range of the commanded lateral velocity, m/s."""
-    yaw: Range = (-1.2, 1.2)
-    """Range of the commanded yaw rate, rad/s."""
-    turn: Positive | None = None
-    """Maximum product of forward velocity and yaw rate, m/s^2; none sets no bound."""
     start: Fraction = 1.0
-    """Share of these ranges from which commands are drawn at assistance 1."""
+    """Share of the skill's ranges from which commands are drawn at assistance 1."""
     tolerance: Positive = 1.0
     """Factor on the errors at which the tracking terms have half of their value."""
     slope: Annotated[float, Ge(0), Le(1.5)] = 0.32
@@ -129,11 +121,11 @@ def sample_spec(key: jax.Array, task: WalkTask, trainee: Trainee, assistance: ja
     chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
     difficulty = 1.0 - assistance
     share = task.start + (1.0 - task.start) * difficulty
-    velocity = share * jnp.stack([uniform(*task.vx), uniform(*task.vy), uniform(*task.yaw)])
+    velocity = share * jnp.stack([uniform(*bounds) for bounds in trainee.skill.trained(VELOCITY)])
     velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
-    if task.turn is not None:
-        excess = jnp.maximum(jnp.abs(velocity[0] * velocity[2]) / task.turn, 1.0)
+    if trainee.skill.turn is not None:
+        excess = jnp.maximum(jnp.abs(velocity[0] * velocity[2]) / trainee.skill.turn, 1.0)
         velocity *= jnp.stack([excess**-0.5, jnp.ones(()), excess**-0.5])
     commands = trainee.sample(velocity, uniform, chance)
     angle = uniform(-jnp.pi, jnp.pi)

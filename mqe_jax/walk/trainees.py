@@ -16,6 +16,8 @@ from mqe_jax.robots.robot import Robot
 from mqe_jax.skills import Skill
 from mqe_jax.walk_policy import WalkMemory, WalkPolicy
 
+VELOCITY = ("vx", "vy", "yaw_rate")
+"""Names of the commands that are a velocity."""
 Draw = Callable[[float, float], jax.Array]
 Chance = Callable[[float], jax.Array]
 
@@ -33,6 +35,11 @@ class Trainee(abc.ABC):
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
+
+    @property
+    def evaluated(self) -> np.ndarray:
+        """Lowest and highest velocity command in evaluations (3, 2), m/s and rad/s: those of the training."""
+        return self.skill.trained(VELOCITY)
 
     @abc.abstractmethod
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
@@ -55,6 +62,10 @@ class Walk(Trainee):
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
         self.skill = WalkPolicy(robot)
+
+    @property
+    def evaluated(self) -> np.ndarray:
+        return np.array([(-1.0, 1.0), (-0.6, 0.6), (-1.0, 1.0)])
 
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
         names, odds = ("trot", "pace", "bound", "pronk"), (0.6, 0.92, 0.96)

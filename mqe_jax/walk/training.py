@@ -47,18 +47,7 @@ AGILE = override(
 )
 """Settings for training the agile skill from nothing; the assistance is the curriculum of commands and disturbances."""
 
-AGILE_TASK = WalkTask(
-    vx=(-1.5, 2.5),
-    vy=(-1.0, 1.0),
-    yaw=(-2.5, 2.5),
-    turn=3.0,
-    start=0.5,
-    tolerance=2.0,
-    command_period=4.0,
-    slope=0.15,
-    shove=100.0,
-    action_lag=1,
-)
+AGILE_TASK = WalkTask(start=0.5, tolerance=2.0, command_period=4.0, slope=0.15, shove=100.0, action_lag=1)
 """The walking task of the agile skill: fast commands, shoves as in contact with robots and boxes, gentle slopes."""
 
 SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {"walk": (WALK, WalkTask()), "agile": (AGILE, AGILE_TASK)}
