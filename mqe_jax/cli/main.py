@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mqe_jax import interrupts
-from mqe_jax.errors import InputError, NonFiniteError, one_line
+from mqe_jax.errors import InputError, NonFiniteError, one_line, shown
 from mqe_jax.literal import line
 
 
@@ -77,7 +77,17 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         return 2, one_line(error)
     except NonFiniteError as error:
         return 1, one_line(error)
+    except ValueError as error:
+        if variable := _jax_variable(error):
+            return 2, f"{variable}: {shown(os.environ[variable])} is not allowed; JAX says: {one_line(error)}"
+        raise
     return 0, ""
+
+
+def _jax_variable(error: ValueError) -> str:
+    """Returns the environment variable whose value JAX rejects where it is imported; empty for another error."""
+    importing, message = "jax" not in sys.modules, str(error).upper()
+    return next((name for name in os.environ if importing and name.startswith("JAX_") and name in message), "")
 
 
 def _run(command: Any) -> None:
