@@ -93,7 +93,7 @@ def _fetch(title: str, archive: Path) -> None:
     """Fetches a package's archive with npm."""
     npm = shutil.which("npm")
     if npm is None:
-        raise InputError("libraries: npm is not installed; install it, or give --libraries FOLDER (see docs/play.md)")
+        raise InputError("libraries: npm is not installed; install it, or name a folder that holds them (docs/play.md)")
     archive.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=archive.parent) as temporary:
         command = [npm, "pack", "--loglevel=error", "--fetch-retries=0", "--pack-destination", temporary, title]

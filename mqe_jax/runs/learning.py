@@ -69,7 +69,9 @@ class Run:
         return plot_curves([self.metrics], self.policy.task)
 
     def save(self, folder: str | Path) -> None:
-        """Writes a run folder without checkpoints, for `load_run`, `load_policy` and the command line.
+        """Writes a run folder without a checkpoint, for `load_run`, `load_policy` and the command line.
+
+        It cannot be resumed; a training can start from its policy (setting `start`).
 
         Raises:
             InputError: if the folder cannot be written, or holds another run.

@@ -12,7 +12,7 @@ import fnmatch
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -23,7 +23,7 @@ from annotated_types import MaxLen, MinLen
 from mqe_jax.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.files import check_folder, locked, making, write_atomically
 from mqe_jax.limits import Seed, Seeds
-from mqe_jax.settings import build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -51,9 +51,9 @@ class Sweep:
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
     """Settings file or shipped name, in which {task} stands for the task's id; none uses that of `mqe train`."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = FrozenMapping()
     """Settings that override the file's in every run; {task} in `start` and `opponents` stands for the task's id."""
-    variants: Annotated[Mapping[str, Any], MinLen(1)] = field(default_factory=lambda: {PLAIN: {}})
+    variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
     """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ def load_sweep(path: Path, part: str | None = None) -> Sweep:
             raise InputError(f"{path}: has no part {part!r}{nearest(part, values)}; it has: {', '.join(values)}")
         values = values[part]
     elif "tasks" not in values and any(isinstance(value, dict) and "tasks" in value for value in values.values()):
-        raise InputError(f"part: none is named; {path} has: {', '.join(values)} (--part {next(iter(values))})")
+        raise InputError(f"part: none is named; {path} has: {', '.join(values)}")
     try:
         return build(Sweep, values)
     except InputError as error:

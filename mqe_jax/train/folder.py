@@ -104,7 +104,7 @@ def check_alone(run_dir: Path) -> None:
     if others:
         raise InputError(
             f"run_dir: {run_dir} cannot hold a run, because {others[0]} holds another run; "
-            "resume that one with its own --num-seeds, or name another folder"
+            "resume that one with all of its seeds, or name another folder"
         )
 
 
@@ -118,8 +118,12 @@ def check_run(run_dir: Path, resume: bool = False) -> None:
     checkpoint = latest(run_dir)
     found = [name for name in RUN_FILES if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
     if found and not resume:
+        advice = "name another folder" if checkpoint is None else "resume it, or name another folder"
+        raise InputError(f"run_dir: {run_dir} already holds a run ({', '.join(found)}); {advice}")
+    if checkpoint is None and {CONFIG_FILE, POLICY_FILE} <= {*found}:
         raise InputError(
-            f"run_dir: {run_dir} already holds a run ({', '.join(found)}); resume it (--resume) or name another folder"
+            f"run_dir: {run_dir} holds a run without a checkpoint, which cannot be resumed; name another folder, "
+            "and start from its policy by the setting 'start'"
         )
     inside = [path for path in sorted(run_dir.glob("[!.]*")) if path.suffix not in _OUTPUT]
     held = [path.name for path in inside if not path.is_dir() or any(path.glob("[!.]*"))]

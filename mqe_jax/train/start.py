@@ -147,8 +147,7 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
         if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
             raise InputError(
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
-                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE} "
-                f"(--config {path / CONFIG_FILE})"
+                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE}"
             )
 
 
