@@ -47,7 +47,38 @@ T = TypeVar("T")
 P = ParamSpec("P")
 R = TypeVar("R")
 
+
+class FrozenMapping(Mapping[str, Any]):
+    """A mapping in a record, which can be hashed like the record; equal to any mapping with its entries."""
+
+    def __init__(self, values: Mapping[str, Any] = {}) -> None:
+        self._values = dict(values)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self))  # the names: values may be lists
+
+    def __repr__(self) -> str:
+        return repr(self._values)
+
+
 _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+
+
+def _two(value: Any) -> Any:
+    try:
+        _, _ = value
+    except (TypeError, ValueError):
+        raise ValueError("two numbers (lowest, highest)") from None
+    return value
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
@@ -56,14 +87,16 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered)]
-Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered)]
+Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered), pydantic.BeforeValidator(_two)]
+Coordinates = Annotated[
+    tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered), pydantic.BeforeValidator(_two)
+]
 
 
 def _parameters(value: Mapping[str, Any]) -> Mapping[str, Any]:
-    for name, place in {"task": "as TASK", "impl": "by --impl", "num_envs": "by --num-envs"}.items():
+    for name in ("task", "impl", "num_envs"):
         if name in value:
-            raise InputError(f"{name}: is not a task parameter; it is given {place}")
+            raise InputError(f"{name}: is not a task parameter, but an argument of its own")
     return value
 
 
@@ -242,6 +275,8 @@ def to_mapping(settings: Any) -> dict[str, Any]:
     def plain(value: Any) -> Any:
         if hasattr(value, "tolist"):
             return value.tolist()
+        if isinstance(value, FrozenMapping):
+            return dict(value)
         fail(type(settings).__name__, value, "a number, a string, true, false, none, or lists and mappings of these")
 
     return pydantic_core.to_jsonable_python(settings, fallback=plain)
@@ -284,7 +319,8 @@ def _lenient(hint: Any) -> Any:
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
     if origin in (Mapping, Sequence, list):
-        return origin[tuple(map(_lenient, parts))]  # type: ignore[index]
+        made = origin[tuple(map(_lenient, parts))]  # type: ignore[index]
+        return Annotated[made, pydantic.AfterValidator(FrozenMapping)] if origin is Mapping else made
     if hint in (int, float):
         return _bounded(Annotated[hint, None])
     before = {bool: _boolean, str: _text, Path: _text}.get(hint)
@@ -389,6 +425,7 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")
     allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
+    allowed = allowed.replace("a valid tuple", "a list").replace("a valid dictionary", "a mapping of names to values")
     if first["type"].startswith("dataclass"):
         allowed = "it must be a mapping of names to values"
     choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]

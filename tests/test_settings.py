@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,9 +13,11 @@ import pytest
 import yaml
 from annotated_types import Gt, MinLen
 
+from mqe_jax.envs.gate import GateParams
 from mqe_jax.errors import InputError
 from mqe_jax.settings import (
     Fraction,
+    FrozenMapping,
     Positive,
     PositiveInt,
     Range,
@@ -49,7 +52,7 @@ class Outer:
     span: Range | None = None
     plain: float = 1.0
     inner: Inner = Inner()
-    free: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    free: Mapping[str, Any] = FrozenMapping()
 
 
 @record
@@ -67,7 +70,7 @@ class Derived(Outer):
         ({"plain": 2}, {"plain": 2.0}),
         ({"flag": np.False_}, {"flag": False}),
         ({"sizes": np.array([3, 4])}, {"sizes": (3, 4)}),
-        ({"span": [0, 1]}, {"span": (0.0, 1.0)}),
+        ({"span": np.array([0, 1])}, {"span": (0.0, 1.0)}),
         ({"span": "none", "label": "none"}, {"span": None, "label": None}),
         ({"inner": {"clip": np.float32(0.5)}, "inner.gamma": 0.5}, {"inner": Inner(clip=0.5, gamma=0.5)}),
         ({"free": {"a.b": 3}, "free.c.d": 4}, {"free": {"a": {"b": 3}, "c": {"d": 4}}}),
@@ -78,7 +81,8 @@ class Derived(Outer):
 def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
     made = build(Derived, values)
     assert {name: getattr(made, name) for name in expected} == expected
-    assert [type(getattr(made, name)) for name in expected] == [type(value) for value in expected.values()]
+    kinds = [FrozenMapping if type(value) is dict else type(value) for value in expected.values()]
+    assert [type(getattr(made, name)) for name in expected] == kinds
 
 
 @pytest.mark.parametrize(
@@ -91,15 +95,17 @@ def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
         ({"plain": float("nan")}, "plain: nan is not allowed; it must be a finite number"),
         ({"plain": "inf"}, "plain: 'inf' is not allowed; it must be a finite number"),
         ({"plain": 1e300}, "plain: 1e+300 is not allowed; it must be less than or equal to 1000000000"),
-        ({"sizes": 64}, "sizes: 64 is not allowed; it must be a valid tuple"),
+        ({"sizes": 64}, "sizes: 64 is not allowed; it must be a list"),
         ({"sizes": []}, "sizes: [] is not allowed"),
         ({"sizes": [1, -1]}, "sizes.1: -1 is not allowed; it must be greater than 0"),
         ({"span": (1, 0)}, "span: (1, 0) is not allowed; it must be two numbers (lowest, highest)"),
+        ({"span": 1}, "span: 1 is not allowed; it must be two numbers (lowest, highest)"),
+        ({"span": [1]}, "span: [1] is not allowed; it must be two numbers (lowest, highest)"),
         ({"label": 3}, "label: 3 is not allowed; it must be a valid string"),
         ({"label": b"x"}, "label: b'x' is not allowed; it must be a text"),
         ({"count": b"3"}, "count: b'3' is not allowed; it must be a number"),
         ({"plain": b"1.5"}, "plain: b'1.5' is not allowed; it must be a number"),
-        ({"free": 3}, "free: 3 is not allowed; it must be a valid dictionary"),
+        ({"free": 3}, "free: 3 is not allowed; it must be a mapping of names to values"),
         ({"cuont": 3}, "cuont: unknown name (value 3) (did you mean 'count'?); allowed: count, flag"),
         ({"inner": 3}, "inner: 3 is not allowed; it must be a mapping"),
         ({"inner.clip": "much"}, "inner.clip: 'much' is not allowed; it must be a valid number"),
@@ -132,6 +138,16 @@ def test_overriding_merges_nested_records_and_free_mappings() -> None:
     second = override(first, {"inner": {"gamma": 0.5}, "free.b": 2, "label": "x"})
     assert second == Derived(inner=Inner(clip=0.5, gamma=0.5), free={"a": 1, "b": 2}, label="x")
     assert first.free == {"a": 1}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [(GateParams, {"command_ranges": {"vx": (-1.0, 1.2)}}), (TrainConfig, {"env": {"commands": ["vx"]}})],
+)
+def test_records_can_be_hashed_and_copied(kind: type[Any], values: dict[str, Any]) -> None:
+    given = build(kind, values)
+    assert len({kind(), given, build(kind, values), pickle.loads(pickle.dumps(given))}) == 2
+    assert build(kind, to_mapping(given)) == given
 
 
 @pytest.mark.parametrize(

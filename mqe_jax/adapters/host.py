@@ -79,7 +79,7 @@ class HostEnvs:
         self._camera: Camera | None = None
         self._task = match = self.env.match if isinstance(self.env, TeamEnv) else self.env
         opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
-        self._key = (type(match), repr(match.params), match.impl, match.control, match.physics.num_envs, opponent)
+        self._key = (type(match), match.params, match.impl, match.control, match.physics.num_envs, opponent)
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns what a copy has: all but the compiled functions."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Literal, TypeVar
 
@@ -23,7 +22,7 @@ from mqe_jax.limits import (
     Time,
     TimeLimit,
 )
-from mqe_jax.settings import FileName, Range, fail, record
+from mqe_jax.settings import FileName, FrozenMapping, Range, fail, record
 
 
 @record
@@ -66,7 +65,7 @@ class TaskParams:
     """Named default commands of the skill; of the walk policy trot, pronk, bound or pace, trot if None."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
     """Commands of the skill that the action sets, in order."""
-    command_ranges: Mapping[str, Range] = dataclasses.field(default_factory=dict)
+    command_ranges: Mapping[str, Range] = FrozenMapping()
     """Lowest and highest value of these commands, by name; the skill's default ranges for those that are not named.
     Scripted policies keep the default ranges.
     """

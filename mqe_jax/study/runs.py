@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mqe_jax.errors import InputError
 from mqe_jax.literal import line
-from mqe_jax.settings import build, load_yaml, record
+from mqe_jax.settings import FrozenMapping, build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
 from mqe_jax.train.logs import number, read_metrics
@@ -128,11 +128,11 @@ class Reference:
 
     label: str = "reference"
     """What the values are, in the legend of figures."""
-    values: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+    values: Mapping[str, Mapping[str, Mapping[str, float]]] = FrozenMapping()
     """Variant -> task -> algorithm -> average step reward."""
-    variants: Mapping[str, str] = field(default_factory=dict)
+    variants: Mapping[str, str] = FrozenMapping()
     """Titles of variants, in their order; others follow."""
-    tasks: Mapping[str, str] = field(default_factory=dict)
+    tasks: Mapping[str, str] = FrozenMapping()
     """Titles of tasks, in their order; others follow."""
     algorithms: tuple[str, ...] = ()
     """Algorithms in their order; others follow."""

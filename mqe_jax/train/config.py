@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,7 +23,7 @@ from mqe_jax.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.settings import FileName, Parameters, fail, joined, load_yaml, override, record
+from mqe_jax.settings import FileName, FrozenMapping, Parameters, fail, joined, load_yaml, override, record
 from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
 from mqe_jax.train.networks import NetworkSettings, network_settings
@@ -193,9 +192,9 @@ class TrainConfig:
 
     task: Annotated[str | None, tyro.conf.Suppress] = None
     """Id of the task."""
-    env: Annotated[Parameters, tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
+    env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
     """Overrides of the task's parameters, passed to the environment unchanged."""
-    train_env: Annotated[Parameters, tyro.conf.Suppress] = dataclasses.field(default_factory=dict)
+    train_env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
     """Further overrides during training only, not in evaluation."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
     """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, another scripted policy of
