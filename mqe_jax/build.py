@@ -14,6 +14,7 @@ from mqe_jax import zoo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.match import Match
+from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.league.league import League, Roster
@@ -58,6 +59,8 @@ def prepare(
 
     `seeds` are trained in one program; by default the one of the settings.
     """
+    if len(set(seeds or ())) < len(seeds or ()):
+        fail("seeds", seeds, "a list without repetitions")
     if isinstance(task, str | QuadrupedEnv):
         settings = for_task(settings_of(task, config), task, env)
     elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
@@ -363,7 +366,7 @@ def base_config(task: str, name: str | None, algorithm: str | None = None) -> Tr
 
 def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
     """Returns the settings with a task and its parameters; says so where they are those of another task."""
-    name = task.name if isinstance(task, QuadrupedEnv) else task
+    name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     if config.task not in (None, name):
         echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
     return override(config, {"task": name, "env": joined(parameters_of(task), env or {})})

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import reprlib
+import sys
+import warnings
 from collections.abc import Iterable
+from pathlib import Path
 
 from mqe_jax.limits import SHOWN
 from mqe_jax.literal import line
@@ -26,6 +29,14 @@ class InUseError(InputError):
 
 class NonFiniteError(ArithmeticError):
     """Training produced NaN or infinite numbers. The command line prints it as one line, exit code 1."""
+
+
+def warn(message: str) -> None:
+    """Warns at the line outside of the package that led to the call."""
+    package, frame, level = str(Path(__file__).parent), sys._getframe(), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
 
 
 def one_line(error: BaseException) -> str:

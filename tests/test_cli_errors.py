@@ -2,6 +2,8 @@
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ pytestmark = pytest.mark.usefixtures("fake_tasks")
 
 BAD = {
     "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
+    "no command of a skill": (["walk"], ["unknown command 'walk'; allowed: walk train, walk eval, walk convert"]),
+    "command of a skill": (["walk", "evl"], ["'walk evl' (did you mean 'walk eval'?); allowed: walk train"]),
     "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
@@ -62,6 +66,7 @@ BAD = {
     ),
     "recording": (["replay", "none.npz"], ["none.npz"]),
     "weights": (["walk", "eval", "--weights", "none.safetensors"], ["none.safetensors"]),
+    "policy to start from": (["train", "fake", *SMALL, "--start", "nope"], ["start: 'nope'"]),
     "checkpoint": (["walk", "convert", "a.jit", "b.jit", "-o", "w.safetensors"], ["a.jit"]),
     "friction": (["bench", "go1gate", "--set", "friction=1e300"], ["friction: '1e300'"]),
     "host": (["view", "go1plane", "--control", "position", "--host", "a..b"], ["host: 'a..b' is not allowed"]),
@@ -221,3 +226,11 @@ def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pyte
     monkeypatch.setattr(build, "make_env", lambda *arguments: defect())
     with pytest.raises(error):
         cli.main(["bench", "fake"])
+
+
+@pytest.mark.parametrize(("name", "value"), [("JAX_ENABLE_X64", "maybe"), ("JAX_NUM_CPU_DEVICES", "many")])
+def test_a_variable_that_jax_rejects_is_named(name: str, value: str) -> None:
+    words = [sys.executable, "-m", "mqe_jax.cli", "zoo", "go1gate"]
+    done = subprocess.run(words, env={**os.environ, name: value}, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith(f"mqe: {name}: '{value}' is not allowed") and done.stderr.count("\n") == 1

@@ -125,7 +125,9 @@ def test_graphs_of_tasks_need_one_skill(weights: str) -> None:
         ({"vx": (1.0, -1.0)}, r"command_ranges.vx: .*\(lowest, highest\), in this order"),
         ({"vx": (-1.0, float("inf"))}, r"command_ranges.vx"),
         ({"vx": (True, 1.0)}, r"command_ranges.vx"),
-        ({"vx": 1.0}, r"command_ranges.vx"),
+        ({"vx": 1.0}, r"command_ranges.vx: 1.0 is not allowed; it must be two numbers \(lowest, highest\)$"),
+        ({"vx": (1.0,)}, r"command_ranges.vx: .*two numbers \(lowest, highest\)$"),
+        ({"vx": (-1.0, 0.5, 1.0)}, r"command_ranges.vx: .*two numbers \(lowest, highest\)$"),
         ({"vy": (-0.2, 0.5)}, r"command_ranges.vy: \(-0.2, 0.5\) .*symmetric in go1revolvingdoor"),
     ],
 )
@@ -135,8 +137,9 @@ def test_bad_ranges_are_named(ranges: Any, message: str) -> None:
 
 
 def test_ranges_beyond_training_warn() -> None:
-    with pytest.warns(UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$"):
+    with pytest.warns(UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$") as found:
         make("go1gate", impl="c", num_envs=1, command_ranges={"vx": (-1.5, 2), "vy": (-0.6, 0.6)})
+    assert found[0].filename == __file__
 
 
 @pytest.mark.parametrize("field", ["policy", "opponent"])

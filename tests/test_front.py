@@ -79,8 +79,11 @@ def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixtur
     assert_same(run.policy.arrays, again.policy.arrays)
     assert again.config == run.config and again.evaluations == [] and repr(again) == repr(run)
     np.testing.assert_allclose(again.metrics["loss/value"], run.metrics["loss/value"], rtol=1e-7)
-    with pytest.raises(InputError, match="run_dir: saved already holds a run"):
+    with pytest.raises(InputError, match=r"run_dir: saved already holds a run \(.*\); name another folder$"):
         run.save("saved")
+    with pytest.raises(InputError, match="run_dir: saved holds a run without a checkpoint, which cannot be resumed"):
+        mqe_jax.learn("fake", FEW, run_dir="saved", resume=True)
+    assert mqe_jax.learn("fake", FEW | {"start": "saved"}).finished
     assert cli.main(["eval", "fake", "--policy", "saved", "--episodes", "2", "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["policy"] == "saved"
 
@@ -140,6 +143,7 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     [
         ("go1gat", {}, r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\)"),
         (None, {}, "task: None is not allowed; it must be a task's id, an environment"),
+        ("fak", {"config": "demo"}, "task: unknown id 'fak'"),
         ("fake", {"config": 5}, "config: 5 is not allowed; it must be a shipped name"),
         ("fake", {"config": {"ppo.clp": 1}}, r"ppo.clp: unknown name .*did you mean 'clip'"),
         ("fake", {"seed": -1}, "seed: -1 is not allowed"),
@@ -151,12 +155,15 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
         (fake(), {"config": {"opponents": ["idle"]}}, r"opponents: \('idle',\) .* left out for a batch"),
     ],
 )
-def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_trained_is_named(
+    task: Any, arguments: dict[str, Any], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(InputError, match=said):
         mqe_jax.learn(task, **arguments)
+    assert "".join(capfd.readouterr()) == ""
 
 
-@pytest.mark.parametrize("seeds", [5, [], [1.5], "ab", range(65)])
+@pytest.mark.parametrize("seeds", [5, [], [1.5], "ab", range(65), [1, 1]])
 def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
     with pytest.raises(InputError, match=r"seeds.* is not allowed"):
         mqe_jax.learn_seeds("fake", FEW, seeds=seeds)

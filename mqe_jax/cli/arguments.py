@@ -88,15 +88,17 @@ def parse(arguments: Sequence[str]) -> Any:
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
     _check_words(arguments)
-    arguments = unaliased(arguments)
+    given, arguments = arguments, unaliased(arguments)
     words = 2 if " ".join(arguments[:2]) in COMMANDS else 1
     name, rest = " ".join(arguments[:words]), list(arguments[words:])
     if {"-h", "--help"}.intersection(arguments[:2]) and name not in COMMANDS:
         print(overview("" if name.startswith("-") else name))
         raise SystemExit(0)
     if name not in COMMANDS:
-        name = " ".join(arguments[:2]) if name == "skill" else name
-        raise InputError(f"unknown command {name!r}{nearest(name, COMMANDS)}; allowed: {', '.join(COMMANDS)}")
+        group = given[0] if name.startswith("skill") else ""
+        known = [f"{group}{each[5:]}" for each in COMMANDS if each.startswith("skill ")] if group else list(COMMANDS)
+        name = " ".join(given[: 2 if group else 1])
+        raise InputError(f"unknown command {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
     if isinstance(COMMANDS[name], str):
         if name == "train" and rest and not rest[0].startswith("-"):
             task_id(rest[0])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import warnings
 from typing import TYPE_CHECKING, Literal
 
 import jax
@@ -29,7 +28,7 @@ from mqe_jax.envs.returned import alike, numbers, shaped, weights_of
 from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import ENDINGS, Moment, S, State
 from mqe_jax.envs.task import Task
-from mqe_jax.errors import InputError
+from mqe_jax.errors import InputError, warn
 from mqe_jax.limits import Environments
 from mqe_jax.precision import single
 from mqe_jax.robots.index import RobotState, placed, read_robots
@@ -105,9 +104,7 @@ class QuadrupedEnv(Task[S, P]):
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
         if uses_skill and (beyond := skill.untrained(self.params.command_ranges)):
-            warnings.warn(
-                f"command_ranges: the skill {skill.name!r} was not trained for {', '.join(beyond)}", stacklevel=1
-            )
+            warn(f"command_ranges: the skill {skill.name!r} was not trained for {', '.join(beyond)}")
         self.controller = Controller(
             mode=control,
             robot=self.robot,
