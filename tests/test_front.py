@@ -230,7 +230,7 @@ def test_a_function_is_a_policy() -> None:
 
 
 def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of the episodes on each."""
+    """If asked to: half of the episodes on each."""
     played: dict[str, Any] = {}
 
     result = mqe_jax.evaluate("fake", "forward", episodes=2)
@@ -240,7 +240,8 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
         return result
 
     monkeypatch.setattr(playing, "evaluate_batch", measure)
-    options: dict[str, Any] = {"impl": "c", "episodes": 6, "num_envs": 4}
+    options: dict[str, Any] = {"impl": "c", "sides": "both", "episodes": 6, "num_envs": 4}
+    words = ["eval", "go1tug", "--policy", "forward", "--impl", "c"]
     evaluate: Any = mqe_jax.evaluate
     about = evaluate("go1tug", "forward", "scripted", **options).about
     assert about == {"policy": "forward", "opponent": "scripted", "sides": "both", "seed": 0}
@@ -248,8 +249,9 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
     for wrong in ({"episodes": 5}, {"num_envs": 3}):
         with pytest.raises(InputError, match=f"{next(iter(wrong))}: . is not allowed; it must be even"):
             evaluate("go1tug", "forward", **(options | wrong))
-    evaluate("go1tug", "forward", sides="first", **options)
-    assert not isinstance(played["batch"], BothSides)
+    for measured in (lambda: evaluate("go1tug", "forward", impl="c"), lambda: cli.main(words)):
+        measured()
+        assert not isinstance(played["batch"], BothSides)
 
 
 def test_halves_of_the_environments_play_equally_many_episodes() -> None:

@@ -34,7 +34,7 @@ def evaluate(
     env: Mapping[str, Any] | None = None,
     impl: str = "auto",
     episodes: int = 512,
-    sides: str = "both",
+    sides: str = "first",
     num_envs: int = 128,
     deterministic: bool = False,
     seed: int = 0,
@@ -57,7 +57,8 @@ def evaluate(
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         episodes: number of episodes.
-        sides: of a match, whether the policy is the task's team 0 in all episodes (`first`), or team 1 in half of them.
+        sides: of a match, whether the policy is the task's team 0 in all episodes (`first`), or team 1 in half of them
+            (`both`).
         num_envs: environments in parallel, at most.
         deterministic: whether trained policies act with their mean actions; a shipped one does so too where its card
             declares it.
