@@ -163,11 +163,14 @@ def task_page(task: Any) -> str:
         f"mqe view {name}{flags}": "live, in the browser",
         f"mqe train {name}": "train a policy",
     }
+    units = {command.name: command.unit for command in env.controller.skill.commands}
+    ranges = [f"`{name}` {low:g} to {high:g} {units[name]}" for name, (low, high) in env.params.commanded().items()]
     width = max(map(len, commands))
     lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
     facts = [
         f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
-        "- action per agent: command 3 (velocities for the walk policy), position 12, torque 12",
+        f"- action per agent: command {len(ranges)} (of the skill `{env.params.skill}`: {', '.join(ranges)}), "
+        "position 12, torque 12",
         f"- observation {env.observation_size} per agent, privileged observation {env.privileged_observation_size}",
         f"- time limit {env.params.episode_length:g} s, {env.max_steps} steps of {env.dt:g} s",
     ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, TypeVar
 
+import numpy as np
+
 from mqe_jax import agile, robots, skills, walk_policy  # noqa: F401  (skills register themselves)
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.errors import InputError
@@ -111,6 +113,14 @@ class TaskParams:
         skill.changes(self.commands, self.command_ranges, skill.default_commands(self.gait))
         if self.min_height >= self.max_height:
             fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
+
+    def commanded(self) -> dict[str, tuple[float, float]]:
+        """Returns the lowest and the highest value of each command that the action sets, in the command's unit."""
+        skill = skills.make(self.skill, robots.get(self.robot))
+        default = skill.default_commands(self.gait)
+        changes = skill.changes(self.commands, self.command_ranges, default)
+        limits = np.round(default[skill.index(self.commands), None] + changes, 6)
+        return {name: (float(low), float(high)) for name, (low, high) in zip(self.commands, limits, strict=True)}
 
 
 P = TypeVar("P", bound=TaskParams)

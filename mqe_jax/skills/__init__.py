@@ -94,7 +94,7 @@ class Skill(abc.ABC):
             if name not in known:
                 hint = nearest(name, known)
                 raise InputError(f"{self.name} command: unknown name {name!r}{hint}; allowed: {', '.join(known)}")
-        return np.array([known.index(name) for name in names])
+        return np.array([known.index(name) for name in names], int)
 
     def column(self, field: str, names: Sequence[str]) -> np.ndarray:
         """Returns a field of `Command`, such as 'gain', of the named commands (n,)."""

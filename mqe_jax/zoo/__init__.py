@@ -13,8 +13,9 @@ from annotated_types import Ge
 from mqe_jax.envs import TASKS
 from mqe_jax.errors import InputError
 from mqe_jax.limits import NonNegative, PositiveInt
-from mqe_jax.settings import PathText, build, checked, record, to_mapping
+from mqe_jax.settings import PathText, build, checked, override, record, to_mapping
 from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
 FOLDER = Path(__file__).parent
@@ -70,6 +71,14 @@ def card(task: str) -> Card:
             f"{TASKS[task].version} now; train one: mqe train {task}"
         )
     return about
+
+
+def commands(task: str) -> dict[str, Any]:
+    """Returns the skill that a task's shipped policy commands, and the ranges of its commands; errors as `card`."""
+    card(task)
+    config = build(TrainConfig, read_metadata(file_of(task), kind="policy")["config"])
+    params = override(TASKS[task].Params(), {k: v for k, v in config.training_env.items() if k != "control"})
+    return {"skill": params.skill, "commands": params.commanded()}
 
 
 def load(task: str) -> TrainedPolicy:
