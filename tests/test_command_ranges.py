@@ -72,6 +72,19 @@ def test_a_range_is_of_the_command_not_of_its_change() -> None:
     np.testing.assert_allclose(commands[:, 4], [2.0, 3.0, 5.0])
 
 
+@pytest.mark.parametrize(
+    "parameters",
+    [{}, {"command_ranges": {"vx": (-0.5, 1.2)}}, {"commands": ("gait_frequency", "body_height"), "gait": "pace"}],
+)
+def test_the_ranges_shown_are_those_of_actions(parameters: Any) -> None:
+    env = make("go1plane", impl="c", num_envs=1, **parameters)
+    names, columns = env.params.commands, env.controller.skill.index(env.params.commands)
+    ends = [env.controller.skill_commands(jnp.full((1, len(names)), end))[0, columns] for end in (-1.0, 1.0)]
+    shown = env.params.commanded()
+    assert tuple(shown) == names
+    np.testing.assert_allclose(np.stack(ends, axis=-1), list(shown.values()), rtol=1e-5)
+
+
 @pytest.mark.parametrize("task", ["go1football-1vs1", "go1football-2vs2", "go1revolvingdoor"])
 def test_scripted_policies_command_the_same_in_other_ranges(task: str, weights: str) -> None:
     plain = make(task, impl="c", num_envs=1)

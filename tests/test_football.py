@@ -273,6 +273,47 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
     assert attack.params.rewards.fall == 0
 
 
+TOUCHES = {
+    (): [0, 0, False],
+    (0,): [0, 0, False],
+    (0, 0): [0, 0, False],
+    (0, 1): [1, 0, True],
+    (1, 0, 0, 1): [2, 0, True],
+    (0, 2, 1): [0, 0, True],
+    (0, 2, 1, 0): [1, 0, True],
+    (2, 3, 0): [0, 1, False],
+    (0, 1, 2, 3, 2): [1, 2, True],
+}
+"""Passes of both teams, and whether both robots of team 0 touched the ball, by the robots that touch it in turn."""
+
+
+@pytest.mark.parametrize(
+    ("task", "touching"),
+    [
+        (task, touching)
+        for task in (TASKS[0], TASKS[2])
+        for touching in TOUCHES
+        if task == TASKS[2] or 3 not in touching
+    ],
+)
+def test_passes_and_goals_of_both(envs: dict[str, Any], fresh: Any, task: str, touching: tuple[int, ...]) -> None:
+    """A touch changes the velocity of the ball, which rolls on after it; at last it is in the goal."""
+    env, state, speed = envs[task], fresh[task], 0.0
+    corners = [(3, -4, 0), (3, 4, 0), (11, 4, 0), (11, -4, 0)][: len(env.kick_off)]
+    for robot in (None, *(step for each in touching for step in (each, None)), "goal"):
+        places = [(6.6, 0, 0) if i == robot else corner for i, corner in enumerate(corners)]
+        speed += 0.2 * isinstance(robot, int)
+        ball = (12.1, 0.0) if robot == "goal" else (7.0, 0.0)
+        after = with_ball(env, standing(env, state, places), ball, (speed, 0.0, 0.0))
+        state = dataclasses.replace(after, task=env.step_task(moment(env, state), moment(env, after)))
+    first, second, both = TOUCHES[touching]
+    outcome = env.outcome(state, env.read(state.data), NO)
+    expected: dict[str, Any] = {"success/passes": first, "success/both_touched": both}
+    if task == TASKS[2]:
+        expected = {"team0/passes": first, "team1/passes": second, "team0/both_touched": both}
+    assert {name: outcome[name].item() for name in expected} == expected
+
+
 # -- the defender -----------------------------------------------------------------------------------------------------
 
 

@@ -226,7 +226,9 @@ def test_a_function_is_a_policy() -> None:
         return 0.25 * np.ones((*obs.shape[:2], 3)), memory
 
     assert mqe_jax.evaluate("fake", forward, episodes=4).success_rate == 1.0
-    assert mqe_jax.evaluate(mqe_jax.make("go1tug", impl="c", episode_length=0.1), forward, "idle", episodes=2).draw
+    match = mqe_jax.make("go1football-2vs2", impl="c", episode_length=0.1)
+    result = mqe_jax.evaluate(match, forward, "idle", episodes=2)
+    assert result.draw and result.outcomes == {"passes": 0.0, "both_touched": 0.0}
 
 
 def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,7 +72,8 @@ def test_the_cards_have_the_rates_of_the_readme(capfd: pytest.CaptureFixture[str
         shown = rates[: 2 if task in MATCHES else 1]
         assert [float(x) for x in listed[task][: len(shown)]] == [float(x) for x in shown], task
     assert cli.main(["zoo", "go1gate"]) == 0
-    assert "published-gate" in capfd.readouterr().out
+    out = capfd.readouterr().out
+    assert "published-gate" in out and "walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5" in out
     assert cli.main(["zoo", "--json"]) == 0
     assert set(json.loads(capfd.readouterr().out)["policies"]) == {*zoo.names()}
 

@@ -175,10 +175,10 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
         return dataclasses.replace(after, task=env.step_task(*moments))
 
     first = kicked(state, 0, 0.5)
-    assert first.task.touched.tolist() == [True, False]
-    assert kicked(state, 1, 0.5, other=0.5).task.touched.tolist() == [False, True]  # the nearest alone
+    assert first.task.play.touched.tolist() == [True, False, False]
+    assert kicked(state, 1, 0.5, other=0.5).task.play.touched.tolist() == [False, True, False]  # the nearest alone
     for nothing in (kicked(state, 0, 0.05), kicked(state, 0, 0.5, apart=0.8), kicked(state, 2, 0.5)):
-        assert not nothing.task.touched.any()
+        assert not nothing.task.play.touched[:2].any()
     alone, both = kicked(first, 0, 0.5, x=12.1), kicked(kicked(first, 1, 0.5), 2, 0.0, x=12.1)
     late = kicked(alone, 1, 0.5, x=12.1)  # after the goal
     for end, together in ((alone, False), (both, True), (late, False)):

@@ -67,6 +67,19 @@ class FootballParams(TaskParams):
 F = TypeVar("F", bound=FootballParams)
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Play:
+    """Who touched the ball in this episode."""
+
+    touched: jax.Array
+    """Robots that touched it (R,) bool."""
+    last: jax.Array
+    """The robot that touched it last (R,) bool."""
+    passes: jax.Array
+    """Passes of each side (2,) int32: touches by a mate of the robot that touched the ball last."""
+
+
 class Football(QuadrupedEnv[S, F]):
     """Base of the football tasks: the field, the ball and the kick-off."""
 
@@ -129,6 +142,20 @@ class Football(QuadrupedEnv[S, F]):
         nearest = jnp.arange(len(apart)) == jnp.argmin(apart)
         return nearest & (apart < _REACH) & (changed > _IMPULSE)
 
+    def kick_off_play(self) -> Play:
+        """Returns the play before the first touch."""
+        nobody = jnp.zeros(len(self.kick_off), bool)
+        return Play(nobody, nobody, jnp.zeros(2, jnp.int32))
+
+    def next_play(self, play: Play, before: Moment, after: Moment) -> Play:
+        """Returns the play after a step."""
+        halfway = GOALS[:, 0].mean()
+        own = np.array([[(x > halfway) == side for x, _, _ in self.kick_off] for side in (False, True)])
+        touch = self.touches(before, after)
+        passed = jnp.any(own & touch, axis=1) & jnp.any(own & play.last, axis=1) & ~jnp.any(touch & play.last)
+        last = jnp.where(jnp.any(touch), touch, play.last)
+        return Play(play.touched | touch, last, play.passes + passed)
+
     def ball(self, data: mjx.Data) -> jax.Array:
         """Returns the ball's position (3,), m."""
         return self.object_pose(data, "ball")[:3]
@@ -175,6 +202,8 @@ class FootballMatchState:
 
     nearest: jax.Array
     """Smallest distance of the ball to the goal that each team attacks in this episode (2,), m."""
+    play: Play
+    """Touches of the ball."""
 
 
 @record
@@ -216,10 +245,12 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
     def reset_task(
         self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array
     ) -> FootballMatchState:
-        return FootballMatchState(self.goal_distance(data))
+        return FootballMatchState(self.goal_distance(data), self.kick_off_play())
 
     def step_task(self, before: Moment[FootballMatchState], after: Moment[FootballMatchState]) -> FootballMatchState:
-        return FootballMatchState(jnp.minimum(before.state.task.nearest, self.goal_distance(after.state.data)))
+        was = before.state.task
+        nearest = jnp.minimum(was.nearest, self.goal_distance(after.state.data))
+        return FootballMatchState(nearest, self.next_play(was.play, before, after))
 
     def distances(self, now: Moment) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal that each team attacks and to each team's nearest robot (2,), m."""
@@ -274,6 +305,14 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
     def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """A team leads while the ball is in the goal that it attacks."""
         return self.in_goal(state.data)
+
+    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+        """Also, of each team with mates, its `passes` and `both_touched`: a goal after touches by all its robots."""
+        result, play = super().outcome(state, robot_state, failed), state.task.play
+        together = self.in_goal(state.data) & jnp.all(play.touched.reshape(2, -1), axis=1)
+        for team in (0, 1) if self.num_agents > 2 else ():
+            result |= {f"team{team}/passes": play.passes[team], f"team{team}/both_touched": together[team]}
+        return result
 
 
 class Go1Football1vs1(FootballMatch[Football1vs1Params]):

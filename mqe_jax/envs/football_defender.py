@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams
+from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams, Play
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
@@ -55,8 +55,8 @@ class DefenderState:
 
     scored: jax.Array
     """Whether the ball has been in the goal in this episode () bool."""
-    touched: jax.Array
-    """Which of the two robots touched the ball before that (2,) bool."""
+    play: Play
+    """Touches of the ball before that."""
 
 
 class Go1FootballDefender(Football[DefenderState, DefenderParams]):
@@ -90,12 +90,13 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         return commands[None]
 
     def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
-        return DefenderState(jnp.zeros((), bool), jnp.zeros((2,), bool))
+        return DefenderState(jnp.zeros((), bool), self.kick_off_play())
 
     def step_task(self, before: Moment[DefenderState], after: Moment[DefenderState]) -> DefenderState:
         was = before.state.task
-        touched = was.touched | (self.touches(before, after)[:2] & ~was.scored)
-        return DefenderState(was.scored | self.in_goal(after.state.data)[0], touched)
+        play = self.next_play(was.play, before, after)
+        play = jax.tree.map(lambda old, new: jnp.where(was.scored, old, new), was.play, play)
+        return DefenderState(was.scored | self.in_goal(after.state.data)[0], play)
 
     def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.asarray(GOALS[0]), jnp.array([True, True, False])
@@ -130,6 +131,10 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         }
 
     def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: a goal at any time in this episode; `success/both_touched`: one after touches by both robots."""
-        task = state.task
-        return {"success": task.scored, "success/both_touched": task.scored & jnp.all(task.touched)}
+        """Success: a goal at any time in this episode.
+
+        `success/both_touched`: one after touches by both robots; `success/passes`: passes before it.
+        """
+        scored, play = state.task.scored, state.task.play
+        both = scored & jnp.all(play.touched[:2])
+        return {"success": scored, "success/both_touched": both, "success/passes": play.passes[0]}

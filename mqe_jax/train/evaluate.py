@@ -73,7 +73,7 @@ class Result:
     endings: dict[str, float]
     """Fraction of episodes that ended by each cause, from metrics `ending/<name>`."""
     outcomes: dict[str, float]
-    """Other outcomes by name, mean over episodes, from metrics `success/<name>`."""
+    """Other outcomes by name, mean over episodes, from metrics `success/<name>` and, in a match, `team0/<name>`."""
     match: dict[str, float]
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
     about: dict[str, Any] = field(default_factory=dict)
@@ -303,6 +303,8 @@ def _result(task: str, episodes: int, progress: _Progress) -> Result:
     steps = total(progress.steps)
     per_step = {name: total(x) / steps for name, x in progress.step_sums.items()}
     per_episode = {name: total(x) / episodes for name, x in progress.end_sums.items()}
+    match = {name: per_episode[f"team0/{name}"] for name in ("win", "draw", "loss") if f"team0/{name}" in per_episode}
+    others = ((name.partition("/"), x) for name, x in per_episode.items())
     return Result(
         task=task,
         episodes=episodes,
@@ -314,6 +316,6 @@ def _result(task: str, episodes: int, progress: _Progress) -> Result:
         overflow=round(per_step.get("overflow", 0.0) * steps),
         diverged=round(per_episode.get("diverged", 0.0) * episodes),
         endings={n.removeprefix("ending/"): v for n, v in per_episode.items() if n.startswith("ending/")},
-        outcomes={n.removeprefix("success/"): v for n, v in per_episode.items() if n.startswith("success/")},
-        match={f"{n}_rate": per_episode[f"team0/{n}"] for n in ("win", "draw", "loss") if f"team0/{n}" in per_episode},
+        outcomes={n: x for (kind, _, n), x in others if kind in ("success", "team0") and n and n not in match},
+        match={f"{name}_rate": x for name, x in match.items()},
     )
