@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("fake_tasks")
 
 BAD = {
     "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
-    "no command of a skill": (["walk"], ["unknown command 'walk'; allowed: walk train, walk eval, walk convert"]),
+    "no command of a skill": (["walk"], ["unknown command 'walk'", "; allowed: walk train, walk eval, walk convert"]),
     "command of a skill": (["walk", "evl"], ["'walk evl' (did you mean 'walk eval'?); allowed: walk train"]),
     "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "task to train": (["train", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
