@@ -117,6 +117,10 @@ def test_an_interrupt_returns_the_run_so_far(
         assert "interrupted after 32 environment steps" in capfd.readouterr().err
         assert cli.main(["train", "fake", "--run-dir", "other", *SMALL]) == 130
         assert not Path("other", "curve.png").exists()
+    capfd.readouterr()
+    with pytest.raises(InputError, match=r"ppo\.clip: 0\.1 differs from the run in run"):
+        mqe_jax.learn("fake", FEW | {"ppo.clip": 0.1}, run_dir="run", resume=True)
+    assert capfd.readouterr().err == ""  # not even that it compiles
     assert len(mqe_jax.learn("fake", FEW, run_dir="run", resume=True).metrics["success"]) == 2
 
 

@@ -85,7 +85,7 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
 
 
 def _jax_variable(error: ValueError) -> str:
-    """Returns the environment variable whose value JAX rejects where it is imported; empty for another error."""
+    """Returns the environment variable whose value JAX rejects when it is imported; empty for another error."""
     importing, message = "jax" not in sys.modules, str(error).upper()
     return next((name for name in os.environ if importing and name.startswith("JAX_") and name in message), "")
 

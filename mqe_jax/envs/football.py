@@ -154,7 +154,7 @@ class Football(QuadrupedEnv[S, F]):
         touch = self.touches(before, after)
         passed = jnp.any(own & touch, axis=1) & jnp.any(own & play.last, axis=1) & ~jnp.any(touch & play.last)
         last = jnp.where(jnp.any(touch), touch, play.last)
-        return Play(play.touched | touch, last, play.passes + passed)
+        return Play(play.touched | touch, last, play.passes + passed.astype(jnp.int32))
 
     def ball(self, data: mjx.Data) -> jax.Array:
         """Returns the ball's position (3,), m."""
@@ -229,6 +229,7 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
       ball position 3, ball velocity 3.
     - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
     - End: a goal, a fall, or 20 s. Win: a goal, or the opponents' fall.
+    - In 2 vs 2, evaluations count a team's passes, and its goals after touches by both robots.
 
     Source: paper, section III; the released system leaves rewards and observations undefined.
     """

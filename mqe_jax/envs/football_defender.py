@@ -66,6 +66,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     - Observation: one-hot 2, own base info 6, teammate's base info 6, ball position 3, ball velocity 3.
     - Reward: see `DefenderRewards`; shared.
     - End: a fall, or 20 s. Success: a goal, at any time in the episode.
+    - Evaluations count passes before the goal, and goals after touches by both robots.
 
     Source: paper, section III and table of rewards.
     """

@@ -25,14 +25,7 @@ from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_l
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
-from mqe_jax.train.start import (
-    check_parameters,
-    first_state,
-    learned,
-    own_learner,
-    policy_to_start,
-    without_environments,
-)
+from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
 from mqe_jax.train.types import AnyBatch, Matchmaker, VectorEnv, generator
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -122,13 +115,9 @@ def open_training(
         processes.gather([0])  # the others wait for these checks
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
-        if configs[0].start is not None and checkpoints[0] is None:
-            policy_to_start(env.name, processes.whole.params, configs[0])
         total = configs[0].num_updates * configs[0].steps_per_update
         with ProgressLog(configs[0].task or env.name, total, shown=processes.leads) as progress:
-            with progress.doing("compiling"):
-                own = Training(env, learner, processes, configs, folders, checkpoints, eval_env, league, progress)
-            yield own
+            yield Training(env, learner, processes, configs, folders, checkpoints, eval_env, league, progress)
 
 
 class Training:
@@ -159,7 +148,7 @@ class Training:
         self._config, self._processes, self._progress = configs[0], processes, progress
         self._seeds = seeds = Seeds(learner.init, len(configs))
         first = [
-            first_state(env.name, learner, processes, own, path, seeds.shared, league)
+            first_state(env.name, learner, processes, own, path, seeds.shared, league, progress.doing)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stacked(seeds.shared)

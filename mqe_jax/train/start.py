@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,15 +55,17 @@ def first_state(
     checkpoint: Path | None,
     shared: PyTree,
     league: Matchmaker | None = None,
+    doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> tuple[TrainState, float]:
     """Returns this process's initial or restored state and the seconds already spent.
 
-    `learner` has the environments of one process; `shared` as in `Seeds`.
+    `learner` has the environments of one process; `shared` as in `Seeds`; `doing` shows what is done after the checks.
     """
     start = processes.compile(learner.init, start=True)
 
     def init(key: jax.Array) -> TrainState:
-        return processes.own(start(key))
+        with doing("compiling"):
+            return processes.own(start(key))
 
     if checkpoint is None:
         policy = None if config.start is None else policy_to_start(task, processes.whole.params, config)
