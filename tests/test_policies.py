@@ -346,7 +346,8 @@ def test_contract(name: str) -> None:
 def test_what_a_user_makes_says_what_it_is() -> None:
     """The `repr` of environments, wrappers and policies; `dir(mqe_jax)` lists the API."""
     env = make("go1tug", impl="c", num_envs=4, episode_length=3.0, rewards={"push": 4})
-    sizes = "1 vs 1 agents, observation 10, action command 3, engine c"
+    actions = "command 3 (walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5)"
+    sizes = f"1 vs 1 agents, observation 10, action {actions}, engine c"
     task = f"<go1tug: {sizes}, episode_length=3.0, rewards.push=4.0>"
     batch, scripted = VectorEnv(env, 4), load_policy("scripted", env)
     policy = "SimplePolicy(task='go1tug', agents=1, name='scripted')"

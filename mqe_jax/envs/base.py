@@ -131,6 +131,7 @@ class QuadrupedEnv(Task[S, P]):
 
     def __repr__(self) -> str:
         size, actions = self.observation_size, f"{self.control} {self.action_size}"
+        actions += f" ({self.params.commanded_text()})" if self.control == "command" else ""
         agents = " vs ".join(str(len(team)) for team in self.teams)
         changed = [f"{name}={value!r}" for name, value in differences(self.params, self.Params()).items()]
         facts = [f"{agents} agents", f"observation {size}", f"action {actions}", f"engine {self.impl}", *changed]

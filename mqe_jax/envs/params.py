@@ -122,6 +122,11 @@ class TaskParams:
         limits = np.round(default[skill.index(self.commands), None] + changes, 6)
         return {name: (float(low), float(high)) for name, (low, high) in zip(self.commands, limits, strict=True)}
 
+    def commanded_text(self) -> str:
+        """Returns the skill and these ranges, such as `walk: vx -1 to 1`."""
+        ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in self.commanded().items())
+        return f"{self.skill}: {', '.join(ranges)}"
+
 
 P = TypeVar("P", bound=TaskParams)
 """Parameters of a task."""

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
 
-from mqe_jax.envs import TASKS
+from mqe_jax.envs import TASKS, TaskParams
 from mqe_jax.errors import InputError
 from mqe_jax.limits import NonNegative, PositiveInt
 from mqe_jax.settings import PathText, build, checked, override, record, to_mapping
@@ -73,12 +73,11 @@ def card(task: str) -> Card:
     return about
 
 
-def commands(task: str) -> dict[str, Any]:
-    """Returns the skill that a task's shipped policy commands, and the ranges of its commands; errors as `card`."""
+def params(task: str) -> TaskParams:
+    """Returns the parameters with which a task's shipped policy was trained; errors as `card`."""
     card(task)
     config = build(TrainConfig, read_metadata(file_of(task), kind="policy")["config"])
-    params = override(TASKS[task].Params(), {k: v for k, v in config.training_env.items() if k != "control"})
-    return {"skill": params.skill, "commands": params.commanded()}
+    return override(TASKS[task].Params(), {k: v for k, v in config.training_env.items() if k != "control"})
 
 
 def load(task: str) -> TrainedPolicy:
