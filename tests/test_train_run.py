@@ -140,7 +140,7 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
         train(PROBE, settings(), run_dir)
     with pytest.raises(ValueError, match=r"ppo.gamma: 0\.5 differs from the run"):
         train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
-    with pytest.raises(ValueError, match=f"--config {run_dir / 'config.yaml'}"):
+    with pytest.raises(ValueError, match=f"its settings are in {run_dir / 'config.yaml'}"):
         train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     with pytest.raises(ValueError, match=r"total_steps: 16 .* at least"):
         train(PROBE, settings(total_steps=16), run_dir, resume=True)
