@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,19 +12,19 @@ import jax
 from mqe_jax import zoo
 from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
-from mqe_jax.envs.match import Match
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.errors import InputError
 from mqe_jax.league.league import League, Roster
 from mqe_jax.league.sides import BothSides
 from mqe_jax.limits import Seeds
 from mqe_jax.literal import echo
 from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import actions_of, all_agents, load_as, load_policy
-from mqe_jax.settings import Parameters, PathText, check, checked, differences, fail, joined, load_yaml, override
+from mqe_jax.presets import base_config
+from mqe_jax.settings import Parameters, PathText, check, checked, differences, fail, joined, override
 from mqe_jax.train import learner
-from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Act
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
 from mqe_jax.train.learner import Learner, env_dims
@@ -41,9 +40,6 @@ Config = str | Path | TrainConfig | Mapping[str, Any] | None
 """Settings of a training: a shipped name, a file, settings, or changes of the task's default ones."""
 Player = str | Path | Policy | Act | None
 """A policy, its function `act` without recurrent state, or what `load_policy` accepts."""
-
-
-CONFIG_FOLDER = Path(__file__).parent / "configs"
 
 
 @checked(env=Mapping[str, Any] | None, impl=str)
@@ -301,42 +297,6 @@ def run_config(target: str) -> Any:
     return config
 
 
-@functools.cache
-def _parts(file: str) -> dict[str, Any]:
-    """Returns the parts of a shipped file of settings: those `common` to all, and changes of them by name."""
-    return load_yaml(CONFIG_FOLDER / f"{file}.yaml")
-
-
-def preset(algorithm: str) -> dict[str, Any]:
-    """Returns the settings that define an algorithm, those of configs/paper.yaml, for `mqe_jax.settings.override`.
-
-    Raises:
-        InputError: for an unknown name, with the nearest known one.
-    """
-    algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
-    if algorithm not in algorithms:
-        fail("algorithm", algorithm, f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}")
-    return algorithms[algorithm]
-
-
-def named_config(name: str, task: str) -> TrainConfig:
-    """Returns the settings of a file, or of a shipped name; `league` has changes of some tasks."""
-    shipped = ["demo", "league"]
-    shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
-    path, allowed = Path(check("config", name, PathText)), f"a YAML file, or one of {', '.join(shipped)}"
-    if name == "demo":
-        path = CONFIG_FOLDER / "demo.yaml"
-    elif name in shipped:
-        file, _, part = name.partition("/")
-        common = override(TrainConfig(), _parts(file)["common"])
-        return override(common, _parts(file).get(part or task, {}))
-    elif path.suffix not in (".yaml", ".yml") and path.parent == Path("."):
-        raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
-    if not path.is_file():
-        raise InputError(f"config: no file {name!r}; allowed: {allowed}")
-    return load_config(path)
-
-
 def settings_of(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
     """Returns the settings that `mqe_jax.learn` is given, without a task's parameters."""
     if isinstance(config, TrainConfig):
@@ -347,21 +307,6 @@ def settings_of(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
         fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
     task = task.name if isinstance(task, QuadrupedEnv) else task
     return override(base_config(task, None if name is None else str(name), algorithm), changes)
-
-
-def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
-    """Returns the settings of a file or a shipped name, with the algorithm's preset.
-
-    The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks. InputError for a file or an algorithm that is not allowed.
-    """
-    task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
-    if name is None and algorithm is not None:
-        name = f"paper/{algorithm}"
-    elif name is None:
-        match = task in TASKS and issubclass(TASKS[task], Match)
-        name = f"tuned/{task}" if task in _parts("tuned") else "league" if match else "paper/mappo"
-    return override(named_config(name, task), changes)
 
 
 def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:

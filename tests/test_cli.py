@@ -15,15 +15,16 @@ from fake_env import SMALL, FakeEnv
 
 import mqe_jax
 from mqe_jax import build, cli
-from mqe_jax.cli import arguments
-from mqe_jax.cli.train import parse_skill_train, parse_train
+from mqe_jax.cli import arguments, demo
+from mqe_jax.cli.skill_train import parse_skill_train
+from mqe_jax.cli.train import parse_train
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
 from mqe_jax.settings import override
 from mqe_jax.train import checkpoint
-from mqe_jax.train.mat import Mat
+from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
 
@@ -293,6 +294,9 @@ from mqe_jax.cli import main
 assert main(["tasks"]) == 0 and main(["tasks", "--json"]) == 0
 for command in ("eval gogate", "view gogate", "render gogate -o a.gif", "bench gogate", "train gogate", "evl go1gate"):
     assert main(command.split()) == 2
+for command in ("train go1gate --sed 1", "train go1gate --config demo --ppo.epoch 3", "train go1gate --config nobody",
+                "train go1tug --network.name mat --network.head 2", "eval go1gate --sed 1", "view go1gate --sed 1"):
+    assert main(command.split()) == 2
 print({"jax", "mujoco"} & {*sys.modules})
 import mqe_jax
 assert mqe_jax.tasks()
@@ -310,8 +314,9 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     rows = {line.split()[0]: line.split() for line in lines if line.startswith("go1")}
     assert rows["go1gate"][-1] == "shipped" and rows["go1plane"][-1] == "none"
     assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"] and max(map(len, lines)) <= 80
-    errors = done.stderr.splitlines()
-    assert len(errors) == 6 and all("did you mean" in line for line in errors)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("mqe: ")]
+    assert len(errors) == 7 and all("did you mean" in line for line in errors[:6]) and "'nobody'" in errors[6]
+    assert all(f"--{flag}" in done.stderr for flag in ("seed", "ppo.epochs", "network.heads"))
 
 
 def test_a_command_starts_without_what_it_does_not_need() -> None:
@@ -328,9 +333,20 @@ print([name for name in ("glfw", "mqe_jax.study.runs") if name in sys.modules], 
     assert done.stdout.splitlines()[-1] == "[] False"
 
 
+def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    monkeypatch.setattr(demo, "DEMO_TASK", "fake")
+    monkeypatch.setattr(demo, "make_env", fake_env.make_env)
+    small = "task: fake\nnum_envs: 4\nrollout_steps: 8\ntotal_steps: 64\ncheckpoint: {every: 1}\n"
+    Path("small.yaml").write_text(small)
+    for _ in range(2):
+        assert cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
+        assert "no checkpoint" not in capfd.readouterr().err
+    assert json.loads(Path("run/evaluation.json").read_text())["after"]["episodes"] == 4
+
+
 def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:
-    demo = build.base_config("go1seesaw", "demo")
-    assert build.for_task(demo, "go1seesaw").task == "go1seesaw"
+    config = build.base_config("go1seesaw", "demo")
+    assert build.for_task(config, "go1seesaw").task == "go1seesaw"
     assert "the settings are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
-    build.for_task(demo, "go1gate")
+    build.for_task(config, "go1gate")
     assert not capfd.readouterr().err

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from mqe_jax.settings import build
-from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.mat import Mat
-from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.networks import ActorCritic, EnvDims, Mat
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.types import NetworkMemory

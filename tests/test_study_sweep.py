@@ -15,9 +15,9 @@ import yaml
 
 from mqe_jax import build as setup
 from mqe_jax import cli, zoo
-from mqe_jax.build import preset
 from mqe_jax.errors import InputError, NonFiniteError
 from mqe_jax.files import locked
+from mqe_jax.presets import preset
 from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs

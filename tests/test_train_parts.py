@@ -11,10 +11,9 @@ import pytest
 
 from mqe_jax.settings import build
 from mqe_jax.train import nn
-from mqe_jax.train.actor_critic import ActorCritic
 from mqe_jax.train.config import PPO, Curriculum, Imitation, OptimizerSettings, TrainConfig
 from mqe_jax.train.loss import gae
-from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.networks import ActorCritic, EnvDims
 from mqe_jax.train.normalize import (
     running_init,
     running_normalize,

@@ -49,7 +49,7 @@ COMMANDS: dict[str, Any] = {
     "report": study.Report,
     "tournament": study.Tournament,
 }
-"""Arguments by command, or what it does: the arguments in `mqe_jax.cli.train` need the trainer's settings."""
+"""Arguments by command, or what it does, where the arguments depend on others."""
 
 
 def overview(group: str = "") -> str:
@@ -99,14 +99,17 @@ def parse(arguments: Sequence[str]) -> Any:
         known = [f"{group}{each[5:]}" for each in COMMANDS if each.startswith("skill ")] if group else list(COMMANDS)
         name = " ".join(given[: 2 if group else 1])
         raise InputError(f"unknown command {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
-    if isinstance(COMMANDS[name], str):
-        if name == "train" and rest and not rest[0].startswith("-"):
+    if name == "train":
+        if rest and not rest[0].startswith("-"):
             task_id(rest[0])
-        programs.import_mujoco()  # which `train` imports
-        from mqe_jax.cli import launch, train
+        from mqe_jax.cli.train import parse_train
 
-        parsers = {"launch": launch.parse_launch, "train": train.parse_train, "skill train": train.parse_skill_train}
-        return parsers[name](rest)
+        return parse_train(rest)
+    if isinstance(COMMANDS[name], str):
+        programs.import_mujoco()  # which these import
+        from mqe_jax.cli import launch, skill_train
+
+        return {"launch": launch.parse_launch, "skill train": skill_train.parse_skill_train}[name](rest)
     command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
     target = getattr(command, "target", None) or getattr(command, "task", None)
     if isinstance(target, str) and os.sep not in target and not Path(target).exists():

@@ -1,4 +1,7 @@
-"""The commands `train` and `skill train`, whose flags are the training settings with the values they would have."""
+"""The command `train`, whose flags are the training settings with the values they would have.
+
+JAX and MuJoCo are imported when it runs: a wrong flag is named before.
+"""
 
 from __future__ import annotations
 
@@ -6,26 +9,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import pydantic
 import tyro
 
-from mqe_jax import interrupts, robots
-from mqe_jax.build import base_config
-from mqe_jax.cli.options import DumpDiverged, Impl, Robot, TaskOptions
+from mqe_jax import interrupts
+from mqe_jax.cli.options import DumpDiverged, TaskOptions
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Seeds
 from mqe_jax.literal import echo
-from mqe_jax.runs.learning import learn, learn_seeds
-from mqe_jax.settings import fail, override, record
+from mqe_jax.presets import base_config
+from mqe_jax.settings import override, record
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.viz import curves
-from mqe_jax.walk.network import HistorySettings
-from mqe_jax.walk.task import WalkTask
-from mqe_jax.walk.training import SETTINGS, train_skill
 
-_HINT = "resume with the same command and --resume; the run is in {}"
-_MARKERS = (tyro.conf.AvoidSubcommands,)
+HINT = "resume with the same command and --resume; the run is in {}"
+MARKERS = (tyro.conf.AvoidSubcommands,)
 
 
 @record
@@ -73,6 +70,11 @@ class Train(TaskOptions):
 
     def run(self) -> None:
         """Trains into the run folder."""
+        import jax
+
+        from mqe_jax.runs.learning import learn, learn_seeds
+        from mqe_jax.viz import curves
+
         run_dir, seed = self.run_dir or Path("runs") / self.target, self.settings.seed
         options: dict[str, Any] = {"env": self.overrides(), "impl": self.impl, "resume": self.resume}
         options |= {"run_dir": run_dir, "dump_diverged": self.dump_diverged}
@@ -83,47 +85,13 @@ class Train(TaskOptions):
             folders = [run_dir / f"seed{number}" for number in seeds]
             runs = learn_seeds(self.target, self.settings, seeds=seeds, **options)
         if not all(run.finished for run in runs):
-            raise interrupts.Interrupted(_HINT.format(run_dir))
+            raise interrupts.Interrupted(HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
         curves.save_figure(curves.plot_curves([run.metrics for run in runs], self.target), run_dir / "curve.png")
         for folder in folders:
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")
-
-
-@record
-class SkillTrain:
-    """Train a skill's weights, from scratch or from other weights (GPU)."""
-
-    skill: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SKILL"), pydantic.SkipValidation()]  # pyright: ignore[reportCallIssue]
-    """Name of the skill: walk or agile."""
-    settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
-    """Settings of the training."""
-    task: WalkTask = WalkTask()
-    """Parameters of the walking task."""
-    run_dir: Path | None = None
-    """Run folder: SKILL.safetensors (rounded to float16), metrics.csv, checkpoints. Default: runs/SKILL."""
-    resume: bool = False
-    """Continue from the newest checkpoint in the run folder, with environments reset."""
-    weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Weights to start from; may be those of another robot. Default: from scratch."""
-    impl: Impl = "auto"
-    robot: Robot = "go1"
-
-    def run(self) -> None:
-        """Trains the skill into the run folder."""
-        robot, config, run_dir = robots.get(self.robot), self.settings, self.run_dir or Path("runs") / self.skill
-        assert isinstance(config.network, HistorySettings)
-        if self.weights is not None:
-            config.network.form().networks.load(robot, self.weights)
-            config = override(config, {"network.weights": str(self.weights.resolve())})
-        try:
-            train_skill(self.skill, robot, run_dir, config, self.task, impl=self.impl, resume=self.resume)
-        except KeyboardInterrupt:
-            raise interrupts.Interrupted(_HINT.format(run_dir)) from None
-        if jax.process_index() == 0:
-            echo(f"mqe: {run_dir} holds {self.skill}.safetensors, metrics.csv and checkpoints")
 
 
 def parse_train(arguments: Sequence[str]) -> Train:
@@ -144,19 +112,4 @@ def parse_train(arguments: Sequence[str]) -> Train:
     if any(word.split("=")[0] == "--opponent" for word in others):  # tyro would append to those of the file
         settings = override(settings, {"opponents": ()})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
-    return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=_MARKERS)
-
-
-def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
-    """Parses the arguments of `mqe skill train`, where the skill comes first and decides the flags' defaults.
-
-    Raises:
-        InputError: for a skill that cannot be trained.
-        SystemExit: as in `parse_train`.
-    """
-    name = next(iter(arguments), "")
-    if name not in SETTINGS and not {"-h", "--help"}.intersection(arguments):
-        fail("skill", name, f"{' or '.join(SETTINGS)}, before all flags: mqe skill train agile --robot go2")
-    settings, task = SETTINGS.get(name, SETTINGS["walk"])
-    default = SkillTrain(skill=tyro.MISSING, settings=settings, task=task)
-    return tyro.cli(SkillTrain, prog="mqe skill train", args=list(arguments), default=default, config=_MARKERS)
+    return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=MARKERS)

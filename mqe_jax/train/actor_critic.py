@@ -5,50 +5,18 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.limits import Horizon, Positive, Width, Widths
 from mqe_jax.settings import fail
 from mqe_jax.train import devices, nn
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
+from mqe_jax.train.networks import ActorCritic, EnvDims, Evaluation, Network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}
-
-
-@register_network("actor_critic")
-class ActorCritic(GaussianSettings):
-    """Settings of actor and critic: hidden layers, an optional recurrent unit, a Gaussian policy."""
-
-    critic_input: Literal["privileged", "observations", "own"] = "privileged"
-    """Critic input: the privileged observation, all agents' observations, or each agent's own."""
-    share_policy: bool = True
-    """Share one actor between all agents, distinguished only by an id in their observations; else one per agent."""
-    hidden_sizes: Widths = (64,)
-    """Widths of the hidden layers of actor and critic."""
-    activation: Literal["relu", "elu", "tanh"] = "relu"
-    """Activation after each hidden layer."""
-    openrl_layers: bool = False
-    """Add the layers of OpenRL's networks: a normalisation after each hidden layer and after the recurrent unit, and a
-    linear layer with one of its own after the hidden layers."""
-    recurrent: bool = True
-    """Use a gated recurrent unit after the hidden layers of actor and critic."""
-    gru_size: Width = 64
-    """Width of the recurrent unit."""
-    chunk_length: Horizon = 2
-    """Steps of truncated backpropagation through time; used with `recurrent`."""
-    action_gain: Positive = 0.01
-    """Gain of the orthogonal initialisation of the action layer."""
-    action_mean: Literal["linear", "tanh"] = "linear"
-    """Output activation of the mean action: linear (unbounded) or tanh."""
-
-    def build(self, dims: EnvDims) -> Network:
-        """Returns the network; see `Network`."""
-        return _build(self, dims)
 
 
 def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, settings: ActorCritic) -> Params:
@@ -99,7 +67,7 @@ def _trunk(
     return nn.dense(params["head"], x), memory
 
 
-def _build(settings: ActorCritic, dims: EnvDims) -> Network:
+def network(settings: ActorCritic, dims: EnvDims) -> Network:
     agents, share = dims.agents, settings.share_policy
     own = settings.critic_input == "own"
     if own and dims.values != agents:

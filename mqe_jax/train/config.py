@@ -24,9 +24,7 @@ from mqe_jax.limits import (
     Steps,
 )
 from mqe_jax.settings import FileName, FrozenMapping, Parameters, fail, joined, load_yaml, override, record
-from mqe_jax.train.actor_critic import ActorCritic
-from mqe_jax.train.mat import Mat  # noqa: F401  (registers itself)
-from mqe_jax.train.networks import NetworkSettings, network_settings
+from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
 

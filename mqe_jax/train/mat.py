@@ -10,46 +10,16 @@ Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, ga
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.limits import Depth, Positive, Width
 from mqe_jax.settings import fail
 from mqe_jax.train import devices, nn
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
+from mqe_jax.train.networks import EnvDims, Evaluation, Mat, Network
 from mqe_jax.train.types import Memory, NetworkMemory, Params
-
-
-@register_network("mat")
-class Mat(GaussianSettings):
-    """Settings of the multi-agent transformer."""
-
-    blocks: Depth = 1
-    """Blocks of the encoder and of the decoder."""
-    heads: Width = 1
-    """Attention heads; a divisor of `width`."""
-    width: Width = 64
-    """Width of every layer."""
-    gain: Positive = 0.01
-    """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of output layers."""
-    deviation: Literal["sigmoid", "free"] = "sigmoid"
-    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an unconstrained
-    log, the only choice that uses log_std_*.
-    """
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.width % self.heads:
-            fail("heads", self.heads, f"a divisor of width ({self.width})")
-
-    def build(self, dims: EnvDims) -> Network:
-        """Returns the network; see `Network`."""
-        return _build(self, dims)
-
 
 # -- layers ----------------------------------------------------------------------------------------------------------
 
@@ -163,7 +133,7 @@ def log_std_of(params: Params, settings: Mat) -> jax.Array:
     return settings.bounded_log_std(parameter)
 
 
-def _build(settings: Mat, dims: EnvDims) -> Network:
+def network(settings: Mat, dims: EnvDims) -> Network:
     if dims.values != dims.agents:
         fail("ppo.value", "joint", "'agent' with the network 'mat', which has one value per agent")
     heads = settings.heads

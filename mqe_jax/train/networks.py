@@ -9,6 +9,8 @@ saved policy use. To add an architecture, register another settings record:
 
         def build(self, dims: EnvDims) -> Network: ...
 
+The settings import no JAX, so that a wrong flag of `mqe train` is named at once.
+
 Shapes: N environments (or any leading axes), A agents, observations O, privileged observation P, actions D, values V,
 chunks of L steps.
 """
@@ -18,17 +20,16 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, dataclass_transform
-
-import jax
-import jax.numpy as jnp
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 
 from mqe_jax.errors import nearest
-from mqe_jax.limits import NonNegativeInt, PositiveInt
-from mqe_jax.precision import single
+from mqe_jax.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
 from mqe_jax.settings import build, fail, record
-from mqe_jax.train import nn
-from mqe_jax.train.types import Memory, NetworkMemory, Params, where_rows
+
+if TYPE_CHECKING:
+    import jax
+
+    from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 
 class EnvDims(NamedTuple):
@@ -111,6 +112,8 @@ class GaussianSettings(NetworkSettings):
 
     def bounded_log_std(self, parameter: jax.Array) -> jax.Array:
         """Returns the parameter clipped to the bounds by `nn.bounded`."""
+        from mqe_jax.train import nn
+
         low = -math.inf if self.log_std_min is None else self.log_std_min
         high = math.inf if self.log_std_max is None else self.log_std_max
         return nn.bounded(parameter, low, high)
@@ -132,6 +135,8 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
 
         @functools.wraps(build_own)
         def build_single(self: Any, dims: EnvDims) -> Network:
+            from mqe_jax.precision import single
+
             return Network._make(single(part) if callable(part) else part for part in build_own(self, dims))
 
         cls.build = build_single
@@ -158,6 +163,63 @@ def network_settings(value: Any) -> Any:
     return build(NETWORKS[name], value)
 
 
-def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
-    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
-    return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
+@register_network("actor_critic")
+class ActorCritic(GaussianSettings):
+    """Settings of actor and critic: hidden layers, an optional recurrent unit, a Gaussian policy."""
+
+    critic_input: Literal["privileged", "observations", "own"] = "privileged"
+    """Critic input: the privileged observation, all agents' observations, or each agent's own."""
+    share_policy: bool = True
+    """Share one actor between all agents, distinguished only by an id in their observations; else one per agent."""
+    hidden_sizes: Widths = (64,)
+    """Widths of the hidden layers of actor and critic."""
+    activation: Literal["relu", "elu", "tanh"] = "relu"
+    """Activation after each hidden layer."""
+    openrl_layers: bool = False
+    """Add the layers of OpenRL's networks: a normalisation after each hidden layer and after the recurrent unit, and a
+    linear layer with one of its own after the hidden layers."""
+    recurrent: bool = True
+    """Use a gated recurrent unit after the hidden layers of actor and critic."""
+    gru_size: Width = 64
+    """Width of the recurrent unit."""
+    chunk_length: Horizon = 2
+    """Steps of truncated backpropagation through time; used with `recurrent`."""
+    action_gain: Positive = 0.01
+    """Gain of the orthogonal initialisation of the action layer."""
+    action_mean: Literal["linear", "tanh"] = "linear"
+    """Output activation of the mean action: linear (unbounded) or tanh."""
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network; see `Network`."""
+        from mqe_jax.train import actor_critic
+
+        return actor_critic.network(self, dims)
+
+
+@register_network("mat")
+class Mat(GaussianSettings):
+    """Settings of the multi-agent transformer."""
+
+    blocks: Depth = 1
+    """Blocks of the encoder and of the decoder."""
+    heads: Width = 1
+    """Attention heads; a divisor of `width`."""
+    width: Width = 64
+    """Width of every layer."""
+    gain: Positive = 0.01
+    """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of output layers."""
+    deviation: Literal["sigmoid", "free"] = "sigmoid"
+    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an unconstrained
+    log, the only choice that uses log_std_*.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.width % self.heads:
+            fail("heads", self.heads, f"a divisor of width ({self.width})")
+
+    def build(self, dims: EnvDims) -> Network:
+        """Returns the network; see `Network`."""
+        from mqe_jax.train import mat
+
+        return mat.network(self, dims)

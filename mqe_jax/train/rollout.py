@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from mqe_jax.train import devices
 from mqe_jax.train.config import PPO
-from mqe_jax.train.networks import Network, reset_memory
+from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, is_per_episode
+from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, is_per_episode, reset_memory
 
 
 class RolloutState(NamedTuple):

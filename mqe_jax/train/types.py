@@ -151,6 +151,11 @@ def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no)
 
 
+def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
+    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
+    return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
+
+
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
     """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or a class with a `replace` method.
 
