@@ -22,6 +22,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax import cli
 from mqe_jax.cli import launch
+from mqe_jax.cli.arguments import parse
 from mqe_jax.errors import InputError
 from mqe_jax.train import devices
 from mqe_jax.train.checkpoint import list_checkpoints
@@ -363,7 +364,7 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "_gpus", lambda: 0)  # unknown, or no GPU
 
     def members(*flags: str) -> list[dict[str, str]]:
-        return launch.parse_launch([*flags, *TRAIN])._members()
+        return parse(["launch", *flags, *TRAIN])._members()
 
     first, second = members("--processes", "2")
     assert (first["CUDA_VISIBLE_DEVICES"], second["CUDA_VISIBLE_DEVICES"]) == ("4", "5")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 from collections.abc import Sequence
@@ -107,11 +108,25 @@ def parse(arguments: Sequence[str]) -> Any:
         return parse_train(rest)
     if isinstance(COMMANDS[name], str):
         programs.import_mujoco()  # which these import
-        from mqe_jax.cli import launch, skill_train
+        from mqe_jax.cli import skill_train
 
-        return {"launch": launch.parse_launch, "skill train": skill_train.parse_skill_train}[name](rest)
+        return {"launch": _parse_launch, "skill train": skill_train.parse_skill_train}[name](rest)
     command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
     target = getattr(command, "target", None) or getattr(command, "task", None)
     if isinstance(target, str) and os.sep not in target and not Path(target).exists():
         task_id(target)  # before JAX and MuJoCo are imported, which take seconds
     return command
+
+
+def _parse_launch(arguments: Sequence[str]) -> Any:
+    """Parses the arguments of `mqe launch`, those of its command included; errors as `parse`."""
+    from mqe_jax.cli.launch import Launch
+
+    names = {"walk", *(name.split()[0] for name in COMMANDS)}
+    start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
+    launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
+    command = tuple(arguments[start:])
+    if command[:1] not in (("train",), ("sweep",)) and tuple(unaliased(command))[:2] != ("skill", "train"):
+        fail("command", " ".join(command[:2]), "train, skill train or sweep: mqe launch --processes 2 train go1gate")
+    parse(command)
+    return dataclasses.replace(launch, command=command)

@@ -230,4 +230,4 @@ class Demo:
         """Trains, evaluates and renders."""
         from mqe_jax.cli import demo
 
-        demo.demo(self)
+        demo.demo(self.run_dir, self.config, self.episodes, self.impl)

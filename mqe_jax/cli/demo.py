@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
 
 from mqe_jax import interrupts
 from mqe_jax.build import base_config, for_task, make_env
-from mqe_jax.cli.commands import Demo
 from mqe_jax.errors import InputError
 from mqe_jax.files import check_folder, write_atomically
 from mqe_jax.literal import echo
@@ -27,21 +27,17 @@ from mqe_jax.viz.clips import check_output
 DEMO_TASK = "go1gate"
 
 
-def demo(arguments: Demo) -> None:
+def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     """Trains from scratch, evaluates before and after, writes curve and video; resumes an interrupted run."""
-    began, run_dir = time.perf_counter(), arguments.run_dir
-    config = for_task(base_config(DEMO_TASK, arguments.config), DEMO_TASK)
+    began = time.perf_counter()
+    config = for_task(base_config(DEMO_TASK, settings), DEMO_TASK)
     check_folder(run_dir)
     resume = (run_dir / CONFIG_FILE).exists()
-    _, batch = make_env(DEMO_TASK, arguments.impl, config.env, config.num_envs)
+    _, batch = make_env(DEMO_TASK, impl, config.env, config.num_envs)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
-    playing: dict[str, Any] = {"env": config.env, "impl": arguments.impl, "deterministic": True}
-    measure: dict[str, Any] = playing | {
-        "episodes": arguments.episodes,
-        "num_envs": config.num_envs,
-        "seed": config.seed + 1000,
-    }
+    playing: dict[str, Any] = {"env": config.env, "impl": impl, "deterministic": True}
+    measure: dict[str, Any] = playing | {"episodes": episodes, "num_envs": config.num_envs, "seed": config.seed + 1000}
 
     state = jax.jit(make_learner(batch, config).init)(initial_key(config))
     before = policy_of(state, env_dims(batch, config), config, task=DEMO_TASK)
@@ -49,7 +45,7 @@ def demo(arguments: Demo) -> None:
     echo("mqe demo: evaluating the untrained policy")
     table = {"before": evaluate(DEMO_TASK, before, **measure).to_dict()}
     print(f"before training: {_summary(table['before'])}", flush=True)
-    run = learn(DEMO_TASK, config, impl=arguments.impl, run_dir=run_dir, resume=resume)
+    run = learn(DEMO_TASK, config, impl=impl, run_dir=run_dir, resume=resume)
     if not run.finished:
         raise interrupts.Interrupted("the same command resumes from here")
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()

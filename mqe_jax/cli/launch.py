@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import signal
@@ -143,25 +142,6 @@ def _gpus() -> int:
 
 def _listed(visible: str | None) -> list[str]:
     return [word for word in (visible or "").split(",") if word]
-
-
-def parse_launch(arguments: Sequence[str]) -> Launch:
-    """Parses the arguments of `mqe launch`, those of its command included.
-
-    Raises:
-        InputError: without a command that can be launched, or for its arguments.
-        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
-    """
-    from mqe_jax.cli.arguments import COMMANDS, parse, unaliased
-
-    names = {"walk", *(name.split()[0] for name in COMMANDS)}
-    start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
-    launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
-    command = tuple(arguments[start:])
-    if command[:1] not in (("train",), ("sweep",)) and tuple(unaliased(command))[:2] != ("skill", "train"):
-        fail("command", " ".join(command[:2]), "train, skill train or sweep: mqe launch --processes 2 train go1gate")
-    parse(command)
-    return dataclasses.replace(launch, command=command)
 
 
 def join() -> None:
