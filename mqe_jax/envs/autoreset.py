@@ -128,7 +128,7 @@ class VectorEnv(Batch):
         Raises:
             InputError: as `QuadrupedEnv.step`, and for another number of environments.
         """
-        self.check_step(state, action, State)
+        self.check_step(state, action, self.env.state_type)
 
         def one(state: State, action: jax.Array) -> State:
             return autoreset(self.env, self.env.step(state, action))

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 class QuadrupedEnv(Task[S, P]):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
+    state_type = State
+
     @single
     def __init__(
         self, params: P | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096

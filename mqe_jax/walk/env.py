@@ -46,6 +46,7 @@ class WalkEnv:
     num_agents = 1
     teams = ((0,),)
     action_size = NUM_JOINTS
+    state_type = WalkState
 
     def __init__(
         self,
