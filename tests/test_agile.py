@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import agile
+from mqe_jax import agile, make
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import Proprioception
 from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
@@ -166,3 +166,17 @@ def test_errors_are_means_over_a_gait_cycle_a_second_after_a_change_of_command()
     commands[..., 4] = hertz
     found = _cycles(errors, alive, commands, 100)
     assert found == pytest.approx({"vx": 0.0, "vy": 0.3, "yaw": 0.0}, abs=1e-9)
+
+
+@pytest.mark.parametrize("robot", ["go1", "go2"])
+def test_the_shipped_weights_run_as_commanded(robot: str) -> None:
+    ranges = {"vx": (-1.5, 2.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
+    params: dict[str, Any] = {"robot": robot, "skill": "agile", "command_ranges": ranges, "num_agents": 1}
+    env = make("go1plane", impl="c", num_envs=1, **params)
+
+    def step(state: Any, _: None) -> Any:
+        state = env.step(state, jnp.array([[1.0, 0.0, 0.0]]))
+        return state, env.read(state.data).position_w[0, :2]
+
+    position = jax.lax.scan(step, jax.jit(env.reset)(jax.random.PRNGKey(0)), None, 151)[1]
+    assert float(jnp.linalg.norm(position[150] - position[100])) == pytest.approx(2.0, abs=0.2)  # m in 1 s
