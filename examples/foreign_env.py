@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from mqe_jax.settings import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.runner import train
+from mqe_jax.train.types import Outcome
 
 
 class State(NamedTuple):
@@ -36,6 +37,8 @@ class State(NamedTuple):
     """Whether an episode terminated (N,)."""
     truncated: jax.Array
     """Whether an episode was truncated at the time limit (N,)."""
+    outcome: Outcome
+    """How episodes ended."""
     metrics: dict[str, jax.Array]
     """Metrics by name (N,) each."""
 
@@ -69,11 +72,13 @@ class Meeting:
         position = jax.random.uniform(draw, (self.num_envs, 2, 2), minval=-1.0)
         obs, privileged = self.observe(position)
         zero = jnp.zeros(self.num_envs)
-        metrics = {"average_step_reward": zero, "success": zero, "success/distance": zero}
-        done, step = zero > 0, zero.astype(jnp.int32)
-        return State(
-            position, step, key, obs, privileged, obs, privileged, jnp.zeros((self.num_envs, 2)), done, done, metrics
-        )
+        done, step, reward = zero > 0, zero.astype(jnp.int32), jnp.zeros((self.num_envs, 2))
+        results = self.outcome(zero), {"average_step_reward": zero}
+        return State(position, step, key, obs, privileged, obs, privileged, reward, done, done, *results)
+
+    def outcome(self, apart: jax.Array) -> Outcome:
+        """Returns success, and the distance, m, of the only team (N, 1) each."""
+        return Outcome(success=(apart < 0.1).astype(jnp.float32)[:, None], further={"distance": apart[:, None]})
 
     def step(self, state: State, action: jax.Array) -> State:
         """Moves the agents, with automatic reset."""
@@ -95,11 +100,8 @@ class Meeting:
             reward=-jnp.stack([apart, apart], axis=-1),
             terminated=jnp.zeros_like(truncated),
             truncated=truncated,
-            metrics={
-                "average_step_reward": -apart,
-                "success": (apart < 0.1).astype(jnp.float32),
-                "success/distance": apart,
-            },
+            outcome=self.outcome(apart),
+            metrics={"average_step_reward": -apart},
         )
 
 

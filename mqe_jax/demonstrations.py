@@ -104,8 +104,7 @@ class Demonstrated(VectorEnv):
             action, memory = policy.act(state.obs, memory, key)
             state = guide.step(state, action)
             done = state.terminated | state.truncated
-            decided = jnp.maximum(state.metrics["success"], state.metrics.get("team1/win", 0.0))
-            return (state, where_rows(done, first, memory)), (decided, done)
+            return (state, where_rows(done, first, memory)), (jnp.max(state.outcome.success, axis=-1), done)
 
         def moment(carry: tuple[State, Any], keys: jax.Array) -> tuple[tuple[State, Any], PyTree]:
             carry, seen = jax.lax.scan(advance, carry, keys)

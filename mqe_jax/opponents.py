@@ -22,9 +22,6 @@ from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
 from mqe_jax.train.types import AnyBatch, AnyPolicy, Memory, PyTree, RandomKey, check_act, where_rows
 
-OUTCOMES = ("win", "draw", "loss")
-"""Outcomes of an episode for team 0, in the order of `Opponent.outcomes`."""
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +37,7 @@ class Opponent:
     memory: Memory
     """Recurrent state, leading axis B."""
     outcomes: jax.Array
-    """Episodes that team 0 won, drew and lost against it (3,) int32."""
+    """Episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`."""
 
 
 @jax.tree_util.register_dataclass
@@ -137,7 +134,7 @@ class Versus(OneTeam):
         both = jnp.concatenate([jnp.asarray(action, jnp.float32), theirs], axis=1)
         match = self._stepped(state, both)
         done = match.terminated | match.truncated
-        ended = jnp.stack([done & (match.metrics[f"team0/{name}"] > 0) for name in OUTCOMES], axis=-1)
+        ended = done[:, None] & (match.outcome.result[:, 0] > 0)
         match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32))
         started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
         return self._seen(match, both, started, key)
@@ -208,6 +205,7 @@ class Versus(OneTeam):
             reward=match.reward[:, own],
             terminated=match.terminated,
             truncated=match.truncated,
+            outcome=match.outcome.by_team(lambda x: x[:, :1]),
             metrics={name: value for name, value in match.metrics.items() if not name.startswith("team1/")},
             step=match.step,
             assistance=match.assistance,
@@ -247,7 +245,7 @@ def versus(
 class Mirror(OneTeam):
     """N matches as 2 N environments of one team, the two of each match side by side: one policy learns as both.
 
-    The privileged observation has one more number, the index of the team. The metrics are those of team 0 for both;
+    The privileged observation has one more number, the index of the team. Outcome and metrics are those of team 0;
     `diverged` and `overflow` are counted for the first.
     """
 
@@ -291,6 +289,7 @@ class Mirror(OneTeam):
             reward=teams(match.reward),
             terminated=twice(match.terminated),
             truncated=twice(match.truncated),
+            outcome=jax.tree.map(twice, match.outcome.by_team(lambda x: x[:, :1])),
             metrics=metrics,
             step=twice(match.step),
             assistance=twice(match.assistance),

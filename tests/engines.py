@@ -164,7 +164,8 @@ def one_step(task: str, robot: str, control: str, engine: str) -> tuple[dict[str
         env, *arrays = stepped(task, robot, control)
     states, action, after = jax.device_get(arrays)
     moved = after.data.qvel[:, env.index.joint_qvel]
-    shown = (after.obs, after.privileged_obs, after.reward, *after.metrics.values(), after.data.qpos, after.data.qvel)
+    metrics = {**after.metrics, **after.outcome.named()}
+    shown = (after.obs, after.privileged_obs, after.reward, *metrics.values(), after.data.qpos, after.data.qvel)
     wrong = [] if all(np.all(np.isfinite(leaf)) for leaf in shown) else ["not finite"]
     wrong += [] if after.obs.shape == (ENVS, env.num_agents, env.observation_size) else [f"obs {after.obs.shape}"]
     wrong += [] if np.ptp(moved, axis=0).max() > 1e-3 else ["two actions have the same effect"]

@@ -22,6 +22,7 @@ from mqe_jax import build
 from mqe_jax.cli import launch, main
 from mqe_jax.envs import TASKS, EnvironmentState
 from mqe_jax.train import devices
+from mqe_jax.train.types import Outcome
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 """Flags of a training that ends within seconds."""
@@ -84,10 +85,10 @@ class FakeEnv:
         start = model.qpos0, model.body_pos[mocap], model.body_quat[mocap], np.zeros(model.nu), np.zeros(model.nv)
         data: FakeData = FakeData(*(jnp.asarray(x, jnp.float32) for x in start))
         zero, obs = jnp.zeros(()), data.qpos[self.robot_x][:, None]
-        names = ("reward/progress", "average_step_reward", "success", "diverged", "overflow")
-        metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
+        names = ("reward/progress", "average_step_reward", "diverged", "overflow")
+        results = Outcome(zero[None]), dict.fromkeys(names, zero)
         seen = obs, obs[:, 0], obs, obs[:, 0]
-        return FakeState(*seen, jnp.zeros(2), false, false, metrics, jnp.int32(0), zero, key, data)
+        return FakeState(*seen, jnp.zeros(2), false, false, *results, jnp.int32(0), zero, key, data)
 
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
         move = 0.1 * jnp.clip(action[:, 0], -1.0, 1.0)
@@ -97,14 +98,14 @@ class FakeEnv:
         metrics = {
             "reward/progress": total,
             "average_step_reward": total,
-            "success": jnp.all(obs > 1.2).astype(jnp.float32),
             "diverged": jnp.zeros(()),
             "overflow": (qpos[0] > self.overflow_x).astype(jnp.float32),
         }
         end, data = state.step >= 9, dataclasses.replace(state.data, qpos=qpos)
         seen = {"obs": obs, "privileged_obs": obs[:, 0], "final_obs": obs, "final_privileged_obs": obs[:, 0]}
-        reward, step = jnp.full(2, total), state.step + 1
-        return dataclasses.replace(state, data=data, **seen, reward=reward, truncated=end, metrics=metrics, step=step)
+        seen |= {"reward": jnp.full(2, total), "truncated": end, "metrics": metrics, "step": state.step + 1}
+        outcome = Outcome(jnp.all(obs > 1.2).astype(jnp.float32)[None])
+        return dataclasses.replace(state, data=data, **seen, outcome=outcome)
 
 
 class FakeVectorEnv:

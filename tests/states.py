@@ -73,7 +73,7 @@ def _with(state: State, **fields: np.ndarray) -> State:
 
 def ending(state: State) -> list[str]:
     """Returns how the episode ended, or nothing while it continues."""
-    return [name.removeprefix("ending/") for name in ENDINGS if state.metrics[name]]
+    return [name for name in ENDINGS if state.outcome.ending[name]]
 
 
 def moving(env: Any, state: State, velocity: Sequence[float | jax.Array]) -> State:

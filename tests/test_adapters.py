@@ -231,6 +231,7 @@ def test_team_0_plays_the_same_match_and_sees_its_own_half() -> None:
         np.testing.assert_allclose(half.reward, whole.reward[:1], atol=1e-6)
     assert bool(half.truncated)
     assert set(half.metrics) == {name for name in whole.metrics if not name.startswith("team1/")}
+    assert half.outcome.win.shape == (1,)
     restarted: Any = jax.jit(lambda state: autoreset(team, state))(half)  # type: ignore[arg-type]
     assert int(restarted.step) == 0 and restarted.rival_obs.shape == half.rival_obs.shape
     assert np.abs(restarted.obs - half.obs).max() > 1e-4

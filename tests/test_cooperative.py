@@ -67,7 +67,7 @@ def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, gate
     assert float(gate.outcome(state, both, fine)["success"]) == 1
     assert float(gate.outcome(state, both, ~fine)["success"]) == 0
     assert float(gate.outcome(state, one, fine)["success"]) == 0
-    assert float(gate.outcome(state, one, fine)["success/one"]) == 1
+    assert float(gate.outcome(state, one, fine)["one"]) == 1
 
 
 # -- endings of every task: a fall, the time limit, and a collision in the tasks that end on one -----------------------
@@ -258,7 +258,7 @@ def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: S
     assert float(env.outcome(fresh, up, fine)["success"]) == 1
     assert float(env.outcome(fresh, up, ~fine)["success"]) == 0
     assert float(env.outcome(fresh, below, fine)["success"]) == 0
-    assert float(env.outcome(fresh, up, fine)["success/height"]) == pytest.approx(1.3)
+    assert float(env.outcome(fresh, up, fine)["height"]) == pytest.approx(1.3)
 
 
 def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(env: Any, step: Any, fresh: State) -> None:
@@ -318,7 +318,7 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
     tipped = stand(on_plank(7.0), SPAWN[1], (-0.25, 0.0))
     assert angle(env, tipped) > -0.22
     up = stand([8.0, 0.0, 1.31], SPAWN[1], (0.0, 0.0))
-    assert float(up.metrics["success"]) == 1 and angle(env, up) == pytest.approx(-0.25, abs=1e-3)
+    assert float(up.outcome.success[0]) == 1 and angle(env, up) == pytest.approx(-0.25, abs=1e-3)
     assert float(env.read(up.data).position_w[0, 2]) == pytest.approx(1.3, abs=0.03)
 
 
@@ -335,7 +335,7 @@ def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
         action = jnp.where(partner, action, action.at[:, 1].set(0.0))
         state = jax.vmap(env.step)(state, action)
         ends = (state.terminated | state.truncated) & ~over
-        return (state, over | ends, won | (ends & (state.metrics["success"] > 0))), None
+        return (state, over | ends, won | (ends & (state.outcome.success[0] > 0))), None
 
     @jax.jit
     def play(key: jax.Array) -> Any:

@@ -350,6 +350,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "no weights": ({"Params": TaskParams}, "Params = TaskParams: no field rewards"),
     "outcome": ({"outcome": lambda *_: {"success": jnp.zeros(2)}}, r"outcome: success: \(2,\) float32; expected \(\)"),
     "no outcome": ({"outcome": lambda *_: None}, "outcome: None; expected numbers by name"),
+    "no success": ({"outcome": lambda *_: {"one": 1.0}}, r"outcome: \['one'\]; expected success, and further results"),
     "ending": ({"ending": lambda *_: jnp.zeros(())}, r"ending: \(\) float32; expected \(\) bool"),
     "own fields": ({"step_task": lambda *_: jnp.zeros(3)}, r"step_task: \(3,\) float32; expected as before, None"),
 }

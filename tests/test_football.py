@@ -203,11 +203,9 @@ def test_goals_at_both_ends(duel: Any, fresh: Any, ball: tuple[float, float], go
     robots = duel.read(state.data)
     np.testing.assert_array_equal(duel.leading(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
-    outcome = duel.outcome(state, robots, NO)
-    assert [float(outcome[f"team{team}/win"]) for team in (0, 1)] == list(goals)
-    assert [float(outcome[f"team{team}/loss"]) for team in (1, 0)] == list(goals)
-    assert float(outcome["team0/draw"]) == float(outcome["team1/draw"]) == 1 - sum(goals)
-    assert float(outcome["success"]) == goals[0]
+    outcome = duel.result(state, robots, NO)
+    assert outcome.win.tolist() == outcome.success.tolist() == outcome.loss[::-1].tolist() == list(map(bool, goals))
+    assert outcome.draw.tolist() == [sum(goals) == 0] * 2
 
 
 def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh: Any) -> None:
@@ -238,14 +236,14 @@ def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
     play = duel_step(state, still(duel))
     assert not play.terminated and not play.truncated
     late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), still(duel))
-    assert late.truncated and not late.terminated and float(late.metrics["team0/draw"]) == 1
+    assert late.truncated and not late.terminated and late.outcome.draw.tolist() == [1, 1]
     fallen = duel_step(standing(duel, state, places, roll=1.0), still(duel))
-    assert fallen.terminated and float(fallen.metrics["team0/loss"]) == 1 and float(fallen.metrics["team1/win"]) == 1
+    assert fallen.terminated and fallen.outcome.win.tolist() == [0, 1]
     assert float(fallen.metrics["reward/fall"]) == -10
     np.testing.assert_allclose(fallen.reward[0], -fallen.reward[1], atol=1e-6)
     for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
         goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), still(duel))
-        assert goal.terminated and float(goal.metrics["team0/win"]) == (sign == 1) and ending(goal) == ["task"]
+        assert goal.terminated and float(goal.outcome.win[0]) == (sign == 1) and ending(goal) == ["task"]
         assert float(goal.metrics["reward/goal"]) == 10 * sign
         np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
 
@@ -260,11 +258,11 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
     assert terms_of(attack, state, own)[0]["goal"] == 0
     # A goal counts until the end of the episode, also when the ball comes out again.
     scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), still(attack))
-    assert float(scored.metrics["success"]) == 1 and not scored.terminated
+    assert float(scored.outcome.success[0]) == 1 and not scored.terminated
     out = attack_step(with_ball(attack, scored, (11.0, 0.5)), still(attack))
-    assert float(out.metrics["success"]) == 1 and float(out.metrics["reward/goal"]) == 0
+    assert float(out.outcome.success[0]) == 1 and float(out.metrics["reward/goal"]) == 0
     late = attack_step(dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)), still(attack))
-    assert late.truncated and not late.terminated and float(late.metrics["success"]) == 0
+    assert late.truncated and not late.terminated and float(late.outcome.success[0]) == 0
     fallen = standing(attack, state, [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)], roll=1.0)
     assert attack_step(fallen, still(attack)).terminated
     assert [int(terms_of(attack, state, after)[0]["fall"]) for after in (state, fallen)] == [0, 1]
@@ -307,11 +305,9 @@ def test_passes_and_goals_of_both(envs: dict[str, Any], fresh: Any, task: str, t
         after = with_ball(env, standing(env, state, places), ball, (speed, 0.0, 0.0))
         state = dataclasses.replace(after, task=env.step_task(moment(env, state), moment(env, after)))
     first, second, both = TOUCHES[touching]
-    outcome = env.outcome(state, env.read(state.data), NO)
-    expected: dict[str, Any] = {"success/passes": first, "success/both_touched": both}
-    if task == TASKS[2]:
-        expected = {"team0/passes": first, "team1/passes": second, "team0/both_touched": both}
-    assert {name: outcome[name].item() for name in expected} == expected
+    outcome = env.result(state, env.read(state.data), NO)
+    assert float(outcome.further["both_touched"][0]) == both
+    assert outcome.further["passes"].tolist() == ([first, second] if task == TASKS[2] else [first])
 
 
 # -- the defender -----------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from mqe_jax.settings import to_mapping
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Rate, evaluate_batch
 from mqe_jax.train.runner import Training
+from mqe_jax.train.types import Outcome
 from tests.training import assert_same
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
@@ -266,7 +267,7 @@ def test_halves_of_the_environments_play_equally_many_episodes() -> None:
     class Halves(FakeVectorEnv):
         def step(self, state: Any, action: jax.Array) -> Any:
             after = super().step(state, action)
-            return dataclasses.replace(after, metrics=after.metrics | {"success": 1.0 * (jnp.arange(4) >= 2)})
+            return dataclasses.replace(after, outcome=Outcome(1.0 * (jnp.arange(4) >= 2)[:, None]))
 
     policy = mqe_jax.load_policy("idle", FakeEnv())  # pyright: ignore[reportArgumentType, reportCallIssue]
     assert evaluate_batch(Halves(FakeEnv(), 4), policy, 6, jax.random.PRNGKey(0)).success_rate == 0.5

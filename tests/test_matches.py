@@ -29,11 +29,10 @@ def stepped(env: QuadrupedEnv, state: Any) -> Any:
 
 def result(env: Any, state: Any) -> tuple[float, float]:
     """Wins of both teams, as if the episode ended now."""
-    out = env.outcome(state, env.read(state.data), jnp.array(False))
-    assert float(out["team0/win"] + out["team0/draw"] + out["team0/loss"]) == 1
-    assert float(out["team0/win"]) == float(out["team1/loss"]) and float(out["team0/draw"]) == float(out["team1/draw"])
-    assert float(out["success"]) == float(out["team0/win"])
-    return float(out["team0/win"]), float(out["team1/win"])
+    out = env.result(state, env.read(state.data), jnp.array(False))
+    assert out.result.sum(axis=1).tolist() == [1, 1]
+    assert out.win.tolist() == out.loss[::-1].tolist() == out.success.tolist()
+    return float(out.win[0]), float(out.win[1])
 
 
 @pytest.mark.parametrize("task", MATCHES)
@@ -159,8 +158,7 @@ def test_a_diverged_match_is_a_draw() -> None:
     state = dataclasses.replace(state, data=state.data.replace(qvel=jnp.full_like(state.data.qvel, jnp.nan)))
     after = stepped(env, state)
     assert after.terminated and float(after.metrics["diverged"]) == 1
-    for team in ("team0", "team1"):
-        assert [float(after.metrics[f"{team}/{name}"]) for name in ("win", "draw", "loss")] == [0, 1, 0]
+    assert after.outcome.result.tolist() == [[0, 1, 0]] * 2
 
 
 @pytest.mark.parametrize("task", ["go1revolvingdoor", "go1wrestling", "go1bridge"])

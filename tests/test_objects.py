@@ -195,7 +195,7 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
     np.testing.assert_allclose(reward, [10 * 0.05 + 1] * 2, atol=1e-4)
     assert float(box_env.outcome(behind, robots, no)["success"]) == 1
     start = dataclasses.replace(behind, task=dataclasses.replace(behind.task, start=jnp.float32(2.2)))
-    assert float(box_env.outcome(start, robots, no)["success/distance"]) == pytest.approx(2.32, abs=1e-4)
+    assert float(box_env.outcome(start, robots, no)["distance"]) == pytest.approx(2.32, abs=1e-4)
 
 
 def test_pushbox_observation(box_env: Any) -> None:

@@ -96,7 +96,7 @@ def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
     np.testing.assert_allclose(state.action[:, 1, 0], [0.0, 0.25, 0.0, 0.25])
     np.testing.assert_array_equal(state.obs, state.match.obs[:, :1])
     np.testing.assert_array_equal(state.reward, state.match.reward[:, :1])
-    assert {"team0/win", "team0/loss", "success"} <= set(state.metrics) and "team1/win" not in state.metrics
+    assert {"team0/win", "team0/loss", "success"} <= set(state.outcome.named()) and state.outcome.win.shape == (4, 1)
 
 
 def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
@@ -194,11 +194,11 @@ def test_the_trainer_sees_one_team(kind: str) -> None:
     assert (dims.agents, dims.values) == (inner.num_agents // 2, 1)
     if kind == "versus":
         metrics = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))[1]
-        assert {"team0/win", "team0/draw", "team0/loss"} <= metrics.keys()
+        assert {"team0/win", "team0/draw", "team0/loss"} <= metrics["ended"].keys()
         return
     _, metrics = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
-    assert float(metrics["episodes"]) >= 2
-    outcomes = [float(metrics[f"team0/{name}"]) for name in ("win", "draw", "loss")]
+    assert float(metrics["ended"]["episodes"]) >= 2
+    outcomes = [float(metrics["ended"][f"team0/{name}"]) for name in ("win", "draw", "loss")]
     assert sum(outcomes) == pytest.approx(1.0)
     assert np.isfinite(float(metrics["loss/policy"]))
 
@@ -220,6 +220,7 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
     exchanged = action.at[2:].set(action[2:, ::-1])
     plain, state = inner.reset(KEY), env.reset(KEY)
     step, plain_step = jax.jit(env.step), jax.jit(inner.step)
+    results = lambda state: (state.outcome.success, state.outcome.result)  # noqa: E731
     for _ in range(6):
         plain, state = plain_step(plain, exchanged), step(state, action)
         for name in ("obs", "final_obs", "reward"):
@@ -232,9 +233,9 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
         np.testing.assert_allclose(state.metrics["average_step_reward"], state.reward[:, 0], atol=1e-7)
         terms = [value for name, value in state.metrics.items() if name.startswith("reward/")]
         np.testing.assert_allclose(sum(terms), state.reward[:, 0], atol=1e-6)
-        np.testing.assert_array_equal(state.metrics["team0/win"][2:], plain.metrics["team1/win"][2:])
-        np.testing.assert_array_equal(state.metrics["team1/win"][2:], plain.metrics["team0/win"][2:])
-        np.testing.assert_array_equal(state.metrics["success"], state.metrics["team0/win"])
+        for own, theirs in zip(jax.tree.leaves(results(state)), jax.tree.leaves(results(plain)), strict=True):
+            np.testing.assert_array_equal(own[:2], theirs[:2])
+            np.testing.assert_array_equal(own[2:], theirs[2:, ::-1])
         assert bool(jnp.any(jnp.abs(jnp.sum(state.reward, axis=1)) > 1e-4))
 
 

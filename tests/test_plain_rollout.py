@@ -18,7 +18,7 @@ from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, rollout
-from mqe_jax.train.types import NetworkMemory
+from mqe_jax.train.types import RESULTS, NetworkMemory, Outcome
 from tests import training as probes
 from tests.states import made
 from tests.test_opponents import matches
@@ -40,15 +40,17 @@ class Rich(Probe):
 
     def _more(self, state: probes.ProbeState) -> probes.ProbeState:
         number, step = jnp.arange(self.num_envs), state.step
-        more = {
-            "success/way": state.hidden + number,
-            "ending/fall": (step + number) % 2 == 0,
-            "team0/draw": (step + number) % 3 == 0,
-            "pace": state.reward[:, 1],
-        }
-        more |= {"team0/loss": number == 1, "diverged": (number + 2 * step) % 3 == 1, "reward/way": state.reward[:, 0]}
+        teams = {"draw": (step + number) % 3 == 0, "loss": number == 1}
+        outcome = Outcome(
+            state.outcome.success,
+            state.outcome.success,
+            **{name: x.astype(jnp.float32)[:, None] for name, x in teams.items()},
+            further={"way": (state.hidden + number)[:, None]},
+            ending={"fall": ((step + number) % 2 == 0).astype(jnp.float32)},
+        )
+        more = {"pace": state.reward[:, 1], "diverged": (number + 2 * step) % 3 == 1, "reward/way": state.reward[:, 0]}
         metrics = {**state.metrics, **{name: x.astype(jnp.float32) for name, x in more.items()}}
-        return dataclasses.replace(state, metrics=metrics)
+        return dataclasses.replace(state, outcome=outcome, metrics=metrics)
 
 
 def pay_differently(hidden: jax.Array, action: jax.Array) -> jax.Array:
@@ -124,25 +126,18 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
                 episodes[n] = Episode(episodes[n].steps + 1, episodes[n].total + float(now.reward[n].mean()))
                 for name, x in now.metrics.items():
                     rows.setdefault(name, []).append(float(x[n]))
-                    if first[n]:
-                        ends.setdefault(name, []).append(float(x[n]))
                 if first[n]:
+                    for name, x in now.outcome.named().items():
+                        ends.setdefault(name, []).append(float(x[n]))
                     ends.setdefault("episode_length", []).append(episodes[n].steps)
                     ends.setdefault("episode_return", []).append(episodes[n].total)
                     episodes[n] = Episode()
         expected = {name: np.mean(values) for name, values in rows.items()}
         expected |= {name: np.sum(rows[name]) for name in ("diverged", "overflow")}
-        outcomes = (
-            "success",
-            "success/way",
-            "ending/fall",
-            "team0/win",
-            "team0/draw",
-            "team0/loss",
-            "episode_length",
-            "episode_return",
-        )
-        expected |= {name: np.mean(ends[name]) for name in outcomes} | {"episodes": len(ends["success"])}
+        outcomes = {"success", "success/way", "ending/fall", *(f"team0/{name}" for name in RESULTS)}
+        assert set(ends) == {*outcomes, "episode_length", "episode_return"}
+        metrics |= metrics.pop("ended")
+        expected |= {name: np.mean(values) for name, values in ends.items()} | {"episodes": len(ends["success"])}
         assert set(metrics) == set(expected)
         for name, x in expected.items():
             np.testing.assert_allclose(metrics[name], x, rtol=1e-5, atol=1e-6, err_msg=name)
@@ -170,7 +165,7 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
             now, memory = step(now, jnp.asarray(action, jnp.float32)), memory + 0.5
             done = np.asarray(now.terminated | now.truncated)
             for n in np.flatnonzero(left):
-                rows.append({name: float(x[n]) for name, x in now.metrics.items()})
+                rows.append({name: float(x[n]) for name, x in (now.metrics | now.outcome.named()).items()})
                 rewards.append(float(now.reward[n, 1]))
                 if done[n]:
                     ends.append(rows[-1])

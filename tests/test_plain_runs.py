@@ -16,7 +16,6 @@ import pytest
 from mqe_jax import demonstrations
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.league import league, pool, tournament
-from mqe_jax.opponents import OUTCOMES
 from mqe_jax.policies import SimplePolicy
 from mqe_jax.settings import build, to_mapping
 from mqe_jax.train import learner as learning
@@ -27,6 +26,7 @@ from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
+from mqe_jax.train.types import RESULTS, Outcome
 from tests import training as probes
 from tests.training import Probe
 
@@ -68,8 +68,8 @@ class Help:
 
     def _state(self, assistance: jax.Array) -> Fields:
         obs, done = jnp.zeros((N, 1, 1)), jnp.ones(N, bool)
-        metrics = {"pay": assistance, "success": (assistance <= self.needed).astype(jnp.float32)}
-        rest = metrics, jnp.zeros(N, jnp.int32), assistance, KEY
+        outcome = Outcome((assistance <= self.needed).astype(jnp.float32)[:, None])
+        rest = outcome, {"pay": assistance}, jnp.zeros(N, jnp.int32), assistance, KEY
         return Fields(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, *rest)
 
 
@@ -185,9 +185,10 @@ class Matches:
 
     def _state(self, step: jax.Array) -> Fields:
         done, result = step % 2 == 0, jnp.where(step <= 2, jnp.arange(12) % 3, 0)
-        metrics = {f"team0/{name}": (result == i).astype(jnp.float32) for i, name in enumerate(OUTCOMES)}
+        first = {name: (result == i).astype(jnp.float32) for i, name in enumerate(RESULTS)}
+        outcome = Outcome(**{name: jnp.stack([x, jnp.zeros(12)], axis=-1) for name, x in first.items()})
         obs, none = jnp.zeros((12, 2, 1)), jnp.zeros((12, 1))
-        rest = jnp.zeros((12, 2)), done, jnp.zeros(12, bool), metrics, step, none[:, 0], KEY
+        rest = jnp.zeros((12, 2)), done, jnp.zeros(12, bool), outcome, {}, step, none[:, 0], KEY
         return Fields(obs, none, obs, none, *rest)
 
 
@@ -204,9 +205,8 @@ class Decided(Matches):
 
     def _state(self, step: jax.Array) -> Fields:
         state, late = super()._state(step), step >= 6
-        metrics = {"success": late & (jnp.arange(12) % 3 == 0), "team1/win": late & (jnp.arange(12) % 3 == 1)}
-        metrics = {name: value.astype(jnp.float32) for name, value in metrics.items()}
-        return dataclasses.replace(state, metrics=metrics, terminated=step == 8)
+        won = [late & (jnp.arange(12) % 3 == team) for team in (0, 1)]
+        return dataclasses.replace(state, outcome=Outcome(1.0 * jnp.stack(won, axis=-1)), terminated=step == 8)
 
 
 def test_phases_of_a_match_lead_to_either_teams_win(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -329,7 +329,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
     config = config_of(name)
     random = np.random.default_rng(5)
     (env, state), data = drawn(random, config, updates)
-    monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, data, {}))
+    monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, data, {"ended": {"episodes": 0.0}}))
     length = config.network.build(learning.env_dims(env, config)).chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
     monkeypatch.setattr(learning, "minibatches", lambda *_: jnp.asarray(order))

@@ -100,7 +100,7 @@ def check_graphs(built: SimpleNamespace, steps: int) -> set[str]:
     kept = np.delete(np.arange(steps), steps - 2)  # without the state in which the robot is turned over
     wanted = [seen["states"][1 + row] for row in kept]
     verdict = {name: x[kept] for name, x in verdict.items()}
-    metrics = [[state.metrics[name] for name in settings["outcomes"]] for state in wanted]
+    metrics = [[state.outcome.named()[name] for name in settings["outcomes"]] for state in wanted]
     np.testing.assert_allclose(verdict["outcome"], metrics, atol=1e-5)
     obs = np.stack([state.obs for state in wanted])
     turns = 2 * np.pi * np.round((verdict["obs"] - obs) / (2 * np.pi))  # yaw at +-pi

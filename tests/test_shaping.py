@@ -183,7 +183,7 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
     late = kicked(alone, 1, 0.5, x=12.1)  # after the goal
     for end, together in ((alone, False), (both, True), (late, False)):
         outcome = env.outcome(end, env.read(end.data), jnp.array(False))
-        assert bool(outcome["success"]) and bool(outcome["success/both_touched"]) == together
+        assert bool(outcome["success"]) and bool(outcome["both_touched"]) == together
     for before, end, goal in ((first, alone, 1.0), (alone, late, 0.0), (both, both, 0.0)):
         assert float(terms_of(env, before, end)[0]["first_goal"]) == goal
 

@@ -17,9 +17,9 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.normalize import value_denormalize
-from mqe_jax.train.types import VectorEnv
+from mqe_jax.train.types import Outcome, VectorEnv
 from tests import training as probes
-from tests.training import Probe
+from tests.training import Probe, assert_same
 
 
 def small(**values: Any) -> TrainConfig:
@@ -99,7 +99,7 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=32)
     _, metrics = learn(env, small(**VARIANTS[variant]), 60)
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
-    assert float(metrics["episode_length"]) == 4.0
+    assert float(metrics["ended"]["episode_length"]) == 4.0
 
 
 def test_an_environment_of_two_teams_is_refused() -> None:
@@ -162,8 +162,7 @@ def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
     assert len(set(one_pass.traces)) == 1
     assert [int(state.updates) for state in one_pass.states] == [0, 1, 2, 3]
     assert len({tuple(state.key.tolist()) for state in one_pass.states}) == 4, "a random key is used again"
-    for name, value in one_pass.metrics[0].items():
-        np.testing.assert_array_equal(value, one_pass.first_again[name])
+    assert_same(one_pass.metrics[0], one_pass.first_again)
 
 
 def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -256,6 +255,7 @@ class Tuple(NamedTuple):
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    outcome: Outcome
     metrics: dict[str, jax.Array]
     step: jax.Array
 
@@ -269,7 +269,7 @@ class Foreign:
     def _state(self, step: jax.Array, done: jax.Array) -> Tuple:
         obs, nothing = step[:, None, None].astype(jnp.float32), jnp.zeros((4, 0))
         reward = jnp.ones((4, 1), jnp.int32)
-        return Tuple(obs, nothing, obs, nothing, reward, done, jnp.zeros(4, bool), {}, step)
+        return Tuple(obs, nothing, obs, nothing, reward, done, jnp.zeros(4, bool), Outcome(), {}, step)
 
     def reset(self, key: jax.Array) -> Tuple:
         return self._state(jnp.zeros(4, jnp.int32), jnp.zeros(4, bool))
@@ -287,7 +287,7 @@ def test_a_foreign_state_without_privileged_observation_is_trained_and_staggered
     state = jax.jit(learner.init)(jax.random.PRNGKey(1))
     assert len(np.unique(state.rollout.env_state.step)) > 1
     _, metrics = jax.jit(learner.update)(state)
-    assert all(np.isfinite(float(value)) for value in metrics.values())
+    assert all(np.isfinite(float(value)) for value in jax.tree.leaves(metrics))
     with pytest.raises(InputError, match=r"network.critic_input: 'privileged'"):
         make_learner(Foreign(), small(num_envs=4))
 

@@ -22,7 +22,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.networks import Network
-from mqe_jax.train.types import Params
+from mqe_jax.train.types import Outcome, Params
 
 
 @jax.tree_util.register_dataclass
@@ -38,6 +38,7 @@ class ProbeState:
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    outcome: Outcome
     metrics: dict[str, jax.Array]
     key: jax.Array
     step: jax.Array
@@ -88,10 +89,9 @@ class Probe:
         step = jnp.zeros((n,), jnp.int32)
         obs, privileged = self._observe(hidden, step)
         zero, reward = jnp.zeros((n,)), jnp.zeros((n, self.num_agents))
-        names = ("reward/pay", "average_step_reward", "success", "team0/win", "diverged", "overflow")
-        metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
-        seen = hidden, obs, privileged, obs, privileged
-        return ProbeState(*seen, reward, terminated=zero > 0, truncated=zero > 0, metrics=metrics, key=key, step=step)
+        names = ("reward/pay", "average_step_reward", "diverged", "overflow")
+        rest = Outcome(zero[:, None]), dict.fromkeys(names, zero), key, step
+        return ProbeState(hidden, obs, privileged, obs, privileged, reward, zero > 0, zero > 0, *rest)
 
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
         key, draw = jax.random.split(state.key)
@@ -112,10 +112,11 @@ class Probe:
         if self.even_truncate:
             terminates &= jnp.arange(self.num_envs) % 2 == 1
         short = (done & (limit == jnp.minimum(odd, self.max_episode_steps))).astype(jnp.float32)
-        metrics = {"reward/pay": pay, "average_step_reward": pay, "success": short, "team0/win": short}
+        metrics = {"reward/pay": pay, "average_step_reward": pay}
         metrics |= {"diverged": jnp.zeros(done.shape), "overflow": (jnp.arange(self.num_envs) % 2).astype(jnp.float32)}
         seen = hidden, obs, privileged, final_obs, final_privileged
-        return ProbeState(*seen, reward, done & terminates, done & ~terminates, metrics, key, step)
+        rest = Outcome(short[:, None]), metrics, key, step
+        return ProbeState(*seen, reward, done & terminates, done & ~terminates, *rest)
 
 
 def show_hidden(hidden: jax.Array, step: jax.Array) -> jax.Array:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from mqe_jax import envs
 from mqe_jax.adapters import missing, quietly, task_env, team_reward
+from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
@@ -74,7 +75,7 @@ class Env(BraxEnv):
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
         pipeline: Any = state  # any pytree, although Brax's annotation is narrower
         zero = jnp.zeros(())
-        return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=state.metrics, info=info)
+        return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=info_of(state), info=info)
 
     @single
     def step(self, state: State, action: jax.Array) -> State:
@@ -93,7 +94,7 @@ class Env(BraxEnv):
             reward=team_reward(self.env, after.reward),
             done=after.terminated.astype(jnp.float32),
             # Wrappers may have added entries.
-            metrics={**state.metrics, **after.metrics},
+            metrics={**state.metrics, **info_of(after)},
             info=info,
         )
 

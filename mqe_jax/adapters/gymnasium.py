@@ -77,7 +77,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances by one environment step; actions are clipped to [-1, 1]."""
         out = self._host.step(np.asarray(action)[None])
-        info: dict[str, Any] = {name: value[0] for name, value in out.metrics.items()}
+        info: dict[str, Any] = {name: value[0] for name, value in out.info.items()}
         info["agent_rewards"] = out.reward[0]
         reward = float(team_reward(self.env, out.reward.astype(float))[0])
         return out.obs[0], reward, bool(out.terminated[0]), bool(out.truncated[0]), info
@@ -162,7 +162,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask")
         out = self._host.step(actions, self.autoreset_mode)
         ended = out.terminated | out.truncated
-        metrics = {**out.metrics, "agent_rewards": out.reward}
+        metrics = {**out.info, "agent_rewards": out.reward}
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = _masked(metrics, ~ended)
             if ended.any():

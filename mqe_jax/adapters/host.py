@@ -33,7 +33,7 @@ RENDER_MODES = ("rgb_array",)
 class Step(NamedTuple):
     """Output of one step of N environments; the arrays are writable copies.
 
-    `final_obs`, `metrics` and all flags and rewards describe the step itself; `obs` is that of the new episode where an
+    `final_obs`, `info` and all flags and rewards describe the step itself; `obs` is that of the new episode where an
     environment was reset in this call.
     """
 
@@ -42,7 +42,7 @@ class Step(NamedTuple):
     reward: np.ndarray  # (N, A)
     terminated: np.ndarray  # (N,) bool
     truncated: np.ndarray  # (N,) bool
-    metrics: dict[str, np.ndarray]  # (N,) each
+    info: dict[str, np.ndarray]  # metrics and outcome by name, (N,) each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,6 +146,11 @@ class HostEnvs:
         return np.array(next(iter(render_frames(self._task, episode, [self._camera], self._size))))
 
 
+def info_of(state: State) -> dict[str, jax.Array]:
+    """Returns the metrics of a step and the outcome of the episode by name () each."""
+    return {**state.metrics, **state.outcome.named()}
+
+
 @functools.lru_cache(maxsize=16)
 def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
     """Returns the compiled reset, and the step with the resets that its last argument names, for any batch size."""
@@ -169,8 +174,8 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
             ended = shown if same else state
             after = select(env, ended.terminated | ended.truncated, fresh, shown)
             shown = shown if same else after
-        out: Any = (after.obs, shown.final_obs, shown.reward, shown.terminated, shown.truncated, shown.metrics)
-        return after, Step(*out)
+        out: Any = (after.obs, shown.final_obs, shown.reward, shown.terminated, shown.truncated)
+        return after, Step(*out, info_of(shown))
 
     def steps(state: State, action: jax.Array, reset: AutoresetMode) -> tuple[State, Step]:
         return jax.vmap(functools.partial(step, reset))(state, action)

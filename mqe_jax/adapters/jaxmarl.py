@@ -16,6 +16,7 @@ import numpy as np
 
 from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, quietly, select, task_env
+from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
@@ -130,7 +131,7 @@ class Env(MultiAgentEnv):
         action = jnp.stack([self._continuous(actions[agent]) for agent in self.agents])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated
-        values = {"truncation": after.truncated.astype(jnp.float32), **after.metrics}
+        values = {"truncation": after.truncated.astype(jnp.float32), **info_of(after)}
         infos = {name: jnp.broadcast_to(value, (self.num_agents,)) for name, value in values.items()}
         rewards = {agent: after.reward[i] for i, agent in enumerate(self.agents)}
         return self.get_obs(after), after, rewards, {**dict.fromkeys(self.agents, done), "__all__": done}, infos

@@ -135,6 +135,7 @@ class TeamEnv:
             obs=state.obs[own],
             final_obs=state.final_obs[own],
             reward=state.reward[own],
+            outcome=state.outcome.by_team(lambda x: x[:1]),
             metrics={name: value for name, value in state.metrics.items() if not name.startswith("team1/")},
             rival_obs=state.obs[self.num_agents :],
         )

@@ -125,7 +125,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
             raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
         out = self._host.step([[actions[agent] for agent in self.agents]])
         terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
-        metrics = {name: float(value[0]) for name, value in out.metrics.items()}
+        metrics = {name: float(value[0]) for name, value in out.info.items()}
         agents = self.agents
         result = (
             self._by_agent(out.obs[0]),

@@ -20,7 +20,7 @@ from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.types import RandomKey
 
-KEPT = ("assistance", "reward", "terminated", "truncated", "metrics", "final_obs", "final_privileged_obs")
+KEPT = ("assistance", "reward", "terminated", "truncated", "outcome", "metrics", "final_obs", "final_privileged_obs")
 """Fields that an auto-reset keeps; all but the first describe the last step."""
 
 _SMALL = 4096
@@ -34,9 +34,9 @@ Start = Callable[[jax.Array, jax.Array], State]
 def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> State:
     """Replaces the state of one environment by a new initial state if its episode has ended.
 
-    Resets the whole state, without a forward pass. `reward`, `terminated`, `truncated`, `metrics` and `final_obs`
-    still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept. The new
-    episode starts in the state of `start`, by default of the task's reset.
+    Resets the whole state, without a forward pass. `reward`, `terminated`, `truncated`, `outcome`, `metrics` and
+    `final_obs` still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept.
+    The new episode starts in the state of `start`, by default of the task's reset.
     """
     done = state.terminated | state.truncated
     key, reset_key = jax.random.split(state.key)

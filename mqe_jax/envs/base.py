@@ -24,7 +24,7 @@ from mqe_jax.envs.observation import ObservationLayout, box
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
-from mqe_jax.envs.returned import alike, numbers, shaped, weights_of
+from mqe_jax.envs.returned import alike, results, shaped, weights_of
 from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import ENDINGS, Moment, S, State
 from mqe_jax.envs.task import Task
@@ -35,7 +35,7 @@ from mqe_jax.robots.index import RobotState, placed, read_robots
 from mqe_jax.rotation import euler_to_quaternion
 from mqe_jax.scene import build_model, compile_scene
 from mqe_jax.settings import check, checked, differences, fail
-from mqe_jax.train.types import Level, RandomKey
+from mqe_jax.train.types import Level, Outcome, RandomKey
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -221,6 +221,7 @@ class QuadrupedEnv(Task[S, P]):
             reward=jnp.zeros(self.num_agents),
             terminated=no,
             truncated=no,
+            outcome=Outcome(),
             metrics={},
             step=jnp.zeros((), jnp.int32),
             anchors=anchors,
@@ -234,9 +235,10 @@ class QuadrupedEnv(Task[S, P]):
         )
         now = Moment(state, robot_state)
         _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams)
-        outcome = numbers("outcome", self.outcome(state, robot_state, no))
-        names = (*logged, *outcome, *ENDINGS, "collision", "diverged", "overflow")
-        state = dataclasses.replace(state, metrics={name: jnp.zeros(()) for name in names})
+        names = (*logged, "collision", "diverged", "overflow")
+        outcome = dataclasses.replace(self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no))
+        outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
+        state = dataclasses.replace(state, outcome=outcome, metrics={name: jnp.zeros(()) for name in names})
         return self._observed(state, robot_state, noise_key)
 
     @single
@@ -292,17 +294,24 @@ class QuadrupedEnv(Task[S, P]):
         failed = diverged | fall | crash
         decided = shaped("ending", self.ending(state, robot_state), (), dtype=bool)
         terminated, late = failed | decided, state.step >= self.max_steps
-        outcome = numbers("outcome", self.outcome(state, robot_state, failed))
-        metrics = {**logged, **outcome, "collision": collision}
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
-        metrics = {name: clean(value, self.metrics_if_diverged.get(name, 0.0)) for name, value in metrics.items()}
-        metrics["diverged"] = diverged.astype(jnp.float32)
+        outcome = self.result(state, robot_state, failed)
+        draw = None if outcome.draw is None else clean(outcome.draw, 1.0)
         causes = jnp.stack([diverged, fall, crash, decided, late])
-        first = causes & (jnp.cumsum(causes) == 1)
-        metrics |= {name: cause.astype(jnp.float32) for name, cause in zip(ENDINGS, first, strict=True)}
-        truncated = ~terminated & late
-        reward = clean(reward)
-        return dataclasses.replace(state, reward=reward, terminated=terminated, truncated=truncated, metrics=metrics)
+        first = (causes & (jnp.cumsum(causes) == 1)).astype(jnp.float32)
+        outcome = dataclasses.replace(
+            jax.tree.map(clean, outcome), draw=draw, ending=dict(zip(ENDINGS, first, strict=True))
+        )
+        metrics = {name: clean(value) for name, value in {**logged, "collision": collision}.items()}
+        metrics["diverged"] = diverged.astype(jnp.float32)
+        ended = {"terminated": terminated, "truncated": ~terminated & late}
+        return dataclasses.replace(state, reward=clean(reward), **ended, outcome=outcome, metrics=metrics)
+
+    def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
+        """Returns the outcome if the episode ends in this step, without its cause; arguments as of `outcome`."""
+        values = results("outcome", self.outcome(state, robot_state, failed))
+        values = {name: value[None] for name, value in values.items()}
+        return Outcome(success=values.pop("success"), further=values)
 
     def read(self, data: mjx.Data) -> RobotState:
         """Returns the state of all robots."""

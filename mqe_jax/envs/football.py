@@ -307,13 +307,11 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
         """A team leads while the ball is in the goal that it attacks."""
         return self.in_goal(state.data)
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Also, of each team with mates, its `passes` and `both_touched`: a goal after touches by all its robots."""
-        result, play = super().outcome(state, robot_state, failed), state.task.play
+    def further(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
+        """Returns, of teams with mates, `passes` and `both_touched`: a goal after touches by all robots of the team."""
+        play = state.task.play
         together = self.in_goal(state.data) & jnp.all(play.touched.reshape(2, -1), axis=1)
-        for team in (0, 1) if self.num_agents > 2 else ():
-            result |= {f"team{team}/passes": play.passes[team], f"team{team}/both_touched": together[team]}
-        return result
+        return {"passes": play.passes, "both_touched": together} if self.num_agents > 2 else {}
 
 
 class Go1Football1vs1(FootballMatch[Football1vs1Params]):

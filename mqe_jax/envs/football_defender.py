@@ -134,8 +134,8 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a goal at any time in this episode.
 
-        `success/both_touched`: one after touches by both robots; `success/passes`: passes before it.
+        `both_touched`: one after touches by both robots; `passes`: passes before it.
         """
         scored, play = state.task.scored, state.task.play
         both = scored & jnp.all(play.touched[:2])
-        return {"success": scored, "success/both_touched": both, "success/passes": play.passes[0]}
+        return {"success": scored, "both_touched": both, "passes": play.passes[0]}

@@ -114,6 +114,6 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
         }
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: both robots are through; `success/one`: at least one is, however the episode ended."""
+        """Success: both robots are through; `one`: at least one is, however the episode ended."""
         through = self.through(state, robot_state)
-        return {"success": jnp.all(through) & ~failed, "success/one": jnp.any(through)}
+        return {"success": jnp.all(through) & ~failed, "one": jnp.any(through)}

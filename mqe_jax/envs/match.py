@@ -8,7 +8,6 @@ Team 0 has the first half of the agents, team 1 the second half.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
@@ -22,6 +21,7 @@ from mqe_jax.envs.state import S, State
 from mqe_jax.robots.index import RobotState
 from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 from mqe_jax.settings import fail
+from mqe_jax.train.types import Outcome
 
 
 class Match(QuadrupedEnv[S, P]):
@@ -30,13 +30,11 @@ class Match(QuadrupedEnv[S, P]):
     Reward: zero-sum; each term is the team's own minus the opponents', but for those whose weight is 0 by default.
     Result: an `eliminated` team (by default one with a fallen robot) loses unless both are; otherwise the `leading`
     team wins, and it is a draw if both or neither lead.
-    Metrics: `team0/win`, `team0/draw`, `team0/loss` and team 1's, as if the episode ended in this step; they are
-    evaluated at its end. `success` is a win of team 0. Diverged physics is a draw.
+    Success is a win. Diverged physics is a draw.
     """
 
     symmetry: ClassVar[str] = "turn"
     """Symmetry that maps one team's frame to the other's: 'turn' or 'reflect'."""
-    metrics_if_diverged: ClassVar[Mapping[str, float]] = {"team0/draw": 1.0, "team1/draw": 1.0}
 
     @property
     def center(self) -> tuple[float, float]:
@@ -78,6 +76,10 @@ class Match(QuadrupedEnv[S, P]):
         out, leading = self.eliminated(robot_state), self.leading(state, robot_state)
         return jnp.where(jnp.any(out), out[::-1] & ~out, leading & ~leading[::-1])
 
+    def further(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
+        """Returns further results of both teams by name (2,), if the episode ends in this step."""
+        return {}
+
     # -- both teams' frames -------------------------------------------------------------------------------------
 
     def views(self, info: jax.Array) -> jax.Array:
@@ -116,15 +118,10 @@ class Match(QuadrupedEnv[S, P]):
         own = jnp.asarray(own, jnp.float32)
         return (own - own[::-1])[self.team_of]
 
-    def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Win, draw and loss of each team; success: team 0 wins."""
+    def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
         wins = self.wins(state, robot_state)
-        result = {}
-        for team in (0, 1):
-            result[f"team{team}/win"] = wins[team]
-            result[f"team{team}/draw"] = ~jnp.any(wins)
-            result[f"team{team}/loss"] = wins[1 - team]
-        return {"success": wins[0], **result}
+        draw = jnp.broadcast_to(~jnp.any(wins), wins.shape)
+        return Outcome(success=wins, win=wins, draw=draw, loss=wins[::-1], further=self.further(state, robot_state))
 
 
 class Duel(Match[S, P]):

@@ -176,5 +176,5 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         return self.box_x(state) > state.anchors[0, 0] + self.params.past_gate
 
     def outcome(self, state: State[PushBoxState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: the box is past the gate; `success/distance`: its displacement along x, m."""
-        return {"success": self.through(state), "success/distance": self.box_x(state) - state.task.start}
+        """Success: the box is past the gate; `distance`: its displacement along x, m."""
+        return {"success": self.through(state), "distance": self.box_x(state) - state.task.start}

@@ -38,6 +38,14 @@ def numbers(method: str, values: Any) -> dict[str, jax.Array]:
     return {name: shaped(f"{method}: {name}", value, ()) for name, value in values.items()}
 
 
+def results(method: str, values: Any) -> dict[str, jax.Array]:
+    """Returns `success` and further numbers () by name."""
+    found = numbers(method, values)
+    if "success" not in found:
+        _fail(method, sorted(found), "success, and further results by name")
+    return found
+
+
 def alike(method: str, values: Any, before: Any) -> Any:
     """Returns a pytree with the structure, shapes and dtypes of another."""
     now, then = jax.tree.map(_kind, values), jax.tree.map(_kind, before)

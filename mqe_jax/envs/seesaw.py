@@ -129,6 +129,6 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
         }
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: a robot stands on the platform; `success/height`: height of the highest robot, m."""
+        """Success: a robot stands on the platform; `height`: height of the highest robot, m."""
         success = jnp.any(self.on_platform(robot_state)) & ~failed
-        return {"success": success, "success/height": jnp.max(robot_state.position_w[:, 2])}
+        return {"success": success, "height": jnp.max(robot_state.position_w[:, 2])}

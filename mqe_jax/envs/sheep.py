@@ -201,10 +201,10 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the share of the sheep that are past the gate, 0 after a fall or a collision.
 
-        `success/through`: the share that are, however the episode ended.
+        `through`: the share that are, however the episode ended.
         """
         through = jnp.mean(self.through(state))
-        return {"success": jnp.where(failed, 0.0, through), "success/through": through}
+        return {"success": jnp.where(failed, 0.0, through), "through": through}
 
 
 class Go1SheepHard(Go1SheepEasy):

@@ -10,6 +10,7 @@ import jax
 from mqe_jax.control import ControlState
 from mqe_jax.envs.randomization import RandomizedParams
 from mqe_jax.robots.index import RobotState
+from mqe_jax.train.types import Outcome
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -18,9 +19,9 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 """A task's own state."""
 
-ENDINGS = ("ending/divergence", "ending/fall", "ending/collision", "ending/task", "ending/time_limit")
-"""Metrics of how an episode ends: 1 for the first of them that holds in its last step. `ending/task` is an end by the
-task's own rules, which decides a match."""
+ENDINGS = ("divergence", "fall", "collision", "task", "time_limit")
+"""Causes that end an episode; the first of them that holds in its last step counts. `task` is an end by the task's own
+rules, which decides a match."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +42,8 @@ class EnvironmentState:
     """Whether the episode terminated () bool."""
     truncated: jax.Array
     """Whether the episode was truncated at the time limit () bool."""
+    outcome: Outcome
+    """How the episode ended, if it did in the last step; else as if it had."""
     metrics: dict[str, jax.Array]
     """`reward/<name>` and the task's own, () each."""
     step: jax.Array
@@ -56,8 +59,8 @@ class EnvironmentState:
 class State(EnvironmentState, Generic[S]):
     """State of one environment with A agents, R robots and G anchors.
 
-    Its metrics include `average_step_reward`, `success`, `ENDINGS`, `collision`, `diverged` and `overflow` (1 where the
-    physics engine may have dropped contacts or constraints in any physics step of this step).
+    Its metrics include `average_step_reward`, `collision`, `diverged` and `overflow` (1 where the physics engine may
+    have dropped contacts or constraints in any physics step of this step); its outcome has the `ENDINGS`.
     """
 
     data: mjx.Data

@@ -37,8 +37,6 @@ class Task(Generic[S, P]):
     """What a team has to do, in one line, as told to somebody who drives a robot."""
     Params: ClassVar[type[Any]] = TaskParams
     """Class of the task's parameters, P."""
-    metrics_if_diverged: ClassVar[Mapping[str, float]] = {}
-    """Non-zero values of metrics in a step in which the physics diverged."""
     npc_varied: ClassVar[tuple[str, ...]] = ()
     """The commands that `npc_commands` changes; without names it may change all."""
     npc_skill: ClassVar[str] = "walk"
@@ -133,7 +131,7 @@ class Task(Generic[S, P]):
         return jnp.zeros((), bool)
 
     def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Returns `success` () and further `success/...` metrics, which are evaluated at the end of an episode.
+        """Returns `success` () and further results by name (), which count at the end of an episode.
 
         Args:
             state: after the step.

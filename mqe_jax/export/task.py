@@ -66,7 +66,7 @@ class TaskFunctions:
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
         robots = env.read(self._start.data)
-        self.outcomes = list(env.outcome(self._start, robots, jnp.zeros((), bool)))
+        self.outcomes = list(env.result(self._start, robots, jnp.zeros((), bool)).named())
         self._noise = _noise_size(lambda: env.step_npcs(self._start.data, robots, self._start.key))
 
     @property
@@ -107,8 +107,8 @@ class TaskFunctions:
     def judge(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns the observation, the result and the task's next fields after a step.
 
-        `obs` (A, O), `outcome`: the metrics `outcomes` as if the episode ended here, `next_task_NAME`, and as 0 or 1
-        `terminated`, `truncated`, `fell` and `collided`: the metrics `ending/fall` and `ending/collision`.
+        `obs` (A, O), `outcome`: those of `outcomes` as if the episode ended here, `next_task_NAME`, and as 0 or 1
+        `terminated`, `truncated`, `fell` and `collided`: whether a fall or a collision ended the episode.
         """
         env, after = self.env, self.state(inputs)
         before = self.state({**inputs, **{name: inputs[f"before_{name}"] for name in PHYSICS}})
@@ -118,11 +118,11 @@ class TaskFunctions:
         obs = env.observation_layout.pack(env.observe(state, robots))
         outputs = {
             "obs": jnp.clip(jnp.nan_to_num(obs), -1e4, 1e4),
-            "outcome": jnp.stack([state.metrics[name] for name in self.outcomes]),
+            "outcome": jnp.stack([state.outcome.named()[name] for name in self.outcomes]),
             "terminated": state.terminated,
             "truncated": state.truncated,
-            "fell": state.metrics["ending/fall"],
-            "collided": state.metrics["ending/collision"],
+            "fell": state.outcome.ending["fall"],
+            "collided": state.outcome.ending["collision"],
             **named("next_task", state.task),
         }
         return {name: x.astype(jnp.float32) for name, x in outputs.items()}

@@ -17,7 +17,7 @@ from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.wrappers import Wrapper
 from mqe_jax.league import pool
 from mqe_jax.league.pool import Pool
-from mqe_jax.opponents import OUTCOMES, Versus, exchange, versus
+from mqe_jax.opponents import Versus, exchange, versus
 from mqe_jax.policies import load_as
 from mqe_jax.precision import single
 from mqe_jax.settings import fail
@@ -27,6 +27,7 @@ from mqe_jax.train.learner import TrainState, env_dims
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import PolicyArrays, TrainedPolicy
+from mqe_jax.train.types import RESULTS
 
 _FADE = 0.95  # of the counts behind the metrics, per update
 _SWING = 30.0  # Elo points per update, at most; one per game beyond what was expected
@@ -189,7 +190,7 @@ class League:
         names = np.array(self._roster.names)
         for name in dict.fromkeys(self._roster.names):
             recent = jnp.sum(league.recent[names == name], axis=0)
-            for i, outcome in enumerate(OUTCOMES):
+            for i, outcome in enumerate(RESULTS):
                 metrics[f"league/{outcome}/{name}"] = recent[i] / jnp.maximum(jnp.sum(recent), 1.0)
         return metrics
 

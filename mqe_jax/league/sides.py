@@ -32,10 +32,9 @@ class BothSides(Wrapper):
         changed = self._changed()
         metrics = dict(inner.metrics)
         for theirs in [name for name in metrics if name.startswith("team1/")]:
-            own = next(name for name in (f"team0/{theirs[6:]}", theirs[6:]) if name in metrics)
+            own = theirs.removeprefix("team1/")
             for name, other in ((own, theirs), (theirs, own)):
                 metrics[name] = jnp.where(changed, inner.metrics[other], inner.metrics[name])
-        metrics["success"] = metrics["team0/win"]
 
         def told(privileged: jax.Array) -> jax.Array:
             return jnp.concatenate([privileged, changed[:, None].astype(privileged.dtype)], axis=1)
@@ -46,6 +45,7 @@ class BothSides(Wrapper):
             "privileged_obs": told(inner.privileged_obs),
             "final_privileged_obs": told(inner.final_privileged_obs),
             "reward": self._exchanged(inner.reward),
+            "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
             "metrics": metrics,
         }
 

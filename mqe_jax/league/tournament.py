@@ -20,12 +20,12 @@ from mqe_jax.envs import VectorEnv
 from mqe_jax.files import replacing, write_atomically
 from mqe_jax.limits import NonNegativeInt
 from mqe_jax.literal import to_label
-from mqe_jax.opponents import OUTCOMES, Versus
+from mqe_jax.opponents import Versus
 from mqe_jax.policies import check_policy
 from mqe_jax.precision import single
 from mqe_jax.settings import PathText, checked, fail
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import AnyBatch, AnyPolicy, RandomKey
+from mqe_jax.train.types import RESULTS, AnyBatch, AnyPolicy, RandomKey
 
 Array = NDArray[np.float64]
 CSV, PICTURE = "tournament.csv", "tournament.png"
@@ -58,7 +58,7 @@ class Ratings(NamedTuple):
 @single
 @checked(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
-    """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `OUTCOMES`.
+    """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `RESULTS`.
 
     Every Kth environment has the same one of the K opponents as team 1 (`Versus`).
     """
@@ -70,7 +70,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
         action, memory = policy.act(state.obs, memory, key)
         state = env.step(state, action)
         done = state.terminated | state.truncated
-        now = jnp.stack([state.metrics[f"team0/{name}"] > 0 for name in OUTCOMES], axis=-1)
+        now = state.outcome.result[:, 0] > 0
         outcome = jnp.where((done & ~finished)[:, None], now, outcome)
         return (state, memory, finished | done, outcome), None
 
@@ -89,7 +89,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
 @single
 @checked(matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey)
 def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
-    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `OUTCOMES`."""
+    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `RESULTS`."""
     keys = jax.random.split(key, len(policies))
     teams = list(policies.values())
     return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
@@ -140,7 +140,7 @@ def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings
         fail("names", names, f"one for each of the {len(results)} policies")
     folder, text = Path(folder), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("team0", "team1", *OUTCOMES, "rating_of_team0", "low", "high"))
+    writer.writerow(("team0", "team1", *RESULTS, "rating_of_team0", "low", "high"))
     for i, j in itertools.product(range(len(names)), repeat=2):
         writer.writerow((names[i], names[j], *results[i, j], *(f"{x[i]:.1f}" for x in ratings)))
     write_atomically(folder / CSV, text.getvalue().encode())

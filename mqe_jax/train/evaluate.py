@@ -20,7 +20,18 @@ from mqe_jax.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.literal import line, to_html
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
-from mqe_jax.train.types import AnyBatch, Memory, PolicyOrAct, RandomKey, VectorEnv, check_act, teams_of, where_rows
+from mqe_jax.train.types import (
+    RESULTS,
+    AnyBatch,
+    Memory,
+    Outcome,
+    PolicyOrAct,
+    RandomKey,
+    VectorEnv,
+    check_act,
+    teams_of,
+    where_rows,
+)
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
@@ -71,9 +82,9 @@ class Result:
     diverged: int
     """Number of episodes that ended because the physics diverged."""
     endings: dict[str, float]
-    """Fraction of episodes that ended by each cause, from metrics `ending/<name>`."""
+    """Fraction of episodes that ended by each cause."""
     outcomes: dict[str, float]
-    """Other outcomes by name, mean over episodes, from metrics `success/<name>` and, in a match, `team0/<name>`."""
+    """Further results of team 0 by name, mean over episodes."""
     match: dict[str, float]
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
     about: dict[str, Any] = field(default_factory=dict)
@@ -139,9 +150,11 @@ class _Progress(NamedTuple):
     returns: jax.Array
     """Rewards of team 0 summed over counted steps (N,)."""
     step_sums: dict[str, jax.Array]
-    """Sums over counted steps (N,) each."""
-    end_sums: dict[str, jax.Array]
-    """Sums over the last steps of counted episodes (N,) each."""
+    """Sums of metrics over counted steps (N,) each."""
+    outcome: Outcome
+    """Sums over counted episodes, leading axis N."""
+    diverged: jax.Array
+    """Counted episodes that ended because the physics diverged (N,)."""
 
 
 def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
@@ -262,9 +275,9 @@ class Evaluator:
 
 def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:
     state = env.reset(key)
-    zeros = {name: jnp.zeros((env.num_envs,)) for name in state.metrics}
-    none = jnp.zeros((env.num_envs,), jnp.int32)
-    return _Progress(state, memory, none, none, jnp.zeros((env.num_envs,)), zeros, zeros)
+    zero, none = jnp.zeros((env.num_envs,)), jnp.zeros((env.num_envs,), jnp.int32)
+    sums = dict.fromkeys(state.metrics, zero), jax.tree.map(lambda x: jnp.zeros(x.shape), state.outcome)
+    return _Progress(state, memory, none, none, zero, *sums, zero)
 
 
 def _run_block(
@@ -279,16 +292,19 @@ def _run_block(
         counted = p.finished < quota
 
         step_sums = {n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()}
-        end_sums = {n: s + jnp.where(counted & done, state.metrics[n], 0.0) for n, s in p.end_sums.items()}
+        last = counted & done
+        ends = jax.tree.map(lambda s, x: s + where_rows(last, x, jnp.zeros_like(s)), p.outcome, state.outcome)
+        diverged = p.diverged + jnp.where(last, state.metrics.get("diverged", 0.0), 0.0)
         return (
             _Progress(
                 env_state=state,
                 memory=where_rows(done, initial_memory, memory),
-                finished=p.finished + (counted & done).astype(jnp.int32),
+                finished=p.finished + last.astype(jnp.int32),
                 steps=p.steps + counted.astype(jnp.int32),
                 returns=p.returns + jnp.where(counted, jnp.mean(state.reward[:, own], axis=-1), 0.0),
                 step_sums=step_sums,
-                end_sums=end_sums,
+                outcome=ends,
+                diverged=diverged,
             ),
             None,
         )
@@ -302,20 +318,19 @@ def _result(task: str, episodes: int, progress: _Progress) -> Result:
 
     steps = total(progress.steps)
     per_step = {name: total(x) / steps for name, x in progress.step_sums.items()}
-    per_episode = {name: total(x) / episodes for name, x in progress.end_sums.items()}
-    match = {name: per_episode[f"team0/{name}"] for name in ("win", "draw", "loss") if f"team0/{name}" in per_episode}
-    others = ((name.partition("/"), x) for name, x in per_episode.items())
+    ended = progress.outcome
+    rate = lambda x: math.nan if x is None else total(x[:, 0]) / episodes  # noqa: E731
     return Result(
         task=task,
         episodes=episodes,
-        success_rate=per_episode.get("success", float("nan")),
+        success_rate=rate(ended.success),
         average_step_reward=per_step.get("average_step_reward", float("nan")),
         terms={n.removeprefix("reward/"): v for n, v in per_step.items() if n.startswith("reward/")},
         episode_return=total(progress.returns) / episodes,
         episode_length=steps / episodes,
         overflow=round(per_step.get("overflow", 0.0) * steps),
-        diverged=round(per_episode.get("diverged", 0.0) * episodes),
-        endings={n.removeprefix("ending/"): v for n, v in per_episode.items() if n.startswith("ending/")},
-        outcomes={n: x for (kind, _, n), x in others if kind in ("success", "team0") and n and n not in match},
-        match={f"{name}_rate": x for name, x in match.items()},
+        diverged=round(total(progress.diverged)),
+        endings={name: total(x) / episodes for name, x in ended.ending.items()},
+        outcomes={name: rate(x) for name, x in ended.further.items()},
+        match={} if ended.win is None else {f"{name}_rate": rate(getattr(ended, name)) for name in RESULTS},
     )

@@ -170,10 +170,7 @@ def make_learner(
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
             assistance=next_assistance(
-                config,
-                now.assistance,
-                metrics.get("success", jnp.float32(0.5)),
-                metrics.get("episodes", jnp.float32(0.0)),
+                config, now.assistance, metrics["ended"].get("success", jnp.float32(0.5)), metrics["ended"]["episodes"]
             ),
             rollout=rollout_state,
             key=key,

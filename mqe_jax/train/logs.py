@@ -29,7 +29,6 @@ from mqe_jax.errors import InputError
 from mqe_jax.files import append, make_folder, parsing, read_rows, write_atomically
 from mqe_jax.settings import PathText, check
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.types import is_per_episode
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
@@ -341,7 +340,8 @@ def row_of(
         "seconds": now - start_time,
         "fps": config.steps_per_update / (now - update_began),
     }
-    none = not metrics["episodes"]
-    values = {name: math.nan if none and is_per_episode(name) else float(x) for name, x in sorted(metrics.items())}
-    row.update(values)
-    return row
+    ended = dict(metrics["ended"])
+    episodes = float(ended.pop("episodes"))
+    values = {name: float(x) for name, x in metrics.items() if name != "ended"} | {"episodes": episodes}
+    values |= {name: float(x) if episodes else math.nan for name, x in ended.items()}
+    return row | dict(sorted(values.items()))

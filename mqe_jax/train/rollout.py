@@ -11,7 +11,7 @@ from mqe_jax.train import devices
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, is_per_episode, reset_memory
+from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, reset_memory
 
 
 class RolloutState(NamedTuple):
@@ -57,9 +57,9 @@ def rollout(
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
-    The environment receives `action_scale` times the sampled action. Metrics: those of the environment are means over
-    steps and environments, but those that are `is_per_episode` are means over ended episodes (0 without any), and
-    `episodes`, `diverged` and `overflow` are counts.
+    The environment receives `action_scale` times the sampled action. Metrics are means over steps and environments,
+    but `diverged` and `overflow` are counts; `ended` has the number of `episodes` that ended, and means over them, 0
+    without any, of their length, return and outcome.
     """
 
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, jax.Array]]:
@@ -87,7 +87,7 @@ def rollout(
         episode_steps = state.episode_steps + 1
         episode_return = state.episode_return + jnp.mean(after.reward, axis=-1)
         of_episodes = {"episode_length": episode_steps.astype(jnp.float32), "episode_return": episode_return}
-        sums = _sums({**after.metrics, **of_episodes}, done)
+        ended = {**after.outcome.named(), **of_episodes}
         state = RolloutState(
             env_state=after,
             memory=NetworkMemory(actor_memory, critic_memory),
@@ -95,34 +95,30 @@ def rollout(
             episode_steps=jnp.where(done, 0, episode_steps),
             episode_return=jnp.where(done, 0.0, episode_return),
         )
-        return state, (transition, jnp.stack([sums[name].astype(jnp.float32) for name in names]))
+        return state, (transition, _sums(after.metrics), _sums({**_masked(ended, done), "episodes": done}))
 
-    names = sorted({*state.env_state.metrics, "episode_length", "episode_return", "episodes"})
-    state, (transitions, sums) = jax.lax.scan(one_step, state, jax.random.split(key, length))
-    totals = devices.total(jnp.sum(sums, axis=0))
-    return state, transitions, _means(dict(zip(names, totals, strict=True)), length * env.num_envs * devices.size())
-
-
-def _sums(metrics: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array]:
-    """Returns the sums over environments of one step: metrics (N,) -> ()."""
-    sums = {
-        name: jnp.sum(jnp.where(done, value, 0.0) if is_per_episode(name) else value) for name, value in metrics.items()
-    }
-    return {**sums, "episodes": jnp.sum(done.astype(jnp.float32))}
+    state, (transitions, *sums) = jax.lax.scan(one_step, state, jax.random.split(key, length))
+    steps, ended = devices.total(jax.tree.map(lambda x: jnp.sum(x, axis=0), sums))
+    return state, transitions, _means(steps, ended, length * env.num_envs * devices.size())
 
 
-def _means(totals: dict[str, jax.Array], samples: int) -> dict[str, jax.Array]:
-    """Returns the metrics of a rollout from its sums over steps and environments ()."""
-    episodes = totals["episodes"]
-    means = {}
-    for name, total in totals.items():
-        if name in ("episodes", "diverged", "overflow"):
-            means[name] = total
-        elif is_per_episode(name):
-            means[name] = total / jnp.maximum(episodes, 1.0)
-        else:
-            means[name] = total / samples
-    return means
+def _masked(values: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array]:
+    """Returns values (N,) of environments whose episode ended, 0 for the others."""
+    return {name: jnp.where(done, value, 0.0) for name, value in values.items()}
+
+
+def _sums(values: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns the sums over environments: (N,) -> ()."""
+    return {name: jnp.sum(value.astype(jnp.float32)) for name, value in values.items()}
+
+
+def _means(steps: dict[str, jax.Array], ended: dict[str, jax.Array], samples: int) -> dict[str, Any]:
+    """Returns the metrics of a rollout from sums over steps and over ended episodes ()."""
+    episodes = ended.pop("episodes")
+    counts = ("diverged", "overflow")
+    means = {name: total if name in counts else total / samples for name, total in steps.items()}
+    of_episodes = {name: total / jnp.maximum(episodes, 1.0) for name, total in ended.items()}
+    return {**means, "ended": {"episodes": episodes, **of_episodes}}
 
 
 def chunks(x: jax.Array, length: int) -> jax.Array:

@@ -228,7 +228,7 @@ class Training:
         metrics, finite = jax.device_get((metrics, all_finite(learned(after))))
         updates, rows = self.env_steps // self._config.steps_per_update + 1, []
         for i in range(len(self._configs)):
-            own = {name: value[i] for name, value in metrics.items()}
+            own = jax.tree.map(lambda x: x[i], metrics)  # noqa: B023
             row = row_of(updates, own, self._config, self._start_time, began)
             row["fps"] *= len(self._configs)
             if not finite or nonfinite_metrics(row):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
@@ -108,9 +109,9 @@ class VectorEnv(Protocol):
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the environment clips actions, unbounded
     samples of the policy, to its range. The state is any pytree with these fields: obs (N, A, O) is the input of the
     next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the state reached by the step, before any
-    reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool; metrics maps names to (N,), and every
-    name is present from the reset on. Metrics are averaged over steps, except for outcomes of episodes (see
-    `is_outcome`) and the counts `diverged` and `overflow`.
+    reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool; outcome, an `Outcome`, counts at the
+    end of an episode; metrics maps names to (N,), which are averaged over steps, except for the counts `diverged` and
+    `overflow`. All names are present from the reset on.
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
@@ -208,15 +209,49 @@ def teams_of(env: VectorEnv) -> Teams:
     return tuple(map(tuple, getattr(env, "teams", (range(env.num_agents),))))
 
 
-def is_outcome(metric: str) -> bool:
-    """Returns whether a metric is an episode outcome, read at its last step: `success`, `team0/win`, `ending/fall`."""
-    reward = metric.removeprefix("team1/").startswith(("reward/", "average_step_reward"))
-    return metric.startswith(("success", "team", "ending/")) and not reward
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How an episode ended, for K teams; before its last step, as if it ended there. Any leading axes."""
+
+    success: jax.Array | None = None
+    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None where there is no such measure."""
+    win: jax.Array | None = None
+    """Whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss."""
+    draw: jax.Array | None = None
+    """Whether it was a draw (K,)."""
+    loss: jax.Array | None = None
+    """Whether each team lost (K,)."""
+    further: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """Further results of each team by name (K,), such as a distance, m."""
+    ending: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """1 for the cause that ended the episode, by name ()."""
+
+    @property
+    def result(self) -> jax.Array:
+        """Win, draw and loss of each team, in the order of `RESULTS` (K, 3)."""
+        return jnp.stack([getattr(self, name) for name in RESULTS], axis=-1)
+
+    def by_team(self, change: Callable[[jax.Array], jax.Array]) -> Outcome:
+        """Returns the outcome with all arrays (..., K) changed."""
+        teams = {name: getattr(self, name) for name in ("success", *RESULTS)}
+        teams = {name: change(x) for name, x in teams.items() if x is not None}
+        return dataclasses.replace(self, **teams, further={name: change(x) for name, x in self.further.items()})
+
+    def named(self) -> dict[str, jax.Array]:
+        """Returns the values by the names under which they are logged: `success`, `team0/win`, `ending/fall`, ..."""
+        values = {} if self.success is None else {"success": self.success[..., 0]}
+        if self.win is None:
+            values |= {f"success/{name}": x[..., 0] for name, x in self.further.items()}
+        else:
+            results = {**{name: getattr(self, name) for name in RESULTS}, **self.further}
+            teams = range(self.win.shape[-1])
+            values |= {f"team{team}/{name}": x[..., team] for team in teams for name, x in results.items()}
+        return values | {f"ending/{name}": x for name, x in self.ending.items()}
 
 
-def is_per_episode(metric: str) -> bool:
-    """Returns whether a training metric is a mean over ended episodes; it is unknown where none ended."""
-    return is_outcome(metric) or metric in ("episode_length", "episode_return")
+RESULTS = ("win", "draw", "loss")
+"""Results of a match for a team."""
 
 
 class Cast(NamedTuple):

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.opponents import OUTCOMES
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import VectorEnv, where_rows
+from mqe_jax.train.types import RESULTS, VectorEnv, where_rows
 from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")
@@ -122,10 +121,9 @@ class Session:
             self.drive.low, self.drive.high = env.controller.changes[self._columns].T
         self.steps = 0
         self.episodes = np.zeros(self.num_envs, int)
-        self.outcomes, self.last = ("success",), [""] * self.num_envs
+        self.last = [""] * self.num_envs
         self.reset()
-        if all(f"team0/{name}" in self.state.metrics for name in OUTCOMES):
-            self.outcomes = OUTCOMES
+        self.outcomes = ("success",) if self.state.outcome.win is None else RESULTS
         self.counts = np.zeros(len(self.outcomes), int)
         rewards = [name for name in self.state.metrics if name.startswith("reward/")]
         self.terms = (*rewards, "average_step_reward")
@@ -198,6 +196,5 @@ class Session:
         memory = where_rows(done, self._first_memory, memory)
         names = [name for name in state.metrics if name.startswith("reward/")]
         rewards = jnp.stack([state.metrics[name] for name in (*names, "average_step_reward")], axis=-1)
-        names = [name if name in state.metrics else f"team0/{name}" for name in self.outcomes]
-        ended = jnp.stack([state.metrics[name] > 0 for name in names], axis=-1)
+        ended = jnp.stack([getattr(state.outcome, name)[:, 0] > 0 for name in self.outcomes], axis=-1)
         return state, memory, done, ended, rewards, commands

@@ -31,7 +31,7 @@ class Episode:
     dt: float
     """Time between frames, s."""
     success: float = 0.0
-    """`success` on the last step; 0 if the recording was cut at its time limit."""
+    """Success of team 0 on the last step; 0 if the recording was cut at its time limit."""
     reward: float = 0.0
     """Mean over steps of the sum of the reward terms."""
     settled: float = 0.0
@@ -87,7 +87,8 @@ def record(
         state = jax.vmap(env.step)(state, action)
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))
-        success = state.metrics.get("success", jnp.zeros_like(reward))
+        success = state.outcome.success
+        success = jnp.zeros_like(reward) if success is None else success[:, 0]
         return (state, memory), (*now(state), done, reward, success)
 
     @jax.jit

@@ -26,6 +26,7 @@ from mqe_jax.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
+from mqe_jax.train.types import Outcome
 from mqe_jax.walk import trainees
 from mqe_jax.walk.rewards import RewardInputs, WalkRewards, combine, reward_terms
 from mqe_jax.walk.task import RANDOMIZATION, EpisodeSpec, WalkState, WalkTask, sample_spec
@@ -147,6 +148,7 @@ class WalkEnv:
             reward=jnp.zeros(1),
             terminated=jnp.zeros((), bool),
             truncated=jnp.zeros((), bool),
+            outcome=Outcome(),
             metrics=_zero_metrics(self.task.rewards),
             spec=spec,
             slope=spec.slope,
