@@ -128,19 +128,19 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
 
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Sets the mouse's velocity."""
-        velocity = flee(self.object_pose(data, "mouse"), robot_state.position_w[0, :2], self.params.mouse_speed)
+        velocity = flee(self.object_pose(data, "mouse")[:2], robot_state.position_w[0, :2], self.params.mouse_speed)
         return data.replace(qvel=data.qvel.at[self.objects["mouse"].qvel].set(velocity))
 
     def distance(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns the horizontal distance of the robot to the mouse (), m."""
-        return jnp.linalg.norm(self.object_pose(state.data, "mouse") - robot_state.position_w[0, :2])
+        return jnp.linalg.norm(self.object_pose(state.data, "mouse")[:2] - robot_state.position_w[0, :2])
 
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("mouse", 2, "x, y, m")))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        return {"base": robot_state.base_info, "mouse": self.object_pose(state.data, "mouse")[None]}
+        return {"base": robot_state.base_info, "mouse": self.object_pose(state.data, "mouse")[:2][None]}
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         distance = self.distance(after.state, after.robots)

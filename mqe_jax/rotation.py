@@ -40,3 +40,16 @@ def rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
 def rotate_inverse(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
     """Rotates world-frame vectors (..., 3) into the body frame of wxyz quaternions (..., 4)."""
     return rotate(quaternion * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
+
+
+def compose(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Returns the products of wxyz quaternions (..., 4): rotations by `second`, then by `first`."""
+    (w, real), (u, v) = (first[..., :1], second[..., :1]), (first[..., 1:], second[..., 1:])
+    scalar = w * real - jnp.sum(u * v, axis=-1, keepdims=True)
+    return jnp.concatenate([scalar, w * v + real * u + jnp.cross(u, v)], axis=-1)
+
+
+def rotation(axis: jax.Array, angle: jax.Array) -> jax.Array:
+    """Returns the wxyz quaternions (..., 4) of rotations about unit axes (..., 3) by angles (...), rad."""
+    half = angle[..., None] / 2
+    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], axis=-1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +15,13 @@ import pytest
 
 from mqe_jax import engines, make, robots
 from mqe_jax.errors import InputError
+from mqe_jax.kinematics import poses
 from mqe_jax.robots.go1 import GO1
 from mqe_jax.robots.index import foot_positions, knee_positions
 from mqe_jax.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, Plane, RoughGround, SpawnArea, Track
+from tests.states import made
 
 PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
 
@@ -86,6 +90,22 @@ def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
     np.testing.assert_allclose(foot_positions(robot, jnp.asarray(joints)), feet, atol=1e-5)
     knees = data.xpos[scene.index.bodies[0, 3::3]] - [1.0, 2.0, 3.0]
     np.testing.assert_allclose(knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)
+
+
+@pytest.mark.parametrize("task", ["go1football-2vs2", "go1revolvingdoor", "go1seesaw", "go1pushbox"])
+def test_poses_of_all_bodies_are_where_mujoco_puts_them(task: str) -> None:
+    """With slides, hinges, ball joints, free joints, and walls that move."""
+    env, random = made(task), np.random.default_rng(0)
+    model = env.compiled.model
+    data = mujoco.MjData(model)
+    mujoco.mj_integratePos(model, data.qpos, random.normal(size=model.nv), 1.0)
+    data.mocap_pos += random.normal(size=data.mocap_pos.shape)
+    mujoco.mj_kinematics(model, data)
+    names = "qpos", "mocap_pos", "mocap_quat"
+    state: Any = SimpleNamespace(**{name: jnp.asarray(getattr(data, name), jnp.float32) for name in names})
+    found = poses(model, state, range(model.nbody))
+    np.testing.assert_allclose(found.position, data.xpos, atol=1e-5)
+    np.testing.assert_allclose(np.abs(np.sum(found.quaternion * data.xquat, axis=1)), 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))

@@ -29,6 +29,7 @@ from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import ENDINGS, Moment, S, State
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError, warn
+from mqe_jax.kinematics import poses
 from mqe_jax.limits import Environments
 from mqe_jax.precision import single
 from mqe_jax.robots.index import RobotState, placed, read_robots
@@ -318,9 +319,9 @@ class QuadrupedEnv(Task[S, P]):
         return read_robots(self.index, data.qpos, data.qvel, data.sensordata)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
-        """Returns the generalised coordinates of an object, as its class documents them; InputError for no object."""
+        """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame; InputError for no object."""
         check("name", name, Literal[tuple(self.objects)])
-        return data.qpos[self.objects[name].qpos]
+        return jnp.concatenate(poses(self.compiled.model, data, [self.objects[name].body]), axis=-1)[0]
 
     def fallen(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots exceed the roll, pitch or height limits (R,) bool."""

@@ -120,7 +120,7 @@ class Go1Tug(Duel[TugState, TugParams]):
 
     def cylinder_y(self, data: mjx.Data) -> jax.Array:
         """Returns the cylinder's y (), m."""
-        return self.object_pose(data, "cylinder")[0]
+        return self.object_pose(data, "cylinder")[1]
 
     def distance(self, now: Moment[TugState]) -> jax.Array:
         """Returns each robot's horizontal distance to the cylinder's axis (2,), m."""
