@@ -104,9 +104,14 @@ def make_learner(
 
 
 def make_env(
-    task: str | QuadrupedEnv, impl: str, overrides: Mapping[str, Any], num_envs: int, copies: int = 1
+    task: str | QuadrupedEnv,
+    impl: str,
+    overrides: Mapping[str, Any],
+    num_envs: int,
+    copies: int = 1,
+    final: Sequence[str] = (),
 ) -> tuple[Any, VectorEnv]:
-    """Returns a task and its vectorised environment with automatic reset; `copies` as in `VectorEnv`.
+    """Returns a task and its vectorised environment with automatic reset; `copies` and `final` as in `VectorEnv`.
 
     The task is an id, or an environment whose class and engine count; `parameters_of` returns its parameters.
     """
@@ -119,7 +124,7 @@ def make_env(
         env = type(task)(override(task.Params(), params), impl=task.impl, control=control, num_envs=num_envs * copies)
     else:
         env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
-    return env, VectorEnv(env, num_envs, copies)
+    return env, VectorEnv(env, num_envs, copies, final=final)
 
 
 def parameters_of(task: str | QuadrupedEnv) -> dict[str, Any]:
@@ -140,16 +145,18 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
-    both, started = make_env(task, impl, config.training_env, config.num_envs, seeds)
+    final = config.network.critic_reads
+    both, started = make_env(task, impl, config.training_env, config.num_envs, seeds, final)
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> Any:
         if demonstrator is None:
-            made = started if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds)
+            made = started if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds, final=final)
         else:
             policy = load_as("curriculum.demonstrator", demonstrator, both)
             everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
-            made = Demonstrated(both, num_envs, everyone, seeds, backward=config.curriculum.backward)
+            backward = config.curriculum.backward
+            made = Demonstrated(both, num_envs, everyone, seeds, backward=backward, final=final)
         return Deadline(made) if config.time_limit_ends else made
 
     eval_env = None

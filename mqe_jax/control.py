@@ -20,10 +20,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from mqe_jax.errors import InputError, nearest
 from mqe_jax.robots.index import Proprioception, placed
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.settings import fail
 from mqe_jax.skills import Skill
 
 MODES = ("command", "position", "torque")
@@ -89,6 +91,23 @@ class Controller:
         if self.mode == "torque":
             rest[: self.num_agents] = 0.0
         return rest
+
+    def checked(self, action: jax.Array) -> jax.Array:
+        """Returns actions (A, action_size) as an array; InputError for others, or known ones that are not finite."""
+        try:
+            action = jnp.asarray(action)
+        except (TypeError, ValueError, OverflowError):
+            fail("action", action, "an array of numbers")
+        shape = (self.num_agents, self.action_size)
+        if action.shape != shape:
+            raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
+        if not jnp.issubdtype(action.dtype, jnp.floating):
+            raise InputError(f"action: dtype {action.dtype}; expected a floating-point type")
+        # Under jit the result is traced even where the action is a captured constant.
+        finite = jnp.all(jnp.isfinite(action))
+        if not isinstance(finite, Tracer) and not bool(finite):
+            raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
+        return action
 
     def reset(self) -> ControlState:
         """Returns the controller state after a reset."""

@@ -6,6 +6,8 @@ Source: resets to demonstrated states, moved backwards as success permits (Tao e
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
-from mqe_jax.envs.autoreset import KEPT, autoreset
+from mqe_jax.envs.autoreset import FINAL, KEPT
 from mqe_jax.precision import single
 from mqe_jax.settings import checked, fail
 from mqe_jax.train import devices
@@ -49,17 +51,24 @@ class Demonstrated(VectorEnv):
 
     @checked(demonstrator=AnyPolicy, backward=bool)
     def __init__(
-        self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1, *, backward: bool = False
+        self,
+        env: QuadrupedEnv,
+        num_envs: int,
+        demonstrator: Policy,
+        copies: int = 1,
+        *,
+        backward: bool = False,
+        final: Sequence[str] = FINAL,
     ) -> None:
-        """Creates the batch; `demonstrator` acts for all agents, `num_envs` and `copies` are those of `VectorEnv`."""
-        super().__init__(env, num_envs, copies)
+        """Creates the batch; `demonstrator` acts for all agents, the others are those of `VectorEnv`."""
+        super().__init__(env, num_envs, copies, final=final)
         if (demonstrator.task, demonstrator.agents) != (env.name, env.num_agents):
             given = f"one of {demonstrator.agents} agents on {demonstrator.task}"
             fail("demonstrator", given, f"one of all {env.num_agents} agents on {env.name}")
         if self.max_episode_steps < MOMENTS:
             fail("episode_length", env.params.episode_length, f"at least {MOMENTS} steps with a demonstrator")
         self.demonstrator, self.backward = demonstrator, backward
-        self._guide = VectorEnv(self.env, EPISODES)
+        self._guide = VectorEnv(self.env, EPISODES, final=())
 
     @single
     def reset(self, key: jax.Array) -> DemonstratedState:
@@ -78,7 +87,7 @@ class Demonstrated(VectorEnv):
 
         def start(key: jax.Array, assistance: jax.Array) -> State:
             fresh_key, choice_key, index_key = jax.random.split(key, 3)
-            fresh = self.env.reset(fresh_key, assistance)
+            fresh = self.env.begin(fresh_key, assistance)
             if self.backward:
                 index, chosen = _earlier(demonstrations["phase"], assistance, index_key)
             else:
@@ -87,11 +96,8 @@ class Demonstrated(VectorEnv):
             begun = jax.tree.map(lambda x, y: jnp.where(chosen, x[index], y), fields, _fields(fresh))
             return dataclasses.replace(fresh, **{**begun, "data": fresh.data.replace(**begun["data"])})
 
-        def one(state: State, action: jax.Array) -> State:
-            return autoreset(self.env, self.env.step(state, action), start)
-
         plain = State(**{field.name: getattr(state, field.name) for field in dataclasses.fields(State)})
-        after = jax.vmap(one)(plain, action)
+        after = jax.vmap(functools.partial(self._step, start=start))(plain, action)
         return DemonstratedState(**vars(after), demonstrations=demonstrations)
 
     def _record(self) -> PyTree:
@@ -142,5 +148,5 @@ def _phases(decided: jax.Array, done: jax.Array) -> jax.Array:
 
 def _fields(state: State) -> dict[str, Any]:
     """Returns the fields of states that a start sets."""
-    names = [field.name for field in dataclasses.fields(State) if field.name not in ("data", "key", *KEPT)]
+    names = [field.name for field in dataclasses.fields(State) if field.name not in ("data", "key", *FINAL, *KEPT)]
     return {**{name: getattr(state, name) for name in names}, "data": {n: getattr(state.data, n) for n in STATE_FIELDS}}

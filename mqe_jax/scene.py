@@ -111,6 +111,11 @@ class CompiledScene:
         """Half-widths of the anchors' ranges (G, 2), m."""
         return np.array([anchor.spread for anchor in self.layout.anchors]).reshape(-1, 2)
 
+    def sample_anchors(self, key: jax.Array) -> jax.Array:
+        """Samples the anchors' positions (G, 2), m."""
+        mean, spread = self.anchor_mean, self.anchor_spread
+        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
+
     def wall_positions(self, anchors: jax.Array) -> jax.Array:
         """Places the moving walls (W, 3) around anchors (G, 2), m: values for `mocap_pos`."""
         if not len(self.mocap_anchor):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs.state import with_final
 from mqe_jax.errors import InputError
 from mqe_jax.policies import SimplePolicy, load_as
 from mqe_jax.precision import single
@@ -106,9 +107,15 @@ class TeamEnv:
     @single
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
         """Returns a randomised initial state; see `QuadrupedEnv.reset`."""
-        state = self.match.reset(key, assistance)
-        memory = self.opponent.initial_memory(1)
-        return self._seen(TeamState(**vars(state), rival_obs=state.obs, rival_memory=memory))
+        return with_final(self.observed(self.begin(key, assistance)))
+
+    def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
+        """Returns the state of `reset` without observations."""
+        rival = {
+            "rival_obs": jnp.zeros((self.num_agents, self.match.observation_size)),
+            "rival_memory": self.opponent.initial_memory(1),
+        }
+        return self._of_team(TeamState(**vars(self.match.begin(key, assistance)), **rival))
 
     @single
     def step(self, state: State, action: jax.Array) -> TeamState:
@@ -124,20 +131,21 @@ class TeamEnv:
         key = jax.random.fold_in(own.key, 1)
         rival, memory = self.opponent.act(own.rival_obs[None], own.rival_memory, key)
         both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.asarray(rival[0], jnp.float32)])
-        after: Any = self.match.step(own, both)
-        return self._seen(dataclasses.replace(after, rival_memory=memory))
+        after: Any = self.match.advance(own, both)
+        return with_final(self.observed(self._of_team(dataclasses.replace(after, rival_memory=memory))))
 
-    def _seen(self, state: TeamState) -> TeamState:
-        """Reduces observations, rewards and metrics of all agents to those of team 0."""
-        own = slice(0, self.num_agents)
+    def observed(self, state: TeamState) -> TeamState:
+        """Returns the state with the observations of both teams that belong to it."""
+        seen: Any = self.match.observed(state)
+        return dataclasses.replace(seen, obs=seen.obs[: self.num_agents], rival_obs=seen.obs[self.num_agents :])
+
+    def _of_team(self, state: TeamState) -> TeamState:
+        """Reduces rewards, outcome and metrics of all agents to those of team 0."""
         return dataclasses.replace(
             state,
-            obs=state.obs[own],
-            final_obs=state.final_obs[own],
-            reward=state.reward[own],
+            reward=state.reward[: self.num_agents],
             outcome=state.outcome.by_team(lambda x: x[:1]),
             metrics={name: value for name, value in state.metrics.items() if not name.startswith("team1/")},
-            rival_obs=state.obs[self.num_agents :],
         )
 
 

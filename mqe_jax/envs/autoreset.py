@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import jax
@@ -16,6 +16,7 @@ from mqe_jax.envs.state import State
 from mqe_jax.errors import InputError
 from mqe_jax.limits import Environments, PositiveInt
 from mqe_jax.memory import bytes_of, check_memory
+from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.types import RandomKey
@@ -23,33 +24,35 @@ from mqe_jax.train.types import RandomKey
 KEPT = ("assistance", "reward", "terminated", "truncated", "outcome", "metrics", "final_obs", "final_privileged_obs")
 """Fields that an auto-reset keeps; all but the first describe the last step."""
 
+FINAL = ("obs", "privileged_obs")
+"""Observations of which a batch may have those at the end of a step too."""
+
 _SMALL = 4096
 """Number of environments whose memory is not checked, which saves a trace."""
 
 Start = Callable[[jax.Array, jax.Array], State]
-"""Returns an initial state from a random key and the assistance, as `QuadrupedEnv.reset`."""
+"""Returns an initial state from a random key and the assistance, as `QuadrupedEnv.begin`."""
 
 
-@jax.named_scope("reset")
 def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> State:
-    """Replaces the state of one environment by a new initial state if its episode has ended.
+    """Replaces the state of one environment by a new initial state if its episode has ended, and observes it.
 
-    Resets the whole state, without a forward pass. `reward`, `terminated`, `truncated`, `outcome`, `metrics` and
-    `final_obs` still describe the step that ended the episode; `obs` belongs to the new episode. `assistance` is kept.
-    The new episode starts in the state of `start`, by default of the task's reset.
+    Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step that ended the episode;
+    `assistance` is kept. The new episode starts in the state of `start`, by default of the task's reset.
     """
     done = state.terminated | state.truncated
-    key, reset_key = jax.random.split(state.key)
-    fresh = (start or env.reset)(reset_key, state.assistance)
-    merged = {
-        field.name: jax.tree.map(
-            lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
-        )
-        for field in dataclasses.fields(state)
-        if field.name not in ("data", "key", *KEPT)
-    }
-    data = env.physics.merge(done, fresh.data, state.data)
-    return dataclasses.replace(state, data=data, key=key, **merged)
+    with jax.named_scope("reset"):
+        key, reset_key = jax.random.split(state.key)
+        fresh = (start or env.begin)(reset_key, state.assistance)
+        merged = {
+            field.name: jax.tree.map(
+                lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
+            )
+            for field in dataclasses.fields(state)
+            if field.name not in ("data", "key", *FINAL, *KEPT)
+        }
+        data = env.physics.merge(done, fresh.data, state.data)
+    return env.observed(dataclasses.replace(state, data=data, key=key, **merged))
 
 
 class Batch:
@@ -91,14 +94,26 @@ class VectorEnv(Batch):
 
     copies: int
     """Batches for which buffers are sized."""
+    final: tuple[str, ...]
+    """Which of `FINAL` are observed at the end of a step too, before any reset."""
 
-    def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1) -> None:
-        """Creates the batch; buffers are sized for `copies` batches under an outer `vmap`, such as one per seed."""
+    def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = FINAL) -> None:
+        """Creates the batch.
+
+        Args:
+            env: the task.
+            num_envs: number of environments N.
+            copies: batches under an outer `vmap`, such as one per seed, for which buffers are sized.
+            final: which of the observations `final_obs` and `final_privileged_obs` a step returns, by the names in
+                `FINAL`; a critic needs them where an episode is cut by the time limit, and each takes time.
+        """
         if isinstance(env, type) or not hasattr(env, "with_num_envs"):  # of tasks and of `walk.env.WalkEnv`
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
         num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
-        self.num_envs, self.copies = num_envs, copies
+        self.num_envs, self.copies, self.final = num_envs, copies, tuple(final)
+        if not {*final} <= {*FINAL}:
+            fail("final", final, f"some of {', '.join(FINAL)}")
         if num_envs * copies > _SMALL:
             state = jax.eval_shape(functools.partial(VectorEnv.reset, self), jax.random.PRNGKey(0))
             check_memory("num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count())
@@ -113,7 +128,8 @@ class VectorEnv(Batch):
     @checked(key=RandomKey)
     def reset(self, key: jax.Array) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
-        return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
+        state = jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
+        return dataclasses.replace(state, **{f"final_{name}": None for name in FINAL if name not in self.final})
 
     def share(self, parts: int) -> Self:
         """Returns the batch of one of several processes; raises an InputError for a fraction of an environment."""
@@ -129,8 +145,13 @@ class VectorEnv(Batch):
             InputError: as `QuadrupedEnv.step`, and for another number of environments.
         """
         self.check_step(state, action, self.env.state_type)
+        return jax.vmap(self._step)(state, action)
 
-        def one(state: State, action: jax.Array) -> State:
-            return autoreset(self.env, self.env.step(state, action))
-
-        return jax.vmap(one)(state, action)
+    @single
+    def _step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
+        """Advances one environment, and resets it to `start` if its episode ended; see `autoreset`."""
+        state = self.env.advance(state, action)
+        if self.final:
+            seen = self.env.observed(state)
+            state = dataclasses.replace(state, **{f"final_{name}": getattr(seen, name) for name in self.final})
+        return autoreset(self.env, state, start)

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.core import Tracer
 
 from mqe_jax import engines, robots, skills
 from mqe_jax.actuators import Actuators, NetworkActuators, load_actuator_network
@@ -26,7 +25,7 @@ from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.returned import alike, results, shaped, weights_of
 from mqe_jax.envs.reward import faded, weigh
-from mqe_jax.envs.state import ENDINGS, Moment, S, State
+from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError, warn
 from mqe_jax.kinematics import poses
@@ -41,6 +40,8 @@ from mqe_jax.train.types import Level, Outcome, RandomKey
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
     from mujoco import mjx
+
+_NOISE = 7919  # folded into a state's key for the noise of its observations
 
 
 class QuadrupedEnv(Task[S, P]):
@@ -203,10 +204,14 @@ class QuadrupedEnv(Task[S, P]):
             key: random key.
             assistance: curriculum level in [0, 1]; 0 is the unmodified task.
         """
+        return with_final(self.observed(self.begin(key, assistance)))
+
+    def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
+        """Returns the state of `reset` without observations."""
         keys = jax.random.split(key, 9)
-        next_key, anchor_key, spawn_key, body_key, object_key, physics_key, task_key, noise_key, freeze_key = keys
+        next_key, anchor_key, spawn_key, body_key, object_key, physics_key, task_key, _, freeze_key = keys
         assistance = jnp.asarray(assistance, jnp.float32)
-        anchors = self._sample_anchors(anchor_key)
+        anchors = self.compiled.sample_anchors(anchor_key)
         qpos, qvel = self._sample_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
         ctrl = self.actuators.control(jnp.asarray(self.controller.neutral))
@@ -217,8 +222,8 @@ class QuadrupedEnv(Task[S, P]):
             data=data,
             obs=empty,
             privileged_obs=empty,
-            final_obs=empty,
-            final_privileged_obs=empty,
+            final_obs=None,
+            final_privileged_obs=None,
             reward=jnp.zeros(self.num_agents),
             terminated=no,
             truncated=no,
@@ -239,11 +244,9 @@ class QuadrupedEnv(Task[S, P]):
         names = (*logged, "collision", "diverged", "overflow")
         outcome = dataclasses.replace(self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no))
         outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
-        state = dataclasses.replace(state, outcome=outcome, metrics={name: jnp.zeros(()) for name in names})
-        return self._observed(state, robot_state, noise_key)
+        return dataclasses.replace(state, outcome=outcome, metrics={name: jnp.zeros(()) for name in names})
 
     @single
-    @jax.named_scope("task")
     def step(self, state: State[S], action: jax.Array) -> State[S]:
         """Advances one environment by one environment step.
 
@@ -256,12 +259,17 @@ class QuadrupedEnv(Task[S, P]):
                 not finite. Finiteness is checked only outside of compiled code; inside, an action that is not finite
                 ends the episode as diverged.
         """
+        return with_final(self.observed(self.advance(state, action)))
+
+    @jax.named_scope("task")
+    def advance(self, state: State[S], action: jax.Array) -> State[S]:
+        """Returns the state of `step` with the observations from before it."""
         self._check_state(state)
-        action = self._checked(action)
+        action = self.controller.checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
         action = self.unmirror_action(jnp.where((state.step < state.frozen_steps)[:, None], 0.0, action))
-        key, push_key, noise_key, npc_key = jax.random.split(state.key, 4)
+        key, push_key, _, npc_key = jax.random.split(state.key, 4)
 
         before = Moment(state, self.read(state.data))
         target, control = self.controller.targets(
@@ -278,8 +286,20 @@ class QuadrupedEnv(Task[S, P]):
         moved = {"data": data, "control": control, "actuators": actuators}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
         state = self.judge(before, Moment(state, robot_state), bad_action)
-        state = dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
-        return self._observed(state, robot_state, noise_key)
+        return dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
+
+    @jax.named_scope("task")
+    def observed(self, state: State[S]) -> State[S]:
+        """Returns the state with the observations that belong to it."""
+        layout, robot_state = self.observation_layout, self.read(state.data)
+        obs = layout.pack(self.observe(state, robot_state), self.num_agents)
+        noise = self.params.randomization.observation_noise
+        if noise:
+            obs = obs + noise * layout.continuous * jax.random.normal(jax.random.fold_in(state.key, _NOISE), obs.shape)
+        clock = self.controller.clock(state.control)
+        privileged = self.privileged.observe(robot_state, state.data, state.anchors, state.randomized, clock)
+        obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
+        return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
         """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""
@@ -333,10 +353,6 @@ class QuadrupedEnv(Task[S, P]):
 
     # -- internals of reset and step ----------------------------------------------------------------------------
 
-    def _sample_anchors(self, key: jax.Array) -> jax.Array:
-        mean, spread = self.compiled.anchor_mean, self.compiled.anchor_spread
-        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
-
     def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
         params, model, index = self.params, self.compiled.model, self.index
         pose = self.spawn(spawn_key)
@@ -373,36 +389,7 @@ class QuadrupedEnv(Task[S, P]):
             "returns; jax.vmap or VectorEnv steps a batch"
         )
 
-    def _checked(self, action: jax.Array) -> jax.Array:
-        try:
-            action = jnp.asarray(action)
-        except (TypeError, ValueError, OverflowError):
-            fail("action", action, "an array of numbers")
-        shape = (self.num_agents, self.action_size)
-        if action.shape != shape:
-            raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
-        if not jnp.issubdtype(action.dtype, jnp.floating):
-            raise InputError(f"action: dtype {action.dtype}; expected a floating-point type")
-        # Under jit the result is traced even where the action is a captured constant.
-        finite = jnp.all(jnp.isfinite(action))
-        if not isinstance(finite, Tracer) and not bool(finite):
-            raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
-        return action
-
     def _diverged(self, data: mjx.Data) -> jax.Array:
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
-
-    def _observed(self, state: State[S], robot_state: RobotState, key: jax.Array) -> State[S]:
-        layout = self.observation_layout
-        obs = layout.pack(self.observe(state, robot_state), self.num_agents)
-        noise = self.params.randomization.observation_noise
-        if noise:
-            obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
-        clock = self.controller.clock(state.control)
-        privileged = self.privileged.observe(robot_state, state.data, state.anchors, state.randomized, clock)
-        obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
-        return dataclasses.replace(
-            state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged
-        )

@@ -32,10 +32,11 @@ class EnvironmentState:
     """The agents' observations (A, O); after an auto-reset, those of the new episode."""
     privileged_obs: jax.Array
     """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new episode."""
-    final_obs: jax.Array
-    """Observations at the end of the last step (A, O); differs from `obs` only after an auto-reset."""
-    final_privileged_obs: jax.Array
-    """Privileged observation at the end of the last step (P,)."""
+    final_obs: jax.Array | None
+    """Observations at the end of the last step (A, O), which differ from `obs` after an auto-reset alone; None in a
+    batch without them (`VectorEnv.final`)."""
+    final_privileged_obs: jax.Array | None
+    """Privileged observation at the end of the last step (P,), or None."""
     reward: jax.Array
     """Reward (A,)."""
     terminated: jax.Array
@@ -77,6 +78,11 @@ class State(EnvironmentState, Generic[S]):
     """The task's own fields."""
     frozen_steps: jax.Array
     """Initial steps during which each agent's action is replaced by zero (A,) int32."""
+
+
+def with_final(state: Any) -> Any:
+    """Returns a state whose observations are also those at the end of its step."""
+    return dataclasses.replace(state, final_obs=state.obs, final_privileged_obs=state.privileged_obs)
 
 
 class Moment(NamedTuple, Generic[S]):

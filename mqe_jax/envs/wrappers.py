@@ -88,12 +88,12 @@ class Deadline(Wrapper):
         self.privileged_observation_size += 1
 
     def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
-        def timed(privileged: jax.Array, step: jax.Array) -> jax.Array:
+        def add_time(privileged: jax.Array, step: jax.Array) -> jax.Array:
             return jnp.concatenate([privileged, 1.0 - step[:, None] / self.max_episode_steps], axis=1)
 
         return {
-            "privileged_obs": timed(inner.privileged_obs, inner.step),
-            "final_privileged_obs": timed(inner.final_privileged_obs, reached),
+            "privileged_obs": add_time(inner.privileged_obs, inner.step),
+            "final_privileged_obs": jax.tree.map(lambda x: add_time(x, reached), inner.final_privileged_obs),
             "terminated": inner.terminated | inner.truncated,
             "truncated": jnp.zeros_like(inner.truncated),
         }

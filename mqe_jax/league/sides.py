@@ -41,9 +41,9 @@ class BothSides(Wrapper):
 
         return {
             "obs": self._exchanged(inner.obs),
-            "final_obs": self._exchanged(inner.final_obs),
+            "final_obs": jax.tree.map(self._exchanged, inner.final_obs),
             "privileged_obs": told(inner.privileged_obs),
-            "final_privileged_obs": told(inner.final_privileged_obs),
+            "final_privileged_obs": jax.tree.map(told, inner.final_privileged_obs),
             "reward": self._exchanged(inner.reward),
             "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
             "metrics": metrics,

@@ -36,9 +36,12 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
         "truncated": (count,),
     }
     for name, shape in expected.items():
-        found = getattr(state, name).shape
-        if found != shape:
-            raise InputError(f"env: {name} of {env.name} has shape {found}; expected {shape}")
+        value = getattr(state, name)
+        if value is None and name.removeprefix("final_") not in config.network.critic_reads:
+            continue
+        if value is None or value.shape != shape:
+            found = "missing" if value is None else f"of shape {value.shape}"
+            raise InputError(f"env: {name} of {env.name} is {found}; expected {shape}")
     numbers = env.num_agents * (env.observation_size + env.action_size + 4) + privileged
     check_memory("rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update / processes)
     assistance = config.curriculum.assistance

@@ -99,8 +99,7 @@ def make_learner(
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)
-    dims = env_dims(env, config)
-    network = config.network.build(dims)
+    network = config.network.build(env_dims(env, config))
     check_divisible(config, network, processes)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
@@ -223,8 +222,10 @@ def _prepare(
     obs, privileged = normalize_obs(
         state.obs_normalizer, transitions.obs, transitions.privileged_obs, config.normalization.observations
     )
+    # What the critic does not read may be missing; these observations take its place.
+    final = (transitions.final_obs, transitions.obs), (transitions.final_privileged_obs, transitions.privileged_obs)
     final_obs, final_privileged = normalize_obs(
-        state.obs_normalizer, transitions.final_obs, transitions.final_privileged_obs, config.normalization.observations
+        state.obs_normalizer, *(b if a is None else a for a, b in final), config.normalization.observations
     )
     pair, _ = network.value(
         state.params,

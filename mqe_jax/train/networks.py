@@ -86,6 +86,11 @@ class NetworkSettings:
     name: str
     """Registered name of the network that the other fields configure."""
 
+    @property
+    def critic_reads(self) -> tuple[str, ...]:
+        """The observations on which `Network.value` depends; others may be missing at the end of a step."""
+        return "obs", "privileged_obs"
+
     def build(self, dims: EnvDims) -> Network:
         """Returns the network for an environment; InputError if the settings do not fit it."""
         raise NotImplementedError
@@ -189,6 +194,10 @@ class ActorCritic(GaussianSettings):
     action_mean: Literal["linear", "tanh"] = "linear"
     """Output activation of the mean action: linear (unbounded) or tanh."""
 
+    @property
+    def critic_reads(self) -> tuple[str, ...]:
+        return ("privileged_obs",) if self.critic_input == "privileged" else ("obs",)
+
     def build(self, dims: EnvDims) -> Network:
         """Returns the network; see `Network`."""
         from mqe_jax.train import actor_critic
@@ -217,6 +226,10 @@ class Mat(GaussianSettings):
         super().__post_init__()
         if self.width % self.heads:
             fail("heads", self.heads, f"a divisor of width ({self.width})")
+
+    @property
+    def critic_reads(self) -> tuple[str, ...]:
+        return ("obs",)
 
     def build(self, dims: EnvDims) -> Network:
         """Returns the network; see `Network`."""

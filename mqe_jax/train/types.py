@@ -108,10 +108,11 @@ class VectorEnv(Protocol):
 
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the environment clips actions, unbounded
     samples of the policy, to its range. The state is any pytree with these fields: obs (N, A, O) is the input of the
-    next action; final_obs (N, A, O) and final_privileged_obs (N, P) belong to the state reached by the step, before any
-    reset; privileged_obs (N, P); reward (N, A); terminated, truncated (N,) bool; outcome, an `Outcome`, counts at the
-    end of an episode; metrics maps names to (N,), which are averaged over steps, except for the counts `diverged` and
-    `overflow`. All names are present from the reset on.
+    next action; privileged_obs (N, P); final_obs (N, A, O) and final_privileged_obs (N, P) belong to the state reached
+    by the step, before any reset, and may be None if the critic does not read them (`NetworkSettings.critic_reads`);
+    reward (N, A); terminated, truncated (N,) bool; outcome, an `Outcome`, counts at the end of an episode; metrics maps
+    names to (N,), which are averaged over steps, except for the counts `diverged` and `overflow`. All names are present
+    from the reset on.
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
@@ -285,10 +286,10 @@ class Transition(NamedTuple):
     """Observations (N, A, O)."""
     privileged_obs: jax.Array
     """Privileged observations (N, P)."""
-    final_obs: jax.Array
-    """Observations of the state reached (N, A, O)."""
-    final_privileged_obs: jax.Array
-    """Privileged observations of the state reached (N, P)."""
+    final_obs: jax.Array | None
+    """Observations of the state reached (N, A, O), or None if the critic does not read them."""
+    final_privileged_obs: jax.Array | None
+    """Privileged observations of the state reached (N, P), or None."""
     action: jax.Array
     """Actions as sampled: unscaled and unclipped (N, A, D)."""
     log_prob: jax.Array

@@ -20,6 +20,7 @@ import numpy as np
 from mqe_jax import engines, walk_policy
 from mqe_jax.actuators import Actuators
 from mqe_jax.envs.randomization import Randomization, RandomizedParams, Randomizer
+from mqe_jax.envs.state import with_final
 from mqe_jax.precision import single
 from mqe_jax.robots.index import Proprioception, RobotState, foot_positions, read_robots
 from mqe_jax.robots.robot import NUM_JOINTS, Robot
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
+_NOISE = 7919  # folded into a state's key for the noise of its observations
 MOTOR_OFFSET = 0.02  # greatest offset of a joint's target under randomisation, rad
 SHOVED = np.array([0.25, 0.08, 0.06])  # half-lengths of the box in the trunk's frame on which shoves act, m
 
@@ -113,7 +115,11 @@ class WalkEnv:
     @single
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0, spec: EpisodeSpec | None = None) -> WalkState:
         """Returns the initial state of an episode; samples a spec if none is given."""
-        next_key, spec_key, random_key, pose_key, noise_key = jax.random.split(key, 5)
+        return with_final(self.observed(self.begin(key, assistance, spec)))
+
+    def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0, spec: EpisodeSpec | None = None) -> WalkState:
+        """Returns the state of `reset` without observations."""
+        next_key, spec_key, random_key, pose_key, _ = jax.random.split(key, 5)
         assistance = jnp.asarray(assistance, jnp.float32)
         if spec is None:
             spec = sample_spec(spec_key, self.task, self.trainee, assistance)
@@ -139,7 +145,7 @@ class WalkEnv:
         data = self.physics.init(qpos, qvel, jnp.zeros((0, 3)), ctrl)
         zero, zeros = jnp.zeros(()), jnp.zeros(NUM_JOINTS)
         memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), zeros, zeros, zero)
-        state = WalkState(
+        return WalkState(
             data=data,
             obs=zero,
             privileged_obs=zero,
@@ -164,13 +170,16 @@ class WalkEnv:
             assistance=assistance,
             key=next_key,
         )
-        return self._observed(state, noise_key)
 
     @single
     def step(self, state: WalkState, action: jax.Array) -> WalkState:
         """Advances by one policy step with an action (1, 12)."""
+        return with_final(self.observed(self.advance(state, action)))
+
+    def advance(self, state: WalkState, action: jax.Array) -> WalkState:
+        """Returns the state of `step` with the observations from before it."""
         task, index = self.task, self.index
-        key, direction_key, time_key, size_key, spec_key, noise_key = jax.random.split(state.key, 6)
+        key, direction_key, time_key, size_key, spec_key, _ = jax.random.split(state.key, 6)
         action = jnp.clip(action[0], -walk_policy.ACTION_CLIP, walk_policy.ACTION_CLIP)
         target = self.robot.joint_targets(action)
         previous_target = self.robot.joint_targets(state.memory.action)
@@ -237,7 +246,7 @@ class WalkEnv:
             fresh = sample_spec(spec_key, task, self.trainee, state.assistance)
             spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, spec)
             mean_error = jnp.where(renewed, 0.0, mean_error)
-        state = dataclasses.replace(
+        return dataclasses.replace(
             state,
             data=data,
             reward=jnp.where(finite, reward, 0.0)[None],
@@ -255,7 +264,6 @@ class WalkEnv:
             episode_steps=episode_steps,
             key=key,
         )
-        return self._observed(state, noise_key)
 
     # -- robot state --------------------------------------------------------------------------------------------
 
@@ -313,14 +321,16 @@ class WalkEnv:
         forces = forces.at[trunk, :2].add(force[0] * along + force[1] * left)
         return forces.at[trunk].add(shove) if self.task.shove else forces
 
-    def _observed(self, state: WalkState, key: jax.Array) -> WalkState:
+    def observed(self, state: WalkState) -> WalkState:
+        """Returns the state with the observations that belong to it."""
         robot_state = self.read(state.data)
         quaternion = robot_state.quaternion[0]
         gravity = rotate_inverse(quaternion, gravity_w(state.slope) / GRAVITY)
         sensed = Proprioception(gravity, robot_state.joint_position[0], robot_state.joint_velocity[0])
         obs = clean = self.trainee.observe(state.memory, state.spec.commands, sensed)
         if self.task.randomize:
-            parts = zip(sensed, (0.02, 0.005, 0.5), jax.random.split(key, 3), strict=True)
+            keys = jax.random.split(jax.random.fold_in(state.key, _NOISE), 3)
+            parts = zip(sensed, (0.02, 0.005, 0.5), keys, strict=True)
             noisy = Proprioception(*(x + size * jax.random.normal(part_key, x.shape) for x, size, part_key in parts))
             obs = self.trainee.observe(state.memory, state.spec.commands, noisy)
         velocity = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
@@ -352,9 +362,7 @@ class WalkEnv:
         )
         obs = jnp.nan_to_num(jnp.clip(obs, -100.0, 100.0))[None]
         privileged = jnp.nan_to_num(jnp.clip(privileged, -100.0, 100.0))
-        return dataclasses.replace(
-            state, obs=obs, privileged_obs=privileged, final_obs=obs, final_privileged_obs=privileged
-        )
+        return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:
