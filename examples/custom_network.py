@@ -37,22 +37,23 @@ class MeanField(NetworkSettings):
             params = {name: nn.mlp_init(k, sizes[name], final_scale=0.1) for k, name in zip(keys, sizes, strict=True)}
             return {**params, "log_std": jnp.full(dims.action, -0.5)}
 
-        def encode(params, obs):
+        def encode(params, obs, active):
             own = nn.mlp(params["encoder"], obs, activate_last=True)
-            return jnp.concatenate([own, jnp.broadcast_to(own.mean(-2, keepdims=True), own.shape)], axis=-1)
+            mean = own.mean(-2, keepdims=True, where=True if active is None else active[..., None])
+            return jnp.concatenate([own, jnp.broadcast_to(mean, own.shape)], axis=-1)
 
-        def act(params, memory, obs, key):
-            mean = nn.mlp(params["actor"], encode(params, obs))
+        def act(params, memory, obs, key, active=None):
+            mean = nn.mlp(params["actor"], encode(params, obs, active))
             noise = 0.0 if key is None else jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
             return mean + noise, log_prob(mean + noise, mean, params["log_std"]), memory
 
-        def value(params, memory, is_first, obs, privileged):
-            return nn.mlp(params["critic"], encode(params, obs))[..., 0], memory
+        def value(params, memory, is_first, obs, privileged, active=None):
+            return nn.mlp(params["critic"], encode(params, obs, active))[..., 0], memory
 
-        def evaluate(params, memory, is_first, obs, privileged, action):
-            mean = nn.mlp(params["actor"], encode(params, obs))
+        def evaluate(params, memory, is_first, obs, privileged, action, active=None):
+            mean = nn.mlp(params["actor"], encode(params, obs, active))
             spread = jnp.broadcast_to(params["log_std"], mean.shape)
-            values, _ = value(params, (), is_first, obs, privileged)
+            values, _ = value(params, (), is_first, obs, privileged, active)
             return Evaluation(log_prob(action, mean, spread), entropy(spread), values)
 
         def policy_params(params):

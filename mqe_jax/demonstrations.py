@@ -20,7 +20,7 @@ from mqe_jax.precision import single
 from mqe_jax.settings import checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import AnyPolicy, PyTree, where_rows
+from mqe_jax.train.types import AnyPolicy, PyTree, observations, where_rows
 
 EPISODES = 128
 """Environments in which the demonstrator acts."""
@@ -107,7 +107,7 @@ class Demonstrated(VectorEnv):
 
         def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Any]:
             state, memory = carry
-            action, memory = policy.act(state.obs, memory, key)
+            action, memory = policy.act(observations(state), memory, key)
             state = guide.step(state, action)
             done = state.terminated | state.truncated
             return (state, where_rows(done, first, memory)), (jnp.max(state.outcome.success, axis=-1), done)

@@ -20,7 +20,17 @@ from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy
-from mqe_jax.train.types import AnyBatch, AnyPolicy, Memory, PyTree, RandomKey, check_act, where_rows
+from mqe_jax.train.types import (
+    AnyBatch,
+    AnyPolicy,
+    Memory,
+    Observations,
+    PyTree,
+    RandomKey,
+    check_act,
+    observations,
+    where_rows,
+)
 
 
 @jax.tree_util.register_dataclass
@@ -125,9 +135,10 @@ class Versus(OneTeam):
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
         others, opponents = [], []
         for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
-            obs = state.match.obs[self._block(i), self.num_agents :]
+            block = jax.tree.map(lambda x: x[self._block(i)], observations(state.match))  # noqa: B023
             shape = (self._size, self.num_agents, self.action_size)
-            other, memory = check_act("opponents", _act(policy, opponent, obs, keys[i]), shape, opponent.memory)
+            returned = _act(policy, opponent, block.of(slice(self.num_agents, None)), keys[i])
+            other, memory = check_act("opponents", returned, shape, opponent.memory)
             others.append(jnp.asarray(other, jnp.float32))
             opponents.append(dataclasses.replace(opponent, memory=memory))
         theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
@@ -211,6 +222,7 @@ class Versus(OneTeam):
             assistance=match.assistance,
             opponents=opponents,
             key=key,
+            active=jax.tree.map(lambda x: x[:, own], match.active),
         )
 
 
@@ -295,6 +307,7 @@ class Mirror(OneTeam):
             assistance=twice(match.assistance),
             opponents=(),
             key=jnp.zeros((2,), jnp.uint32),
+            active=jax.tree.map(teams, match.active),
         )
 
 
@@ -313,7 +326,7 @@ def _arrays(policy: Policy) -> PyTree:
     return jax.tree.map(jnp.asarray, policy.arrays) if isinstance(policy, TrainedPolicy) else ()
 
 
-def _act(policy: Policy, opponent: Opponent, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
+def _act(policy: Policy, opponent: Opponent, obs: Observations, key: jax.Array) -> tuple[jax.Array, Any]:
     """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
     if not isinstance(policy, TrainedPolicy):
         return policy.act(obs, opponent.memory, key)

@@ -21,7 +21,7 @@ from mqe_jax.precision import single
 from mqe_jax.settings import PathText, check, checked, override
 from mqe_jax.train import devices
 from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, read_policy
-from mqe_jax.train.types import AnyEnvironment, AnyPolicy, Memory, PolicyOrAct, RandomKey
+from mqe_jax.train.types import AnyEnvironment, AnyPolicy, Memory, Observations, PolicyOrAct, RandomKey
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -48,9 +48,10 @@ class SimplePolicy:
         return ()
 
     @single
-    def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
-        return self.plan(check_obs(obs, self.agents), check("key", key, RandomKey)), memory
+        obs = check_obs(Observations.at(obs).obs, self.agents)
+        return self.plan(obs, check("key", key, RandomKey)), memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,11 +77,11 @@ class BothTeams:
         """Returns the initial recurrent states of both."""
         return self.first.initial_memory(num_envs), self.second.initial_memory(num_envs)
 
-    def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions of all agents; see `Policy`."""
-        keys, size = jax.random.split(key), self.first.agents
-        first, first_memory = self.first.act(obs[:, :size], memory[0], keys[0])
-        second, second_memory = self.second.act(obs[:, size:], memory[1], keys[1])
+        keys, size, seen = jax.random.split(key), self.first.agents, Observations.at(obs)
+        first, first_memory = self.first.act(seen.of(slice(size)), memory[0], keys[0])
+        second, second_memory = self.second.act(seen.of(slice(size, None)), memory[1], keys[1])
         return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
 
 

@@ -92,7 +92,8 @@ def robot_state(position: Any, **euler: Any) -> RobotState:
     """The state of two robots at rest at positions (2, 3), m, with the default joints; see `angles`."""
     joints = jnp.asarray(np.tile(GO1.default_joints, (2, 1)), jnp.float32)
     none, turn = jnp.zeros((2, 3)), _quaternion(angles(**euler))
-    return RobotState(jnp.asarray(position), turn, none, none, joints, jnp.zeros((2, 12)), jnp.zeros(2))
+    rest = joints, jnp.zeros((2, 12)), jnp.zeros(2), jnp.ones(2, bool)
+    return RobotState(jnp.asarray(position), turn, none, none, *rest)
 
 
 def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()) -> State:
@@ -115,7 +116,7 @@ def _programs(env: QuadrupedEnv) -> tuple[Any, Any, Any]:
 
     def terms(before: State, after: State) -> tuple[dict[str, jax.Array], jax.Array]:
         terms = env.rewards(moment(before), moment(after), jnp.array(False))
-        return terms, weigh(terms, env.params.rewards, env.teams)[0]
+        return terms, weigh(terms, env.params.rewards, env.teams, after.active)[0]
 
     return jax.jit(observe), jax.jit(moment), jax.jit(terms)
 

@@ -51,7 +51,7 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, gate_fres
     assert float(terms["approach"]) == pytest.approx(2 - np.hypot(1.7, 0.03), abs=1e-5)
     # hypot(0.3, 0.43) = 0.524 m apart, which is not closer than 0.5 m
     assert float(terms["crowding"]) == 0
-    reward, logged = weigh(terms, gate.params.rewards, gate.teams)
+    reward, logged = weigh(terms, gate.params.rewards, gate.teams, jnp.ones(2, bool))
     np.testing.assert_allclose(reward, [5 + 0.29974 - 2] * 2, atol=1e-4)
     close = robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]])
     near = gate.rewards(Moment(state, after), Moment(state, close), jnp.array(False))
@@ -226,7 +226,7 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
 
     def reward(after: RobotState, collision: Any = no) -> tuple[Any, Any]:
         terms = env.rewards(before, Moment(fresh, after), collision)
-        total, logged = weigh(terms, env.params.rewards, env.teams)
+        total, logged = weigh(terms, env.params.rewards, env.teams, jnp.ones(2, bool))
         assert float(logged["average_step_reward"]) == float(total[0]) == float(total[1])
         return total[0], terms
 

@@ -21,7 +21,7 @@ from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.errors import InputError
 from tests import engines
-from tests.states import ending, initial, made, stepper
+from tests.states import ending, initial, made, placed, stepper
 
 Array = jax.Array
 
@@ -136,13 +136,26 @@ def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
 
 
+def test_a_robot_that_takes_no_part_counts_nowhere(gate: QuadrupedEnv, gate_step: Any) -> None:
+    """It lies on its back, past the gate: it neither ends the episode nor is rewarded, and does not act."""
+    state = placed(gate, [[1.0, -0.5, 0.3], [6.0, 0.5, 0.3]], euler=[[0, 0, 0], [np.pi, 0, 0]])
+    out = dataclasses.replace(state, active=jnp.array([True, False]))
+    still, moved = jnp.zeros((2, 12)), jnp.zeros((2, 12)).at[1].set(1.0)
+    assert ending(gate_step(state, still)) == ["fall"]
+    after, other = gate_step(out, still), gate_step(out, moved)
+    assert ending(after) == [] and not after.terminated and after.active.tolist() == [True, False]
+    np.testing.assert_array_equal(after.data.qpos, other.data.qpos)
+    assert float(after.reward[1]) == 0 and not after.obs[1].any() and after.obs[0].any()
+    assert float(after.metrics["reward/success"]) == 0 and float(after.outcome.further["one"]) == 0
+
+
 def test_only_the_agents_trunks_count_as_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
     env = made("go1football-defender")
     read = env.read
 
     @jax.jit
     def collides(state: State, force: Array) -> Array:
-        monkeypatch.setattr(env, "read", lambda data: dataclasses.replace(read(data), trunk_force=force))
+        monkeypatch.setattr(env, "read", lambda *of: dataclasses.replace(read(*of), trunk_force=force))
         return env.step(state, jnp.zeros((2, 12))).metrics["collision"]
 
     forces = {(100.0, 0.0, 0.0): 1, (0.0, 100.0, 0.0): 1, (0.0, 0.0, 100.0): 0}  # the third robot is the defender

@@ -150,7 +150,7 @@ def test_a_registered_network_is_exported_with_all_its_recurrent_states(monkeypa
     @networks.register_network("averaging")
     class Averaging(networks.NetworkSettings):
         def build(self, dims: EnvDims) -> networks.Network:
-            def act(params: Any, memory: Any, obs: jax.Array, key: Any) -> Any:
+            def act(params: Any, memory: Any, obs: jax.Array, key: Any, active: Any = None) -> Any:
                 slow, fast = 0.9 * memory["slow"] + 0.1 * obs, 0.5 * memory["fast"] + 0.5 * obs
                 mean = nn.dense(params, fast - slow)
                 return mean, log_prob(mean, mean, params["bias"]), {"slow": slow, "fast": fast}

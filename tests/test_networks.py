@@ -166,6 +166,23 @@ def test_later_actions_change_no_earlier_log_probability() -> None:
     assert np.abs(earlier[:, 1:] - before[:, 1:]).max() > 1e-3
 
 
+def test_an_agent_that_takes_no_part_is_left_out_of_the_sequence() -> None:
+    """The others act, and are valued, as if it were not there."""
+    network, params, obs = made(4, blocks=2, heads=2)
+    there = np.array([0, 2, 3])
+    active = jnp.zeros((4, 4), bool).at[:, there].set(True)
+    action, density, _ = network.act(network.policy_params(params), (), obs, None, active)
+    fewer = made(3, blocks=2, heads=2)[0]
+    alone, its_density, _ = fewer.act(fewer.policy_params(params), (), obs[:, there], None)
+    np.testing.assert_allclose(action[:, there], alone, atol=1e-5)
+    np.testing.assert_allclose(density[:, there], its_density, atol=1e-5)
+    first, taken = jnp.zeros(4, bool), jax.random.normal(KEY, (4, 4, 2))
+    one = network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], taken, active)
+    two = fewer.evaluate(params, NO_MEMORY, first, obs[:, there], obs[..., 0, :1], taken[:, there])
+    np.testing.assert_allclose(one.log_prob[:, there], two.log_prob, atol=1e-5)
+    np.testing.assert_allclose(one.value[:, there], two.value, atol=1e-5)
+
+
 def test_the_deviation_starts_as_openrl_has_it_or_free() -> None:
     for settings, deviation in (
         ({}, 0.5 / (1 + np.exp(-1))),

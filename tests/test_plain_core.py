@@ -302,7 +302,9 @@ def test_other_agents_rows_follow_in_order() -> None:
 def test_crowding_by_hand() -> None:
     """Pairs at 0.3 m and at 0.49 m, one at 0.05 m, which counts as 0.1 m, and one at 0.51 m, which does not."""
     place = jnp.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.49], [5.0, 0.0], [5.05, 0.0], [5.56, 0.0]])
-    assert float(crowding(place)) == pytest.approx(2 * (1 / 0.09 + 1 / 0.49**2 + 100), rel=1e-4)
+    active = jnp.arange(7) < 6
+    place = jnp.concatenate([place, place[:1]])  # the last one takes no part
+    assert float(crowding(place, active)) == pytest.approx(2 * (1 / 0.09 + 1 / 0.49**2 + 100), rel=1e-4)
 
 
 def test_places_behind_the_box_are_one_for_each_robot() -> None:

@@ -126,7 +126,7 @@ def test_points_that_coincide_give_finite_numbers() -> None:
     np.testing.assert_allclose(close, [[0.2 * 1e-4 / 1e-3**1.4, 0.0]], rtol=1e-2)
     goal = jnp.array([12.0, 0.0])
     assert np.all(np.isfinite(defend(goal, jnp.float32(0.0), goal, goal)))
-    assert float(crowding(jnp.zeros((2, 2)))) == pytest.approx(200.0)
+    assert float(crowding(jnp.zeros((2, 2)), jnp.ones(2, bool))) == pytest.approx(200.0)
     optimizer = adam(max_grad_norm=1.0)
     params, _, norm = optimizer.update({"x": jnp.zeros(2)}, optimizer.init({"x": jnp.ones(2)}), {"x": jnp.ones(2)}, 0.1)
     assert float(norm) == 0.0 and params["x"].tolist() == [1.0, 1.0]

@@ -73,11 +73,11 @@ class Episode(NamedTuple):
 def test_a_rollout_is_that_of_a_plain_implementation() -> None:
     """Two rollouts one after the other; the recurrent states count steps and add up what they see."""
 
-    def act(params: Any, memory: Any, obs: Any, key: Any) -> tuple[Any, Any, Any]:
+    def act(params: Any, memory: Any, obs: Any, key: Any, active: Any) -> tuple[Any, Any, Any]:
         action = params["gain"] * obs[..., 2:3] + 0.1 * memory[:, None, None]
         return action, -action, memory + 1.0
 
-    def value(params: Any, memory: Any, first: Any, obs: Any, privileged: Any) -> tuple[Any, Any]:
+    def value(params: Any, memory: Any, first: Any, obs: Any, privileged: Any, active: Any) -> tuple[Any, Any]:
         assert first.shape[0] == obs.shape[0] == privileged.shape[0] == 1
         return None, memory + params["all"] * (jnp.sum(obs[0], axis=(1, 2)) + jnp.sum(privileged[0], axis=1))
 
@@ -152,7 +152,7 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
     env = rich(teams=((1,), (0,)))
 
     def act(params: Any, obs: Any, memory: Any, key: Any) -> tuple[Any, Any]:
-        return params * obs[..., 2:3] + memory[:, None, None], memory + 0.5
+        return params * obs.obs[..., 2:3] + memory[:, None, None], memory + 0.5
 
     both = jnp.array([0.3, -0.8])
     found = Evaluator(env, act, jnp.full(N, 0.1), block=4)(both, 9, jax.random.split(KEY, 2))
@@ -182,6 +182,41 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
         assert (values.pop("task"), values.pop("episodes")) == ("probe", 9)
         assert values == pytest.approx(expected, rel=1e-5)
         assert terms == pytest.approx({name: mean(f"reward/{name}", rows) for name in ("pay", "way")}, rel=1e-5)
+
+
+class Half(Rich):
+    """The second agent takes no part."""
+
+    def _more(self, state: probes.ProbeState) -> probes.ProbeState:
+        active = jnp.zeros(state.reward.shape, bool).at[:, 0].set(True)
+        fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(probes.ProbeState)}
+        return HalfState(**fields | vars(super()._more(state)), active=active)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class HalfState(probes.ProbeState):
+    """The state of a probe that says which agents take part."""
+
+    active: jax.Array
+
+
+def test_results_are_those_of_the_agents_that_take_part() -> None:
+    """Both evaluations and rollouts leave the others' rewards out of an episode's return."""
+    values = {"num_envs": N, "features": 2, "max_episode_steps": 2, "odd_episode_steps": 2}
+    env = Half(lambda hidden, step: jnp.stack([hidden, 0.5 * step], axis=-1), pay_differently, **values)
+    act = lambda params, seen, memory, key: (seen.obs[..., 2:3], memory)  # noqa: E731
+    (result,) = Evaluator(env, act, block=2)(None, N, KEY[None])
+    hidden = np.asarray(env.reset(KEY).hidden)
+    assert result.episode_return == pytest.approx(4 * hidden.mean())
+    nothing: Any = None
+    copy = lambda params, memory, obs, key, active: (obs[..., 2:3], obs[..., 2:3], memory)  # noqa: E731
+    network = Network(nothing, lambda p: p, nothing, copy, lambda *_: (None, ()), nothing)
+    zero = jnp.zeros(N)
+    start = RolloutState(env.reset(KEY), NetworkMemory((), ()), zero == 0, zero.astype(jnp.int32), zero)
+    _, transitions, metrics = rollout(env, network, {}, nothing, start, KEY, 2, normalize=False, action_scale=1.0)
+    assert float(metrics["ended"]["episode_return"]) == pytest.approx(4 * hidden.mean())
+    assert transitions.active.tolist() == [[[True, False]] * N] * 2
 
 
 def test_a_league_counts_as_a_plain_implementation() -> None:

@@ -89,18 +89,20 @@ def test_running_statistics_merge_as_one_batch() -> None:
     statistics = running_init(3)
     np.testing.assert_array_equal(running_normalize(statistics, data), data)
     for part in (data[:10], data[10:35], data[35:]):
-        statistics = jax.jit(running_update)(statistics, part.reshape(-1, 1, 3))
+        both = jnp.stack([part, jnp.full_like(part, 1e6)], axis=1)  # the second agent takes no part
+        active = jnp.tile(jnp.array([True, False]), (len(part), 1))
+        statistics = jax.jit(running_update)(statistics, both, active)
     np.testing.assert_allclose(statistics.mean, data.mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(statistics.variance, data.var(axis=0), rtol=1e-4)
     np.testing.assert_array_equal(running_normalize(statistics, jnp.array([1e6, -1e6, 3.0]))[:2], [10.0, -10.0])
-    constant = running_update(running_init(1), jnp.full((10, 1), 7.0))
+    constant = running_update(running_init(1), jnp.full((10, 1), 7.0), jnp.ones(10, bool))
     np.testing.assert_allclose(running_normalize(constant, jnp.array([7.0])), [0.0], atol=1e-4)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_value_statistics_are_debiased_and_invertible_at_any_scale(scale: float) -> None:
     target = scale * jnp.array([1.0, 3.0])
-    statistics = value_update(value_init(), target, 0.99)
+    statistics = value_update(value_init(), jnp.append(target, 1e9), jnp.array([True, True, False]), 0.99)
     np.testing.assert_allclose(value_normalize(statistics, target), [-1.0, 1.0], rtol=1e-3)
     np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target, rtol=1e-6)
 
@@ -111,10 +113,10 @@ def test_value_statistics_at_their_limits() -> None:
     np.testing.assert_array_equal(value_denormalize(value_init(enabled=False), target), target)
     np.testing.assert_array_equal(value_denormalize(value_init(), target), 0.0)
     for constant in (0.0, 5.0):
-        statistics = value_update(value_init(), jnp.full((3,), constant), 0.99)
+        statistics = value_update(value_init(), jnp.full((3,), constant), jnp.ones(3, bool), 0.99)
         assert float(jnp.abs(value_normalize(statistics, jnp.float32(constant)))) < 0.1
     # The deviation of nearly constant targets is taken to be a thousandth of their size.
-    statistics = value_update(value_init(), 5.0 + 1e-4 * target, 0.99)
+    statistics = value_update(value_init(), 5.0 + 1e-4 * target, jnp.ones(2, bool), 0.99)
     np.testing.assert_allclose(value_normalize(statistics, jnp.float32(5.5)), 100.0, rtol=2e-2)
 
 

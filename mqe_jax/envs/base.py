@@ -238,9 +238,10 @@ class QuadrupedEnv(Task[S, P]):
             assistance=assistance,
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
             key=next_key,
+            active=jnp.ones(self.num_agents, bool),
         )
         now = Moment(state, robot_state)
-        _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams)
+        _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams, state.active)
         names = (*logged, "collision", "diverged", "overflow")
         outcome = dataclasses.replace(self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no))
         outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
@@ -268,10 +269,11 @@ class QuadrupedEnv(Task[S, P]):
         action = self.controller.checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
-        action = self.unmirror_action(jnp.where((state.step < state.frozen_steps)[:, None], 0.0, action))
+        still = (state.step < state.frozen_steps) | ~state.active
+        action = self.unmirror_action(jnp.where(still[:, None], 0.0, action))
         key, push_key, _, npc_key = jax.random.split(state.key, 4)
 
-        before = Moment(state, self.read(state.data))
+        before = Moment(state, self.read(state.data, state.active))
         target, control = self.controller.targets(
             state.control,
             action,
@@ -282,7 +284,7 @@ class QuadrupedEnv(Task[S, P]):
         data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
         fields, forces = self.randomizer.fields(state.randomized), self.external_forces(state)
         data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
-        robot_state = self.read(data)
+        robot_state = self.read(data, state.active)
         moved = {"data": data, "control": control, "actuators": actuators}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
         state = self.judge(before, Moment(state, robot_state), bad_action)
@@ -291,7 +293,7 @@ class QuadrupedEnv(Task[S, P]):
     @jax.named_scope("task")
     def observed(self, state: State[S]) -> State[S]:
         """Returns the state with the observations that belong to it."""
-        layout, robot_state = self.observation_layout, self.read(state.data)
+        layout, robot_state = self.observation_layout, self.read(state.data, state.active)
         obs = layout.pack(self.observe(state, robot_state), self.num_agents)
         noise = self.params.randomization.observation_noise
         if noise:
@@ -299,18 +301,19 @@ class QuadrupedEnv(Task[S, P]):
         clock = self.controller.clock(state.control)
         privileged = self.privileged.observe(robot_state, state.data, state.anchors, state.randomized, clock)
         obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
+        obs = jnp.where(state.active[:, None], obs, 0.0)
         return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
         """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""
         state, robot_state = after
         diverged = bad_action | self._diverged(state.data)
-        collision = jnp.any(robot_state.trunk_force[: self.num_agents] > self.params.collision_force)
+        collision = jnp.any(robot_state.count(robot_state.trunk_force[: self.num_agents] > self.params.collision_force))
         state = dataclasses.replace(state, task=alike("step_task", self.step_task(before, after), state.task))
         terms = self.rewards(before, Moment(state, robot_state), collision)
         if (floor := self.params.shaping_floor) < 1.0:
             terms = faded(terms, weights_of(self.Params()), floor + (1.0 - floor) * state.assistance)
-        reward, logged = weigh(terms, self.weights, self.teams)
+        reward, logged = weigh(terms, self.weights, self.teams, state.active)
         fall, crash = jnp.any(self.fallen(robot_state)), collision & self.params.end_on_collision
         failed = diverged | fall | crash
         decided = shaped("ending", self.ending(state, robot_state), (), dtype=bool)
@@ -334,9 +337,9 @@ class QuadrupedEnv(Task[S, P]):
         values = {name: value[None] for name, value in values.items()}
         return Outcome(success=values.pop("success"), further=values)
 
-    def read(self, data: mjx.Data) -> RobotState:
-        """Returns the state of all robots."""
-        return read_robots(self.index, data.qpos, data.qvel, data.sensordata)
+    def read(self, data: mjx.Data, active: jax.Array | None = None) -> RobotState:
+        """Returns the state of all robots; `active` (A,) says which agents take part, by default all."""
+        return read_robots(self.index, data.qpos, data.qvel, data.sensordata, active)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
         """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame; InputError for no object."""
@@ -344,12 +347,12 @@ class QuadrupedEnv(Task[S, P]):
         return jnp.concatenate(poses(self.compiled.model, data, [self.objects[name].body]), axis=-1)[0]
 
     def fallen(self, robot_state: RobotState) -> jax.Array:
-        """Returns which robots exceed the roll, pitch or height limits (R,) bool."""
+        """Returns which active robots exceed the roll, pitch or height limits (R,) bool."""
         params = self.params
         roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
         height = robot_state.position_w[:, 2]
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
-        return out | (height < params.min_height) | (height > params.max_height)
+        return (out | (height < params.min_height) | (height > params.max_height)) & robot_state.active
 
     # -- internals of reset and step ----------------------------------------------------------------------------
 

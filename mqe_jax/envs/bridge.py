@@ -115,7 +115,7 @@ class Go1Bridge(Duel[None, BridgeParams]):
 
     def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots are off the bridge or have fallen (2,) bool."""
-        return self.fallen(robot_state) | (robot_state.position_w[:, 2] < self.params.off_height)
+        return self.fallen(robot_state) | robot_state.count(robot_state.position_w[:, 2] < self.params.off_height)
 
     def across(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots are on the opponent's platform (2,) bool."""
@@ -124,7 +124,7 @@ class Go1Bridge(Duel[None, BridgeParams]):
         first, second = params.platform_x
         half = params.platform[0] / 2
         reached = jnp.stack([x[0] > second - half, x[1] < first + half])
-        return reached & (height > params.top)
+        return robot_state.count(reached & (height > params.top))
 
     def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """A robot leads while it is on the opponent's platform."""

@@ -105,7 +105,7 @@ class Go1RevolvingDoor(Duel[None, DoorParams]):
 
     def leading(self, state: State, robot_state: RobotState) -> jax.Array:
         """A robot leads while it is past the line."""
-        return robot_state.position_w[:, 0] > self.params.line_x
+        return robot_state.count(robot_state.position_w[:, 0] > self.params.line_x)
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends when a robot is past the line."""

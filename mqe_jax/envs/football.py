@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 # Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
 _GOAL_DEPTH = 1.0  # m
+FAR = 1e3  # m; distance of robots that take no part
 _REACH = 0.6  # m; from a trunk's centre to that of a ball that the robot touches
 _IMPULSE = 0.1  # m/s; change of the ball's velocity in a step that only a touch causes
 
@@ -256,6 +257,7 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
     def distances(self, now: Moment) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal that each team attacks and to each team's nearest robot (2,), m."""
         apart = jnp.linalg.norm(now.robots.position_w[:, :2] - self.ball(now.state.data)[:2], axis=-1)
+        apart = jnp.where(now.robots.active, apart, FAR)
         return self.goal_distance(now.state.data), jnp.min(apart.reshape(2, -1), axis=1)
 
     @property

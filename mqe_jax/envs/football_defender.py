@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.football import BALL_BLOCKS, GOALS, Football, FootballParams, Play
+from mqe_jax.envs.football import BALL_BLOCKS, FAR, GOALS, Football, FootballParams, Play
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
@@ -105,7 +105,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal's midpoint and to the nearest robot (), m."""
         apart = jnp.linalg.norm(now.robots.position_w[:2, :2] - self.ball(now.state.data)[:2], axis=-1)
-        return self.goal_distance(now.state.data)[0], jnp.min(apart)
+        return self.goal_distance(now.state.data)[0], jnp.min(jnp.where(now.robots.active[:2], apart, FAR))
 
     @property
     def observation_layout(self) -> ObservationLayout:

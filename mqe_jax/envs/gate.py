@@ -107,13 +107,15 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         return {
-            "success": jnp.sum(self.through(after.state, after.robots)).astype(jnp.float32),
-            "approach": jnp.sum(self.target_distance(before.robots) - self.target_distance(after.robots)),
-            "crowding": reward.crowding(after.robots.position_w[:, :2]),
+            "success": jnp.sum(after.robots.count(self.through(after.state, after.robots))).astype(jnp.float32),
+            "approach": jnp.sum(
+                after.robots.count(self.target_distance(before.robots) - self.target_distance(after.robots))
+            ),
+            "crowding": reward.crowding(after.robots.position_w[:, :2], after.robots.active),
             "collision": collision.astype(jnp.float32),
         }
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: both robots are through; `one`: at least one is, however the episode ended."""
         through = self.through(state, robot_state)
-        return {"success": jnp.all(through) & ~failed, "one": jnp.any(through)}
+        return {"success": jnp.all(through | ~robot_state.active) & ~failed, "one": jnp.any(robot_state.count(through))}

@@ -64,7 +64,7 @@ class Match(QuadrupedEnv[S, P]):
     # -- task interface (override) ------------------------------------------------------------------------------
 
     def eliminated(self, robot_state: RobotState) -> jax.Array:
-        """Returns which team is eliminated (2,) bool: by default one with a fallen robot."""
+        """Returns which team is eliminated (2,) bool: by default one with a fallen active robot."""
         return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
 
     def leading(self, state: State[S], robot_state: RobotState) -> jax.Array:

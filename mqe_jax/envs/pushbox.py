@@ -140,7 +140,7 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         box = self.object_pose(now.state.data, "box")[:2]
         length, width, _ = self.params.box.size
         places = box + jnp.array([[-0.5 * length - _BEHIND, -0.25 * width], [-0.5 * length - _BEHIND, 0.25 * width]])
-        behind = jnp.sum(jnp.linalg.norm(now.robots.position_w[:2, :2] - places, axis=-1))
+        behind = jnp.sum(now.robots.count(jnp.linalg.norm(now.robots.position_w[:2, :2] - places, axis=-1)))
         return behind, jnp.abs(box[1] - now.state.anchors[0, 1])
 
     @property

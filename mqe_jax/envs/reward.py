@@ -13,16 +13,18 @@ from mqe_jax.envs.returned import named, shaped
 
 
 def weigh(
-    terms: Mapping[str, jax.Array], weights: Any, teams: Sequence[Sequence[int]]
+    terms: Mapping[str, jax.Array], weights: Any, teams: Sequence[Sequence[int]], active: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Returns the weighted sum of the terms per agent, and the weighted terms for logging.
 
-    A term is () if it is shared by all agents, or (A,); of the latter the value of each team's first agent is logged.
+    A term is () if it is shared by all agents, or (A,); of the latter the value of each team's first active agent is
+    logged. The reward of an agent that is not active is 0.
 
     Args:
         terms: unweighted terms by name.
         weights: a record whose fields have the same names.
         teams: agents of each team.
+        active: which agents take part (A,) bool.
 
     Returns:
         reward (A,), and `reward/<name>` () of every term with their sum `average_step_reward`, those of team 1 with the
@@ -39,11 +41,20 @@ def weigh(
     total = sum((jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents))
     values = {**{f"reward/{name}": value for name, value in weighted.items()}, "average_step_reward": total}
     logged = {
-        f"team{team}/{name}" if team else name: value[first] if value.ndim else value
-        for team, (first, *_) in enumerate(teams)
+        f"team{team}/{name}" if team else name: _first(value, agents, active) if value.ndim else value
+        for team, agents in enumerate(teams)
         for name, value in values.items()
     }
-    return total, logged
+    return jnp.where(active, total, 0.0), logged
+
+
+def _first(value: jax.Array, agents: Sequence[int], active: jax.Array) -> jax.Array:
+    """Returns the value () of the first active one of some agents; without any, that of the last."""
+    *others, chosen = agents
+    result = value[chosen]
+    for agent in reversed(others):
+        result = jnp.where(active[agent], value[agent], result)
+    return result
 
 
 def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
@@ -52,10 +63,10 @@ def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | floa
     return {name: term if getattr(weights, name) else factor * as_float(term) for name, term in terms.items()}
 
 
-def crowding(position: jax.Array, within: float = 0.5) -> jax.Array:
-    """Sum of 1 / d^2 over all ordered pairs of robots at a distance d below `within` m: (A, D) -> ()."""
+def crowding(position: jax.Array, active: jax.Array, within: float = 0.5) -> jax.Array:
+    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below `within` m: (A, D) -> ()."""
     count = position.shape[0]
     apart = position[:, None] - position[None]
     square = jnp.sum(jnp.square(apart), axis=-1) + jnp.eye(count)
-    near = (square < within**2) & ~jnp.eye(count, dtype=bool)
+    near = (square < within**2) & ~jnp.eye(count, dtype=bool) & active & active[:, None]
     return jnp.sum(jnp.where(near, 1.0 / jnp.maximum(square, 1e-2), 0.0))

@@ -109,9 +109,9 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
         return pair(robot_state.base_info)
 
     def on_platform(self, robot_state: RobotState) -> jax.Array:
-        """Returns which robots are on the platform (2,) bool."""
+        """Returns which active robots are on the platform (2,) bool."""
         x, z = self.params.on_platform
-        return (robot_state.position_w[:, 0] > x) & (robot_state.position_w[:, 2] > z)
+        return robot_state.active & (robot_state.position_w[:, 0] > x) & (robot_state.position_w[:, 2] > z)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         params = self.params
@@ -120,15 +120,15 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
         roll, pitch = jnp.abs(robots.euler[:, 0]), jnp.abs(robots.euler[:, 1])
         return {
             "success": jnp.sum(self.on_platform(robots)).astype(jnp.float32),
-            "height": jnp.sum(z) - params.height_base,
-            "progress": jnp.sum(x - before.robots.position_w[:, 0]),
-            "lateral_offset": jnp.sum(jnp.square(y)) - params.lateral_offset_base,
+            "height": jnp.sum(robots.count(z)) - params.height_base,
+            "progress": jnp.sum(robots.count(x - before.robots.position_w[:, 0])),
+            "lateral_offset": jnp.sum(robots.count(jnp.square(y))) - params.lateral_offset_base,
             "collision": collision.astype(jnp.float32),
-            "fall": jnp.any((roll > params.max_roll) | (pitch > params.max_pitch)).astype(jnp.float32),
-            "crowding": reward.crowding(robots.position_w[:, :2]) / 2,
+            "fall": jnp.any(robots.count((roll > params.max_roll) | (pitch > params.max_pitch))).astype(jnp.float32),
+            "crowding": reward.crowding(robots.position_w[:, :2], robots.active) / 2,
         }
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: a robot stands on the platform; `height`: height of the highest robot, m."""
         success = jnp.any(self.on_platform(robot_state)) & ~failed
-        return {"success": success, "height": jnp.max(robot_state.position_w[:, 2])}
+        return {"success": success, "height": jnp.max(robot_state.count(robot_state.position_w[:, 2]))}

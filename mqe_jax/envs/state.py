@@ -53,6 +53,8 @@ class EnvironmentState:
     """Curriculum level () in [0, 1]; 0 is the unmodified task."""
     key: jax.Array
     """Random key."""
+    active: jax.Array | None = dataclasses.field(default=None, kw_only=True)
+    """Which agents take part (A,) bool; the others count nowhere. None: all."""
 
 
 @jax.tree_util.register_dataclass

@@ -124,7 +124,8 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
         """Returns which robots have fallen or left the ring (2,) bool."""
         params = self.params
         below = robot_state.position_w[:, 2] < params.platform.center[2] - params.ring_depth
-        return self.fallen(robot_state) | (self.distance(robot_state) > params.ring_radius) | below
+        out = (self.distance(robot_state) > params.ring_radius) | below
+        return self.fallen(robot_state) | robot_state.count(out)
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends when a robot has fallen or left the ring."""

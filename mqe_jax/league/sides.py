@@ -45,6 +45,7 @@ class BothSides(Wrapper):
             "privileged_obs": told(inner.privileged_obs),
             "final_privileged_obs": jax.tree.map(told, inner.final_privileged_obs),
             "reward": self._exchanged(inner.reward),
+            "active": jax.tree.map(self._exchanged, inner.active),
             "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
             "metrics": metrics,
         }

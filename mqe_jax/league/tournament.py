@@ -25,7 +25,7 @@ from mqe_jax.policies import check_policy
 from mqe_jax.precision import single
 from mqe_jax.settings import PathText, checked, fail
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import RESULTS, AnyBatch, AnyPolicy, RandomKey
+from mqe_jax.train.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
 
 Array = NDArray[np.float64]
 CSV, PICTURE = "tournament.csv", "tournament.png"
@@ -67,7 +67,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
 
     def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
         state, memory, finished, outcome = carry
-        action, memory = policy.act(state.obs, memory, key)
+        action, memory = policy.act(observations(state), memory, key)
         state = env.step(state, action)
         done = state.terminated | state.truncated
         now = state.outcome.result[:, 0] > 0

@@ -144,6 +144,12 @@ class RobotState:
     """Joint velocities (R, 12), rad/s."""
     trunk_force: jax.Array
     """Strongest contact force on the trunk (R,), N."""
+    active: jax.Array
+    """Robots that take part (R,) bool; the others count nowhere."""
+
+    def count(self, values: jax.Array) -> jax.Array:
+        """Returns values (R',) of the first R' robots, 0 for those that take no part."""
+        return jnp.where(self.active[: len(values)], values, 0)
 
     @property
     def euler(self) -> jax.Array:
@@ -166,8 +172,14 @@ class RobotState:
         return Proprioception(self.projected_gravity, self.joint_position, self.joint_velocity)
 
 
-def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array) -> RobotState:
-    """Reads all robots from the state vectors of one environment (nq,), (nv,), (nsensordata,)."""
+def read_robots(
+    index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array, active: jax.Array | None = None
+) -> RobotState:
+    """Reads all robots from the state vectors of one environment (nq,), (nv,), (nsensordata,).
+
+    `active` (A,) says which of the first robots take part; by default all.
+    """
+    every = jnp.ones(index.num_robots, bool)
     base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
     return RobotState(
         position_w=base[:, :3],
@@ -177,6 +189,7 @@ def read_robots(index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata:
         joint_position=qpos[index.joint_qpos],
         joint_velocity=qvel[index.joint_qvel],
         trunk_force=jnp.max(jnp.linalg.norm(sensordata[index.trunk_force], axis=-1), axis=-1),
+        active=every if active is None else jnp.concatenate([active, every[len(active) :]]),
     )
 
 

@@ -127,7 +127,7 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         return mean, jnp.broadcast_to(log_std, mean.shape), memory
 
     def act(
-        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: jax.Array | None = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         is_first = jnp.zeros((1, *obs.shape[:-2]), bool)
         mean, log_std, memory = distribution(params, memory, is_first, obs[None])
@@ -138,7 +138,12 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         return action, log_prob(action, mean, log_std), memory
 
     def value(
-        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
+        params: Params,
+        memory: Memory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        active: jax.Array | None = None,
     ) -> tuple[jax.Array, Memory]:
         if settings.critic_input == "privileged":
             x = privileged[..., None, :]
@@ -156,6 +161,7 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         obs: jax.Array,
         privileged: jax.Array,
         action: jax.Array,
+        active: jax.Array | None = None,
     ) -> Evaluation:
         mean, log_std, _ = distribution(params, memory.actor, is_first, obs)
         values, _ = value(params, memory.critic, is_first, obs, privileged)

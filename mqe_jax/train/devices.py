@@ -66,19 +66,26 @@ def mean(tree: PyTree) -> PyTree:
     return tree if size() == 1 else jax.tree.map(lambda x: x / size(), total(tree))
 
 
+def mean_where(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
+    """Returns the mean of the elements where a mask of the same shape is true, over an axis and processes; else 0."""
+    count = jnp.maximum(total(jnp.sum(mask.astype(jnp.float32), axis)), 1.0)
+    return total(jnp.sum(jnp.where(mask, x, 0.0), axis)) / count
+
+
 def any_of(flag: jax.Array) -> jax.Array:
     """Returns whether a flag () is true in any process."""
     return total(flag.astype(jnp.int32)) > 0 if size() > 1 else flag
 
 
-def variance(x: jax.Array, axis: int | None = None) -> jax.Array:
-    """Returns the variance over an axis and processes, or over all elements; processes have equally many."""
-    return mean(jnp.mean(jnp.square(x - mean(jnp.mean(x, axis))), axis))
+def variance(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
+    """Returns the variance of the elements where a mask is true, over an axis and processes."""
+    return mean_where(jnp.square(x - mean_where(x, mask, axis)), mask, axis)
 
 
-def median(x: jax.Array) -> jax.Array:
-    """Returns the median () of the elements of all processes."""
-    return jnp.median(x if size() == 1 else jax.lax.all_gather(x, AXIS))
+def median(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns the median () of the elements of all processes where a mask is true; 0 without any."""
+    x = jnp.where(mask, x, jnp.nan)
+    return jnp.nan_to_num(jnp.nanmedian(x if size() == 1 else jax.lax.all_gather(x, AXIS)))
 
 
 def rows(draw: Callable[[int], jax.Array], count: int) -> jax.Array:

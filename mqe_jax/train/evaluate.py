@@ -20,15 +20,18 @@ from mqe_jax.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.literal import line, to_html
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
+from mqe_jax.train.rollout import active_of, mean_of_team
 from mqe_jax.train.types import (
     RESULTS,
     AnyBatch,
     Memory,
+    Observations,
     Outcome,
     PolicyOrAct,
     RandomKey,
     VectorEnv,
     check_act,
+    observations,
     teams_of,
     where_rows,
 )
@@ -36,7 +39,7 @@ from mqe_jax.train.types import (
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy
 
-Act = Callable[[jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]]
+Act = Callable[[Any, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
 
 _NORMAL = 1.959964  # two-sided 95% quantile
@@ -163,7 +166,8 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     if not hasattr(either, "act"):
         if any(np.shape(leaf)[:1] != (num_envs,) for leaf in jax.tree.leaves(memory)):
             fail("memory", memory, f"arrays with a leading axis of {num_envs}, the environments")
-        return functools.partial(_acted, either, (num_envs, env.num_agents, env.action_size)), memory
+        function = functools.partial(_given, either)
+        return functools.partial(_acted, function, (num_envs, env.num_agents, env.action_size)), memory
     if (trained := getattr(either, "task", "")) and trained != env.name:
         fail("policy", f"one of {trained}", f"one of {env.name}; its `act` may be given alone")
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
@@ -175,10 +179,12 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     return act, either.initial_memory(num_envs)
 
 
-def _acted(
-    act: Act, shape: tuple[int, ...], obs: jax.Array, memory: Memory, key: jax.Array
-) -> tuple[jax.Array, Memory]:
+def _acted(act: Act, shape: tuple[int, ...], obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
     return check_act("policy", act(obs, memory, key), shape, memory)
+
+
+def _given(function: Act, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    return function(Observations.at(obs).obs, memory, key)
 
 
 @checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
@@ -222,14 +228,14 @@ def evaluate_batch(
 class Evaluator:
     """Evaluates B policies in one compiled program; see `evaluate_batch`.
 
-    `act(params, obs (N, A, O), memory, key) -> (action, memory)` is the policy; `params` has a leading axis B, one
-    set for each evaluation, or is None if all evaluations share one policy.
+    `act(params, seen, memory, key) -> (action, memory)` is the policy, `seen` its `Observations`; `params` has a
+    leading axis B, one set for each evaluation, or is None if all evaluations share one policy.
     """
 
     def __init__(
         self,
         env: VectorEnv,
-        act: Callable[[Any, jax.Array, Memory, jax.Array], tuple[jax.Array, Memory]],
+        act: Callable[[Any, Observations, Memory, jax.Array], tuple[jax.Array, Memory]],
         memory: Memory = (),
         *,
         block: int = 50,
@@ -286,9 +292,9 @@ def _run_block(
     own = np.array(teams_of(env)[0])
 
     def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
-        action, memory = act(p.env_state.obs, p.memory, step_key)
+        action, memory = act(observations(p.env_state), p.memory, step_key)
         state = env.step(p.env_state, action)
-        done = state.terminated | state.truncated
+        done, active = state.terminated | state.truncated, active_of(p.env_state)
         counted = p.finished < quota
 
         step_sums = {n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()}
@@ -301,7 +307,7 @@ def _run_block(
                 memory=where_rows(done, initial_memory, memory),
                 finished=p.finished + last.astype(jnp.int32),
                 steps=p.steps + counted.astype(jnp.int32),
-                returns=p.returns + jnp.where(counted, jnp.mean(state.reward[:, own], axis=-1), 0.0),
+                returns=p.returns + jnp.where(counted, mean_of_team(state.reward[:, own], active[:, own]), 0.0),
                 step_sums=step_sums,
                 outcome=ends,
                 diverged=diverged,

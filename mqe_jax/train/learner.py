@@ -30,7 +30,16 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import AdamState, Optimizer, adam, begun_anew
-from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, minibatches, normalize_obs, rollout, take
+from mqe_jax.train.rollout import (
+    ObservationNormalizer,
+    RolloutState,
+    chunks,
+    mean_of_team,
+    minibatches,
+    normalize_obs,
+    rollout,
+    take,
+)
 from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
 from mqe_jax.train.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
 
@@ -159,8 +168,10 @@ def make_learner(
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
             obs_normalizer = ObservationNormalizer(
-                running_update(obs_normalizer.obs, transitions.obs),
-                running_update(obs_normalizer.privileged, transitions.privileged_obs),
+                running_update(obs_normalizer.obs, transitions.obs, transitions.active),
+                running_update(
+                    obs_normalizer.privileged, transitions.privileged_obs, jnp.any(transitions.active, axis=-1)
+                ),
             )
         new_state = TrainState(
             params=params,
@@ -219,13 +230,14 @@ def _prepare(
     The critic evaluates each step's observation and final observation as a chunk of two, batched over all steps: the
     next value uses the recurrent state after the step's observation, whether or not the episode ended there.
     """
+    active, normalize = transitions.active, config.normalization.observations
     obs, privileged = normalize_obs(
-        state.obs_normalizer, transitions.obs, transitions.privileged_obs, config.normalization.observations
+        state.obs_normalizer, transitions.obs, transitions.privileged_obs, active, normalize
     )
     # What the critic does not read may be missing; these observations take its place.
     final = (transitions.final_obs, transitions.obs), (transitions.final_privileged_obs, transitions.privileged_obs)
     final_obs, final_privileged = normalize_obs(
-        state.obs_normalizer, *(b if a is None else a for a, b in final), config.normalization.observations
+        state.obs_normalizer, *(b if a is None else a for a, b in final), active, normalize
     )
     pair, _ = network.value(
         state.params,
@@ -233,12 +245,13 @@ def _prepare(
         jnp.zeros((2, *transitions.done.shape), bool),
         jnp.stack([obs, final_obs]),
         jnp.stack([privileged, final_privileged]),
+        jnp.stack([active, active]),
     )
     value_normalizer = state.value_normalizer
     value, next_value = value_denormalize(value_normalizer, pair)
-    reward = transitions.reward
+    reward, counted = jnp.where(active, transitions.reward, 0), active
     if config.ppo.value == "joint":
-        reward = jnp.mean(reward, axis=-1, keepdims=True)
+        reward, counted = mean_of_team(reward, active)[..., None], jnp.any(active, axis=-1, keepdims=True)
     advantage, target = gae(
         reward,
         value,
@@ -249,15 +262,15 @@ def _prepare(
         gae_lambda=config.ppo.gae_lambda,
     )
     if config.normalization.values:
-        value_normalizer = value_update(value_normalizer, target, config.normalization.value_decay)
-    unexplained = devices.variance(target - value) / jnp.maximum(devices.variance(target), 1e-8)
-    metrics = {"value_mean": devices.mean(jnp.mean(value)), "explained_variance": 1.0 - unexplained}
+        value_normalizer = value_update(value_normalizer, target, counted, config.normalization.value_decay)
+    unexplained = devices.variance(target - value, counted) / jnp.maximum(devices.variance(target, counted), 1e-8)
+    metrics = {"value_mean": devices.mean_where(value, counted), "explained_variance": 1.0 - unexplained}
     if config.ppo.advantage_clip is not None:
-        scale = devices.median(jnp.abs(advantage)) + 1e-8
+        scale = devices.median(jnp.abs(advantage), counted) + 1e-8
         advantage = jnp.clip(advantage / scale, -now.advantage_clip, now.advantage_clip)
     if config.normalization.advantages:
-        deviation = jnp.sqrt(devices.variance(advantage))
-        advantage = (advantage - devices.mean(jnp.mean(advantage))) / (deviation + 1e-8)
+        deviation = jnp.sqrt(devices.variance(advantage, counted))
+        advantage = (advantage - devices.mean_where(advantage, counted)) / (deviation + 1e-8)
 
     steps = network.chunk_length
     batch = Batch(
@@ -270,6 +283,7 @@ def _prepare(
         advantage=chunks(advantage, steps),
         target=chunks(target, steps),
         old_value=chunks(pair[0], steps),
+        active=chunks(active, steps),
     )
     return batch, value_normalizer, metrics
 
@@ -282,31 +296,43 @@ def _loss(
     value_normalizer: ValueStatistics,
     batch: Batch,
 ) -> tuple[jax.Array, Metrics]:
-    """Returns the PPO loss () of a minibatch and its parts."""
-    ppo = config.ppo
-    new = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, batch.action)
-    log_ratio = RATIOS[ppo.ratio](new.log_prob, batch.log_prob)
+    """Returns the PPO loss () of a minibatch and its parts, means over active agents."""
+    ppo, active = config.ppo, batch.active
+    seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
+    new = network.evaluate(params, *seen, batch.action, active)
+    old, now_taken = (jnp.where(active[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
+    log_ratio = RATIOS[ppo.ratio](now_taken, old)
     surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
-    policy_loss = jnp.mean(jnp.sum(surrogate, axis=-1))
+    policy_loss = _mean(jnp.sum(surrogate, axis=-1), active)
     target = value_normalize(value_normalizer, batch.target)
-    critic_loss = jnp.mean(value_loss(new.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta))
-    mean_entropy = jnp.mean(new.entropy)
-    per_agent = RATIOS["agent"](new.log_prob, batch.log_prob)
+    critic_loss = _mean(value_loss(new.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta), active)
+    mean_entropy = _mean(new.entropy, active)
+    per_agent = RATIOS["agent"](now_taken, old)[..., 0]
     metrics = {
         "loss/policy": policy_loss,
         "loss/value": critic_loss,
         "entropy": mean_entropy,
-        "approx_kl": jnp.mean(jnp.exp(per_agent) - 1.0 - per_agent),
-        "clip_fraction": jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32)),
+        "approx_kl": _mean(jnp.exp(per_agent) - 1.0 - per_agent, active),
+        "clip_fraction": _mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), active),
     }
     metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
     actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
     if config.imitation.teacher is not None:
-        action = batch.teacher_action
-        taught = network.evaluate(params, batch.memory, batch.is_first, batch.obs, batch.privileged_obs, action)
-        metrics["loss/imitation"] = -jnp.mean(jnp.sum(taught.log_prob, axis=-1))
+        taught = network.evaluate(params, *seen, batch.teacher_action, active)
+        metrics["loss/imitation"] = -_mean(jnp.sum(taught.log_prob, axis=-1), active)
         actor_loss += now.imitation * metrics["loss/imitation"]
     return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
+
+
+def _mean(x: jax.Array, active: jax.Array) -> jax.Array:
+    """Returns the mean over active agents of values (L, C, A, ...); of a team's, (L, C, 1, ...), over teams with any.
+
+    The count is a mean over processes, over which the gradient is averaged.
+    """
+    mask = active if x.shape[:3] == active.shape else jnp.any(active, axis=-1, keepdims=True)
+    mask = jnp.broadcast_to(mask.reshape(*mask.shape, *(1,) * (x.ndim - mask.ndim)), x.shape)
+    count = devices.mean(jnp.sum(mask.astype(jnp.float32)))
+    return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(count, 1.0)
 
 
 def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:

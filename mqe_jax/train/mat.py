@@ -24,10 +24,12 @@ from mqe_jax.train.types import Memory, NetworkMemory, Params
 # -- layers ----------------------------------------------------------------------------------------------------------
 
 
-def attention(params: Params, query: jax.Array, context: jax.Array, heads: int, *, causal: bool) -> jax.Array:
+def attention(
+    params: Params, query: jax.Array, context: jax.Array, heads: int, active: jax.Array | None, *, causal: bool
+) -> jax.Array:
     """Multi-head attention of `query` to `context`: (..., A, W), (..., A, W) -> (..., A, W).
 
-    With `causal`, an agent attends to none after itself.
+    An agent attends to itself and to the active ones (..., A); with `causal`, to none after itself.
 
     Source: Vaswani et al., arXiv 1706.03762, equation 1.
     """
@@ -40,6 +42,8 @@ def attention(params: Params, query: jax.Array, context: jax.Array, heads: int, 
     weight = jnp.matmul(q, jnp.swapaxes(k, -1, -2), precision=nn.PRECISION) / math.sqrt(q.shape[-1])
     if causal:
         weight = jnp.where(np.tri(weight.shape[-1], dtype=bool), weight, -jnp.inf)
+    if active is not None:
+        weight = jnp.where(active[..., None, None, :] | np.eye(weight.shape[-1], dtype=bool), weight, -jnp.inf)
     weight = jax.nn.softmax(weight, axis=-1)
     mixed = jnp.moveaxis(jnp.matmul(weight, v, precision=nn.PRECISION), -3, -2)
     return nn.dense(params["projection"], mixed.reshape(*mixed.shape[:-2], -1))
@@ -101,28 +105,41 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
     }
 
 
-def encode(params: Params, obs: jax.Array, heads: int) -> jax.Array:
-    """Returns features of each agent from the observations of all: (..., A, O) -> (..., A, W)."""
+def encode(params: Params, obs: jax.Array, heads: int, active: jax.Array | None = None) -> jax.Array:
+    """Returns features of each agent from the observations of all active ones: (..., A, O) -> (..., A, W)."""
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs))))
     for block in params["blocks"]:
-        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, causal=False))
+        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, active, causal=False))
         x = nn.layer_norm(block["norm1"], x + nn.mlp(block["mlp"], x, _gelu))
     return x
 
 
-def decode(params: Params, features: jax.Array, action: jax.Array, heads: int) -> jax.Array:
-    """Returns mean actions given the actions of preceding agents: (..., A, W), (..., A, D) -> (..., A, D).
+def decode(
+    params: Params, features: jax.Array, action: jax.Array, heads: int, active: jax.Array | None = None
+) -> jax.Array:
+    """Returns mean actions given those of preceding active agents: (..., A, W), (..., A, D) -> (..., A, D).
 
-    An agent's own and later actions have no effect on its mean; the first agent's token is zero.
+    An agent's own and later actions have no effect on its mean; its token is the action of the active agent before it,
+    and zero for the first one.
     """
-    token = jnp.concatenate([jnp.zeros_like(action[..., :1, :]), action[..., :-1, :]], axis=-2)
+    token = _preceding(action, active)
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
     for block in params["blocks"]:
-        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, causal=True))
-        mixed = attention(block["attention1"], features, x, heads, causal=True)
+        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, active, causal=True))
+        mixed = attention(block["attention1"], features, x, heads, active, causal=True)
         x = nn.layer_norm(block["norm1"], features + mixed)
         x = nn.layer_norm(block["norm2"], x + nn.mlp(block["mlp"], x, _gelu))
     return _head(params["head"], x)
+
+
+def _preceding(action: jax.Array, active: jax.Array | None) -> jax.Array:
+    """Returns the action (..., A, D) of each agent's predecessor among the active ones, zero without one."""
+    tokens, last = [], jnp.zeros_like(action[..., 0, :])
+    for agent in range(action.shape[-2]):
+        tokens.append(last)
+        own = action[..., agent, :]
+        last = own if active is None else jnp.where(active[..., agent, None], own, last)
+    return jnp.stack(tokens, axis=-2)
 
 
 def log_std_of(params: Params, settings: Mat) -> jax.Array:
@@ -139,9 +156,9 @@ def network(settings: Mat, dims: EnvDims) -> Network:
     heads = settings.heads
 
     def act(
-        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: jax.Array | None = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
-        features = encode(params["encoder"], obs, heads)
+        features = encode(params["encoder"], obs, heads, active)
         shape = (*obs.shape[:-1], dims.action)
         log_std = jnp.broadcast_to(log_std_of(params, settings), shape)
         noise = 0.0 if key is None else jnp.exp(log_std) * devices.normal(key, shape, obs.dtype)
@@ -149,7 +166,7 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         def act_at(agent: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             action, mean = carry
             now = (jnp.arange(dims.agents) == agent)[:, None]
-            mean = jnp.where(now, decode(params["decoder"], features, action, heads), mean)
+            mean = jnp.where(now, decode(params["decoder"], features, action, heads, active), mean)
             return jnp.where(now, mean + noise, action), mean
 
         zero = jnp.zeros(shape, obs.dtype)
@@ -157,9 +174,14 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         return action, log_prob(action, mean, log_std), memory
 
     def value(
-        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
+        params: Params,
+        memory: Memory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        active: jax.Array | None = None,
     ) -> tuple[jax.Array, Memory]:
-        return _head(params["value_head"], encode(params["encoder"], obs, heads))[..., 0], memory
+        return _head(params["value_head"], encode(params["encoder"], obs, heads, active))[..., 0], memory
 
     def evaluate(
         params: Params,
@@ -168,9 +190,10 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         obs: jax.Array,
         privileged: jax.Array,
         action: jax.Array,
+        active: jax.Array | None = None,
     ) -> Evaluation:
-        features = encode(params["encoder"], obs, heads)
-        mean = decode(params["decoder"], features, action, heads)
+        features = encode(params["encoder"], obs, heads, active)
+        mean = decode(params["decoder"], features, action, heads, active)
         log_std = jnp.broadcast_to(log_std_of(params, settings), mean.shape)
         values = _head(params["value_head"], features)[..., 0]
         return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)

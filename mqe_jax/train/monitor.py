@@ -27,7 +27,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, Result
 from mqe_jax.train.learner import env_dims
 from mqe_jax.train.policy import TrainedPolicy, policy_act, read_policy, save_policy
-from mqe_jax.train.types import Memory, VectorEnv
+from mqe_jax.train.types import Memory, Observations, VectorEnv
 
 EVALUATIONS_FILE = "evaluations.json"
 ABSOLUTE_FACTOR = 10
@@ -60,9 +60,9 @@ class Monitor:
         dims = env_dims(env, config)
         act_of = policy_act(dims, config.network, config.normalization.observations)
 
-        def act(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        def act(params: Any, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
             arrays, mode = params
-            sampled, mean = act_of(arrays, obs, memory, key), act_of(arrays, obs, memory, None)
+            sampled, mean = (act_of(arrays, seen.obs, memory, k, seen.active) for k in (key, None))
             return jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
 
         self._config = config

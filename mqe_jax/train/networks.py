@@ -62,21 +62,23 @@ class Network(NamedTuple):
     `init(key) -> params`
     `policy_params(params) -> params`: the parameters used by `act`, stored in a saved policy
     `initial_memory(num_envs) -> memory`: recurrent state of zeros with leading axis N
-    `act(policy_params, actor_memory, obs (N, A, O), key or None) -> (action (N, A, D), log_prob (N, A, D),
-    actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents may act
-    autoregressively within one call.
-    `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P)) -> (value (L, N, V),
-    critic_memory)`
-    `evaluate(params, memory, is_first (L, C), obs, privileged, action) -> Evaluation`, all agents in parallel
+    `act(policy_params, actor_memory, obs (N, A, O), key or None, active (N, A)) -> (action (N, A, D),
+    log_prob (N, A, D), actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents
+    may act autoregressively within one call.
+    `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P), active (L, N, A)) ->
+    (value (L, N, V), critic_memory)`
+    `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> Evaluation`, all agents in parallel
+    `active` says which agents take part, None: all. The observations of the others are 0; a network in which agents see
+    each other leaves them out.
     `chunk_length`: steps of truncated backpropagation through time; 1 for feed-forward networks
     """
 
     init: Callable[[jax.Array], Params]
     policy_params: Callable[[Params], Params]
     initial_memory: Callable[[int], NetworkMemory]
-    act: Callable[[Params, Memory, jax.Array, jax.Array | None], tuple[jax.Array, jax.Array, Memory]]
-    value: Callable[[Params, Memory, jax.Array, jax.Array, jax.Array], tuple[jax.Array, Memory]]
-    evaluate: Callable[[Params, NetworkMemory, jax.Array, jax.Array, jax.Array, jax.Array], Evaluation]
+    act: Callable[..., tuple[jax.Array, jax.Array, Memory]]
+    value: Callable[..., tuple[jax.Array, Memory]]
+    evaluate: Callable[..., Evaluation]
     chunk_length: int = 1
 
 

@@ -28,17 +28,18 @@ def running_init(size: int) -> RunningStatistics:
     return RunningStatistics(jnp.zeros((size,)), jnp.ones((size,)), jnp.zeros(()))
 
 
-def running_update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
-    """Merges a batch (..., size) into the statistics; all leading axes are samples.
+def running_update(statistics: RunningStatistics, batch: jax.Array, active: jax.Array) -> RunningStatistics:
+    """Merges the samples (..., size) of a batch that are active (...) bool into the statistics.
 
     Source: Chan, Golub and LeVeque 1979, the parallel form of Welford's algorithm.
     """
     batch = batch.reshape(math.prod(batch.shape[:-1]), batch.shape[-1])
-    batch_samples = jnp.float32(batch.shape[0] * devices.size())
-    batch_mean = devices.mean(jnp.mean(batch, axis=0))
-    batch_variance = devices.variance(batch, axis=0)
+    mask = jnp.broadcast_to(active.reshape(-1, 1), batch.shape)
+    batch_samples = devices.total(jnp.sum(active.astype(jnp.float32)))
+    batch_mean = devices.mean_where(batch, mask, axis=0)
+    batch_variance = devices.variance(batch, mask, axis=0)
     samples = statistics.samples + batch_samples
-    fraction = batch_samples / samples
+    fraction = batch_samples / jnp.maximum(samples, 1.0)
     shift = batch_mean - statistics.mean
     mean = statistics.mean + shift * fraction
     variance = (
@@ -74,13 +75,13 @@ def value_init(enabled: bool = True) -> ValueStatistics:
     return ValueStatistics(jnp.zeros(()), jnp.float32(not enabled), jnp.float32(not enabled))
 
 
-def value_update(statistics: ValueStatistics, target: jax.Array, decay: float) -> ValueStatistics:
-    """Updates the averages with a rollout's targets, of any shape; the weight removes the initial bias.
+def value_update(statistics: ValueStatistics, target: jax.Array, active: jax.Array, decay: float) -> ValueStatistics:
+    """Updates the averages with a rollout's targets where `active`, of the same shape; weights remove the initial bias.
 
     Source: Yu et al., arXiv 2103.01955 (there with decay 0.99999 per minibatch; here per rollout).
     """
-    mean = decay * statistics.mean + (1.0 - decay) * devices.mean(jnp.mean(target))
-    square = decay * statistics.square + (1.0 - decay) * devices.mean(jnp.mean(jnp.square(target)))
+    mean = decay * statistics.mean + (1.0 - decay) * devices.mean_where(target, active)
+    square = decay * statistics.square + (1.0 - decay) * devices.mean_where(jnp.square(target), active)
     weight = decay * statistics.weight + (1.0 - decay)
     return ValueStatistics(mean, square, weight)
 

@@ -22,7 +22,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims, NetworkSettings
 from mqe_jax.train.normalize import RunningStatistics, running_init, running_normalize
-from mqe_jax.train.types import Memory, Params, RandomKey
+from mqe_jax.train.types import Memory, Observations, Params, RandomKey
 
 POLICY_FILE = "policy.safetensors"
 
@@ -31,7 +31,7 @@ class Policy(Protocol):
     """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled code.
 
     `initial_memory(num_envs)` is the recurrent state at an episode's start, leading axis N;
-    `act(obs (N, A, O), memory, key) -> (action (N, A, D) in [-1, 1], memory)`.
+    `act(obs (N, A, O), memory, key) -> (action (N, A, D) in [-1, 1], memory)`; `obs` may also be `Observations`.
     """
 
     @property
@@ -45,7 +45,7 @@ class Policy(Protocol):
         ...
 
     def initial_memory(self, num_envs: int) -> Memory: ...
-    def act(self, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]: ...
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]: ...
 
 
 class PolicyArrays(NamedTuple):
@@ -120,8 +120,8 @@ class TrainedPolicy:
     def act(self, obs: Any, memory: Memory, key: jax.Array | None = None) -> tuple[jax.Array, Memory]:
         """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or (A, D).
 
-        `memory` is the recurrent state; the caller resets it to `initial_memory` at an episode's start. Without a key,
-        the action is the mean.
+        `obs` may also be `Observations`. `memory` is the recurrent state; the caller resets it to `initial_memory` at
+        an episode's start. Without a key, the action is the mean.
 
         Raises:
             InputError: for an observation of another shape.
@@ -133,13 +133,14 @@ class TrainedPolicy:
         self, arrays: PolicyArrays, obs: Any, memory: Memory, key: jax.Array | None = None
     ) -> tuple[jax.Array, Memory]:
         """Returns what a policy of the same architecture with other arrays does; see `act`."""
-        obs = check_obs(obs, self.dims.agents, self.dims.observation)
+        seen = Observations.at(obs)
+        obs = check_obs(seen.obs, self.dims.agents, self.dims.observation)
         check("key", key, RandomKey | None)
         expected = jax.tree.structure(self.initial_memory())
         if jax.tree.structure(memory) != expected:
             fail("memory", memory, f"the recurrent state of this policy, {expected}")
         act = policy_act(self.dims, self.config.network, self.config.normalization.observations)
-        return act(arrays, obs, memory, None if self.deterministic else key)
+        return act(arrays, obs, memory, None if self.deterministic else key, seen.active)
 
 
 @functools.lru_cache(maxsize=32)
@@ -160,14 +161,21 @@ def _shapes(tree: Any) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def policy_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any:
-    """Returns a network's compiled `act(arrays, obs, memory, key or None) -> (action, memory)`, scaled and clipped."""
+    """Returns a network's compiled `act(arrays, obs, memory, key or None, active)`, scaled and clipped.
+
+    It returns the action and the next recurrent state.
+    """
     network = settings.build(dims)
 
     @jax.jit
-    def act(arrays: PolicyArrays, obs: jax.Array, memory: Memory, key: jax.Array | None) -> tuple[jax.Array, Memory]:
+    def act(
+        arrays: PolicyArrays, obs: jax.Array, memory: Memory, key: jax.Array | None, active: jax.Array | None = None
+    ) -> tuple[jax.Array, Memory]:
         if normalize:
             obs = running_normalize(arrays.normalizer, obs)
-        action, _, memory = network.act(arrays.params, memory, obs, key)
+        if active is not None:
+            obs = jnp.where(active[..., None], obs, 0.0)
+        action, _, memory = network.act(arrays.params, memory, obs, key, active)
         return jnp.clip(arrays.action_scale * action, -1.0, 1.0), memory
 
     return act

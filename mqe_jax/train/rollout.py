@@ -35,12 +35,24 @@ class ObservationNormalizer(NamedTuple):
 
 
 def normalize_obs(
-    normalizer: ObservationNormalizer, obs: jax.Array, privileged: jax.Array, enabled: bool
+    normalizer: ObservationNormalizer, obs: jax.Array, privileged: jax.Array, active: jax.Array, enabled: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns both observations as network inputs: normalised where `enabled`."""
-    if not enabled:
-        return obs, privileged
-    return running_normalize(normalizer.obs, obs), running_normalize(normalizer.privileged, privileged)
+    """Returns both observations as network inputs: normalised where `enabled`, 0 of agents that are not `active`."""
+    if enabled:
+        obs, privileged = running_normalize(normalizer.obs, obs), running_normalize(normalizer.privileged, privileged)
+    return jnp.where(active[..., None], obs, 0.0), privileged
+
+
+def active_of(state: Any) -> jax.Array:
+    """Returns which agents of an environment's state take part (N, A) bool."""
+    active = getattr(state, "active", None)
+    return jnp.ones(state.reward.shape, bool) if active is None else active
+
+
+def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
+    """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
+    count = jnp.sum(active.astype(jnp.float32), axis=-1)
+    return jnp.sum(jnp.where(active, reward, 0.0), axis=-1) / jnp.maximum(count, 1.0)
 
 
 def rollout(
@@ -65,10 +77,11 @@ def rollout(
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, jax.Array]]:
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
-        obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, normalize)
-        action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key)
+        active = active_of(before)
+        obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, active, normalize)
+        action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key, active)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
-        _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None])
+        _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None], active[None])
         after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
         transition = Transition(
@@ -81,11 +94,12 @@ def rollout(
             action=action,
             log_prob=log_prob,
             reward=after.reward,
+            active=active,
             terminated=after.terminated,
             done=done,
         )
         episode_steps = state.episode_steps + 1
-        episode_return = state.episode_return + jnp.mean(after.reward, axis=-1)
+        episode_return = state.episode_return + mean_of_team(after.reward, active)
         of_episodes = {"episode_length": episode_steps.astype(jnp.float32), "episode_return": episode_return}
         ended = {**after.outcome.named(), **of_episodes}
         state = RolloutState(

@@ -116,7 +116,8 @@ class VectorEnv(Protocol):
 
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
-    which `curriculum.assistance` sets (see `replace_fields`). In several processes, `share(parts)` returns the batch of
+    which `curriculum.assistance` sets (see `replace_fields`); `state.active` (N, A) bool, the agents that take part: no
+    others enter statistics, losses and results. In several processes, `share(parts)` returns the batch of
     one, whose states are consecutive rows of those of all (`devices.rows`).
     """
 
@@ -251,6 +252,31 @@ class Outcome:
         return values | {f"ending/{name}": x for name, x in self.ending.items()}
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """What agents see: the input of a policy. Leading axis N, or none for a single environment."""
+
+    obs: jax.Array
+    """Observations (N, A, O)."""
+    active: jax.Array | None = None
+    """Which agents take part (N, A) bool; None: all."""
+
+    def of(self, agents: slice) -> Observations:
+        """Returns what some of the agents see."""
+        return Observations(self.obs[..., agents, :], None if self.active is None else self.active[..., agents])
+
+    @classmethod
+    def at(cls, seen: Any) -> Observations:
+        """Returns the observations of an environment's state; an array is that of the group `policy`."""
+        return seen if isinstance(seen, Observations) else cls(seen)
+
+
+def observations(state: Any) -> Observations:
+    """Returns what all agents see in an environment's state."""
+    return Observations(state.obs, getattr(state, "active", None))
+
+
 RESULTS = ("win", "draw", "loss")
 """Results of a match for a team."""
 
@@ -296,6 +322,8 @@ class Transition(NamedTuple):
     """Log-probabilities of the actions (N, A, D)."""
     reward: jax.Array
     """Rewards (N, A)."""
+    active: jax.Array
+    """Which agents took part (N, A) bool."""
     terminated: jax.Array
     """Whether the episode terminated (N,) bool."""
     done: jax.Array
@@ -317,5 +345,7 @@ class Batch(NamedTuple):
     """Value targets in units of reward (L, C, V)."""
     old_value: jax.Array
     """Normalised values at collection (L, C, V)."""
+    active: jax.Array
+    """Which agents took part (L, C, A) bool."""
     teacher_action: Any = ()
     """Actions of the teacher, unscaled (L, C, A, D); empty without one."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import RESULTS, VectorEnv, where_rows
+from mqe_jax.train.types import RESULTS, VectorEnv, observations, where_rows
 from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")
@@ -182,7 +182,7 @@ class Session:
 
     def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
         env = self.env
-        action, memory = self._policy.act(state.obs, memory, key)
+        action, memory = self._policy.act(observations(state), memory, key)
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.

@@ -15,7 +15,7 @@ from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.evaluate import Act, acting
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import AnySingle, PolicyOrAct, RandomKey
+from mqe_jax.train.types import AnySingle, PolicyOrAct, RandomKey, observations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def record(
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
         state, memory = carry
-        action, memory = act(state.obs, memory, key)
+        action, memory = act(observations(state), memory, key)
         state = jax.vmap(env.step)(state, action)
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))

@@ -206,7 +206,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         return NetworkMemory(jnp.zeros((num_envs, form.past, form.row_size)), ())
 
     def act(
-        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: jax.Array | None = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         history = jnp.concatenate([memory, obs[..., : form.row_size]], axis=-2)
         inputs = form.inputs(history[..., form.rows, :], obs[..., 0, :])
@@ -216,7 +216,12 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], history[..., 1:, :]
 
     def value(
-        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array
+        params: Params,
+        memory: Memory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        active: jax.Array | None = None,
     ) -> tuple[jax.Array, Memory]:
         return nn.mlp(params["critic"], privileged, jax.nn.elu, precision=_PRECISION), memory
 
@@ -227,6 +232,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         obs: jax.Array,
         privileged: jax.Array,
         action: jax.Array,
+        active: jax.Array | None = None,
     ) -> Evaluation:
         obs = obs[..., 0, :]
         inputs = form.inputs(windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs)
