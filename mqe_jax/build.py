@@ -29,7 +29,7 @@ from mqe_jax.train.evaluate import Act
 from mqe_jax.train.folder import CONFIG_FILE, load_run_config
 from mqe_jax.train.learner import Learner, env_dims
 from mqe_jax.train.logs import check_loggers
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
 from mqe_jax.train.start import initial_key, policy_to_start
 from mqe_jax.train.types import Cast
 from mqe_jax.train.types import VectorEnv as AnyVectorEnv
@@ -145,8 +145,10 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
-    final = config.network.critic_reads
+    final = ["groups" if name == "obs" and config.group != "policy" else name for name in config.network.critic_reads]
     both, started = make_env(task, impl, config.training_env, config.num_envs, seeds, final)
+    others = [load_as("opponent", name, both) for name in Roster(opponents).fixed] if len(both.teams) > 1 else []
+    groups = {config.group, *groups_of(*others)}
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> Any:
@@ -157,11 +159,13 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
             everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
             backward = config.curriculum.backward
             made = Demonstrated(both, num_envs, everyone, seeds, backward=backward, final=final)
+        made = made.with_groups(groups)
         return Deadline(made) if config.time_limit_ends else made
 
     eval_env = None
     if config.evaluation.every is not None:
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
+        eval_env = eval_env.with_groups(groups)
     if config.train_env:
         _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env)
     _check_teams(both, config)
@@ -284,7 +288,8 @@ def players(
         about["actions"] = "mean" if own.deterministic else "sampled"
     if match:
         about["opponent"] = str(against)
-    return Players(task_env, batch, all_agents(task_env, own, other), about)
+    everyone = all_agents(task_env, own, other)
+    return Players(task_env, batch.with_groups(groups_of(everyone)), everyone, about)
 
 
 def run_config(target: str) -> Any:

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 
 from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
-from mqe_jax.envs.autoreset import FINAL, KEPT
+from mqe_jax.envs.autoreset import KEPT, SEEN
 from mqe_jax.precision import single
 from mqe_jax.settings import checked, fail
 from mqe_jax.train import devices
-from mqe_jax.train.policy import Policy
+from mqe_jax.train.policy import Policy, groups_of
 from mqe_jax.train.types import AnyPolicy, PyTree, observations, where_rows
 
 EPISODES = 128
@@ -58,7 +58,7 @@ class Demonstrated(VectorEnv):
         copies: int = 1,
         *,
         backward: bool = False,
-        final: Sequence[str] = FINAL,
+        final: Sequence[str] = SEEN,
     ) -> None:
         """Creates the batch; `demonstrator` acts for all agents, the others are those of `VectorEnv`."""
         super().__init__(env, num_envs, copies, final=final)
@@ -68,7 +68,7 @@ class Demonstrated(VectorEnv):
         if self.max_episode_steps < MOMENTS:
             fail("episode_length", env.params.episode_length, f"at least {MOMENTS} steps with a demonstrator")
         self.demonstrator, self.backward = demonstrator, backward
-        self._guide = VectorEnv(self.env, EPISODES, final=())
+        self._guide = VectorEnv(self.env, EPISODES, final=()).with_groups(groups_of(demonstrator))
 
     @single
     def reset(self, key: jax.Array) -> DemonstratedState:
@@ -107,7 +107,7 @@ class Demonstrated(VectorEnv):
 
         def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Any]:
             state, memory = carry
-            action, memory = policy.act(observations(state), memory, key)
+            action, memory = policy.act(observations(state).to(policy), memory, key)
             state = guide.step(state, action)
             done = state.terminated | state.truncated
             return (state, where_rows(done, first, memory)), (jnp.max(state.outcome.success, axis=-1), done)
@@ -148,5 +148,5 @@ def _phases(decided: jax.Array, done: jax.Array) -> jax.Array:
 
 def _fields(state: State) -> dict[str, Any]:
     """Returns the fields of states that a start sets."""
-    names = [field.name for field in dataclasses.fields(State) if field.name not in ("data", "key", *FINAL, *KEPT)]
+    names = [field.name for field in dataclasses.fields(State) if field.name not in ("data", "key", *SEEN, *KEPT)]
     return {**{name: getattr(state, name) for name in names}, "data": {n: getattr(state.data, n) for n in STATE_FIELDS}}

@@ -223,6 +223,8 @@ class Versus(OneTeam):
             opponents=opponents,
             key=key,
             active=jax.tree.map(lambda x: x[:, own], match.active),
+            groups=jax.tree.map(lambda x: x[:, own], match.groups),
+            final_groups=jax.tree.map(lambda x: x[:, own], match.final_groups),
         )
 
 
@@ -308,6 +310,8 @@ class Mirror(OneTeam):
             opponents=(),
             key=jnp.zeros((2,), jnp.uint32),
             active=jax.tree.map(teams, match.active),
+            groups=jax.tree.map(teams, match.groups),
+            final_groups=jax.tree.map(teams, match.final_groups),
         )
 
 
@@ -329,7 +333,7 @@ def _arrays(policy: Policy) -> PyTree:
 def _act(policy: Policy, opponent: Opponent, obs: Observations, key: jax.Array) -> tuple[jax.Array, Any]:
     """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
     if not isinstance(policy, TrainedPolicy):
-        return policy.act(obs, opponent.memory, key)
+        return policy.act(obs.to(policy), opponent.memory, key)
 
     def now() -> tuple[jax.Array, Any]:
         return policy.act_with(opponent.arrays, obs, opponent.memory, key)

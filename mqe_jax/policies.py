@@ -20,7 +20,7 @@ from mqe_jax.planners import scripted_policy
 from mqe_jax.precision import single
 from mqe_jax.settings import PathText, check, checked, override
 from mqe_jax.train import devices
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, read_policy
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, groups_of, read_policy
 from mqe_jax.train.types import AnyEnvironment, AnyPolicy, Memory, Observations, PolicyOrAct, RandomKey
 
 NAMES = ("scripted", "random", "idle", "forward")
@@ -73,6 +73,11 @@ class BothTeams:
         """Number of agents of both teams."""
         return self.first.agents + self.second.agents
 
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of observations that both see."""
+        return tuple(groups_of(self.first, self.second))
+
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns the initial recurrent states of both."""
         return self.first.initial_memory(num_envs), self.second.initial_memory(num_envs)
@@ -80,8 +85,9 @@ class BothTeams:
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions of all agents; see `Policy`."""
         keys, size, seen = jax.random.split(key), self.first.agents, Observations.at(obs)
-        first, first_memory = self.first.act(seen.of(slice(size)), memory[0], keys[0])
-        second, second_memory = self.second.act(seen.of(slice(size, None)), memory[1], keys[1])
+        first, first_memory = self.first.act(seen.of(slice(size)).to(self.first), memory[0], keys[0])
+        others = seen.of(slice(size, None)).to(self.second)
+        second, second_memory = self.second.act(others, memory[1], keys[1])
         return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
 
 
@@ -176,7 +182,11 @@ def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
             if value != ours[field]:
                 here = f"{env.name} has {ours[field]!r} here"
                 raise InputError(f"policy: {name} was trained with {field} {value!r}; {here}")
-    sizes = (len(env.teams[0]), env.observation_size, env.action_size)
+    group, layouts = policy.config.group, {"policy": None, **getattr(task, "groups", {})}
+    if group not in layouts:
+        raise InputError(f"policy: {name} sees the group {group!r}; {env.name} has {', '.join(layouts)}")
+    seen = env.observation_size if group == "policy" else layouts[group].size
+    sizes = (len(env.teams[0]), seen, env.action_size)
     trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
     if sizes != trained:
         raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 
 def quaternion_to_euler(quaternion: jax.Array) -> jax.Array:
@@ -29,7 +30,7 @@ def euler_to_quaternion(euler: jax.Array) -> jax.Array:
     )
 
 
-def rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
+def rotate(quaternion: jax.Array, vector: ArrayLike) -> jax.Array:
     """Rotates body-frame vectors (..., 3) into the world frame by wxyz quaternions (..., 4)."""
     w, imaginary = quaternion[..., :1], quaternion[..., 1:]
     vector = jnp.broadcast_to(vector, imaginary.shape)
@@ -42,14 +43,15 @@ def rotate_inverse(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
     return rotate(quaternion * jnp.array([1.0, -1.0, -1.0, -1.0]), vector)
 
 
-def compose(first: jax.Array, second: jax.Array) -> jax.Array:
+def compose(first: jax.Array, second: ArrayLike) -> jax.Array:
     """Returns the products of wxyz quaternions (..., 4): rotations by `second`, then by `first`."""
-    (w, real), (u, v) = (first[..., :1], second[..., :1]), (first[..., 1:], second[..., 1:])
+    other = jnp.asarray(second)
+    (w, real), (u, v) = (first[..., :1], other[..., :1]), (first[..., 1:], other[..., 1:])
     scalar = w * real - jnp.sum(u * v, axis=-1, keepdims=True)
     return jnp.concatenate([scalar, w * v + real * u + jnp.cross(u, v)], axis=-1)
 
 
-def rotation(axis: jax.Array, angle: jax.Array) -> jax.Array:
+def rotation(axis: ArrayLike, angle: jax.Array) -> jax.Array:
     """Returns the wxyz quaternions (..., 4) of rotations about unit axes (..., 3) by angles (...), rad."""
     half = angle[..., None] / 2
-    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], axis=-1)
+    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * jnp.asarray(axis)], axis=-1)

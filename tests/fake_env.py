@@ -86,7 +86,8 @@ class FakeEnv:
         data: FakeData = FakeData(*(jnp.asarray(x, jnp.float32) for x in start))
         zero, obs = jnp.zeros(()), data.qpos[self.robot_x][:, None]
         names = ("reward/progress", "average_step_reward", "diverged", "overflow")
-        results = Outcome(zero[None]), dict.fromkeys(names, zero)
+        metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
+        results = Outcome(zero[None]), metrics
         seen = obs, obs[:, 0], obs, obs[:, 0]
         return FakeState(*seen, jnp.zeros(2), false, false, *results, jnp.int32(0), zero, key, data)
 
@@ -121,6 +122,10 @@ class FakeVectorEnv:
     def reset(self, key: jax.Array) -> FakeState:
         return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
 
+    def with_groups(self, names: set[str]) -> FakeVectorEnv:
+        assert names <= {"policy"}
+        return self
+
     def share(self, parts: int) -> FakeVectorEnv:
         return FakeVectorEnv(self.env, self.num_envs // parts)
 
@@ -137,7 +142,7 @@ class FakeVectorEnv:
         return jax.vmap(one)(state, action)
 
 
-def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, copies: int = 1) -> Any:
+def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, *_: Any) -> Any:
     """Replaces `mqe_jax.build.make_env`."""
     return made(num_envs)
 

@@ -335,7 +335,7 @@ def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
         action = jnp.where(partner, action, action.at[:, 1].set(0.0))
         state = jax.vmap(env.step)(state, action)
         ends = (state.terminated | state.truncated) & ~over
-        return (state, over | ends, won | (ends & (state.outcome.success[0] > 0))), None
+        return (state, over | ends, won | (ends & (state.outcome.success[:, 0] > 0))), None
 
     @jax.jit
     def play(key: jax.Array) -> Any:

@@ -31,14 +31,15 @@ def test_statistics_are_those_of_all_processes() -> None:
     x, mask = random.normal(2.0, 3.0, (2, 5, 7)).astype(np.float32), random.random((2, 5, 7)) < 0.7
     x[~mask] = 1e6  # counts nowhere
     kept = np.ma.masked_array(x, ~mask)
-    for function, expected in (
+    cases: Any = (
         (lambda x, mask: devices.mean({"a": jnp.mean(x)})["a"], x.mean()),
         (lambda x, mask: devices.total(jnp.sum(x)), x.sum()),
         (devices.mean_where, kept.mean()),
         (devices.variance, kept.var()),
         (devices.median, np.ma.median(kept)),
         (lambda x, mask: devices.variance(x, mask, axis=0), kept.reshape(10, 7).var(axis=0)),
-    ):
+    )
+    for function, expected in cases:
         found = np.asarray(jax.vmap(function, axis_name=devices.AXIS, axis_size=2)(x, mask))
         np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-5)
         np.testing.assert_allclose(function(x.reshape(10, 7), mask.reshape(10, 7)), expected, rtol=1e-5)

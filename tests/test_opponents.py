@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax import build as setup
 from mqe_jax import cli
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.wrestling import WrestlingRewards
@@ -21,13 +22,14 @@ from mqe_jax.errors import InputError
 from mqe_jax.league.sides import BothSides
 from mqe_jax.opponents import Mirror, Versus, versus
 from mqe_jax.policies import BothTeams, all_agents, load_policy
-from mqe_jax.settings import build
+from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import score
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.types import observations
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
@@ -58,6 +60,35 @@ def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **se
     network = config.network.build(dims)
     weights = network.policy_params(random_params(network, seed))
     return TrainedPolicy(weights, running_init(dims.observation), dims, config, {"task": env.name})
+
+
+def test_teams_may_see_different_groups_of_observations() -> None:
+    """One team sees the match, the other what its robots' own sensors measure; it learns from that too."""
+    task = matches("go1tug", 2).env
+    plain = VectorEnv(task, 2)
+    with pytest.raises(InputError, match="group: 'smell' is not allowed; it must be one of go1tug: policy, proprio"):
+        plain.with_groups(["smell"])
+    env = plain.with_groups(["proprioception"])
+    seeing, blind = (new_policy(versus(env, ["idle"]), group=group) for group in ("policy", "proprioception"))
+    assert (seeing.dims.observation, blind.dims.observation) == (env.observation_size, 27)
+    state, less = jax.jit(env.reset)(KEY), jax.jit(plain.reset)(KEY)
+    robots = jax.jit(jax.vmap(task.read))(state.data)
+    np.testing.assert_allclose(state.groups["proprioception"][..., :3], robots.projected_gravity, atol=1e-6)
+    assert less.groups == {}
+    both = BothTeams(seeing, blind)
+    memory, keys = both.initial_memory(2), jax.random.split(KEY)
+    action, _ = both.act(observations(state), memory, KEY)
+    own, _ = blind.act(state.groups["proprioception"][:, 1:], memory[1], keys[1])
+    np.testing.assert_array_equal(action[:, 1:], own)
+    with pytest.raises(InputError, match="group: 'proprioception' is missing in the state"):
+        both.act(observations(less), memory, KEY)
+    config = build(TrainConfig, {**SETTINGS, "num_envs": 2, "group": "proprioception"})
+    config = override(config, {"network.critic_input": "own"})
+    learner = make_learner(Versus(env, [seeing]), config)
+    after, _ = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
+    assert after.obs_normalizer.obs.mean.shape == (27,)
+    cast = setup.environments("c", override(config, {"task": "go1gate", "evaluation.every": 1, "seed": 0}), 1)
+    assert cast.env.groups == cast.eval_env.groups == ("proprioception",)
 
 
 @pytest.fixture(scope="module")
@@ -225,11 +256,11 @@ def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half
         plain, state = plain_step(plain, exchanged), step(state, action)
         for name in ("obs", "final_obs", "reward"):
             own, theirs = getattr(state, name), getattr(plain, name)
-            np.testing.assert_array_equal(own[:2], theirs[:2])
-            np.testing.assert_array_equal(own[2:], theirs[2:, ::-1])
+            np.testing.assert_allclose(own[:2], theirs[:2], atol=1e-6)
+            np.testing.assert_allclose(own[2:], theirs[2:, ::-1], atol=1e-6)
         np.testing.assert_array_equal(state.action, exchanged)
         np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 0, 1, 1])
-        np.testing.assert_array_equal(state.privileged_obs[:, :-1], plain.privileged_obs)
+        np.testing.assert_allclose(state.privileged_obs[:, :-1], plain.privileged_obs, atol=1e-6)
         np.testing.assert_allclose(state.metrics["average_step_reward"], state.reward[:, 0], atol=1e-7)
         terms = [value for name, value in state.metrics.items() if name.startswith("reward/")]
         np.testing.assert_allclose(sum(terms), state.reward[:, 0], atol=1e-6)

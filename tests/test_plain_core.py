@@ -15,7 +15,7 @@ import pytest
 from mqe_jax import rotation
 from mqe_jax.control import Controller
 from mqe_jax.envs import VectorEnv, make, replay
-from mqe_jax.envs.autoreset import KEPT, autoreset
+from mqe_jax.envs.autoreset import KEPT, SEEN, autoreset
 from mqe_jax.envs.observation import others
 from mqe_jax.envs.reward import crowding
 from mqe_jax.robots.go1 import GO1
@@ -162,7 +162,8 @@ def test_the_privileged_observation_has_everything_in_its_place() -> None:
     drawn = jax.tree.map(lambda x: normal(*x.shape), state.randomized)
     drawn = dataclasses.replace(drawn, action_lag=jnp.int32(2))
     anchors, clock = normal(1, 2), normal(2, 2)
-    found = env.privileged_layout.split(env.privileged.observe(env.read(data), data, anchors, drawn, clock))
+    state = dataclasses.replace(state, data=data, anchors=anchors, randomized=drawn)
+    found = env.privileged_layout.split(env.privileged.observe(env.read(data), state, clock))
     q, v, sensors = (np.asarray(x) for x in (data.qpos, data.qvel, data.sensordata))
     expected: dict[str, Any] = {}
     force = lambda name: np.linalg.norm(sensors[model.sensor(name + "_force").adr[0] :][:3])  # noqa: E731
@@ -274,8 +275,10 @@ def test_an_ended_episode_is_replaced_whole_and_another_one_left_alone() -> None
     for ended in (True, False):
         now = dataclasses.replace(state, truncated=jnp.array(ended), step=jnp.int32(7))
         after = autoreset(env, now, lambda key, assistance: fresh)
+        seen = env.observed(after)  # what is left is observed
         for field in dataclasses.fields(after):
-            expected = getattr(fresh if ended and field.name not in KEPT else now, field.name)
+            source = seen if field.name in SEEN else fresh if ended and field.name not in KEPT else now
+            expected = getattr(source, field.name)
             if field.name == "data":
                 for name in (
                     "qpos",

@@ -26,7 +26,7 @@ from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
-from mqe_jax.train.types import RESULTS, Outcome
+from mqe_jax.train.types import Outcome
 from tests import training as probes
 from tests.training import Probe
 
@@ -185,8 +185,8 @@ class Matches:
 
     def _state(self, step: jax.Array) -> Fields:
         done, result = step % 2 == 0, jnp.where(step <= 2, jnp.arange(12) % 3, 0)
-        first = {name: (result == i).astype(jnp.float32) for i, name in enumerate(RESULTS)}
-        outcome = Outcome(**{name: jnp.stack([x, jnp.zeros(12)], axis=-1) for name, x in first.items()})
+        win, draw, loss = (jnp.stack([(result == i) * 1.0, jnp.zeros(12)], axis=-1) for i in range(3))
+        outcome = Outcome(win=win, draw=draw, loss=loss)
         obs, none = jnp.zeros((12, 2, 1)), jnp.zeros((12, 1))
         rest = jnp.zeros((12, 2)), done, jnp.zeros(12, bool), outcome, {}, step, none[:, 0], KEY
         return Fields(obs, none, obs, none, *rest)

@@ -306,7 +306,7 @@ def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
         seen.append(np.array(action))
         return action
 
-    def act(params: Any, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+    def act(params: Any, obs: Any, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         action = jax.random.uniform(key, (4, 2, 1))
         shown = jax.pure_callback(see, action, action, vmap_method="broadcast_all")
         return action, jnp.sum(shown, axis=(1, 2))  # so that the call is not left out

@@ -90,7 +90,8 @@ class Probe:
         obs, privileged = self._observe(hidden, step)
         zero, reward = jnp.zeros((n,)), jnp.zeros((n, self.num_agents))
         names = ("reward/pay", "average_step_reward", "diverged", "overflow")
-        rest = Outcome(zero[:, None]), dict.fromkeys(names, zero), key, step
+        metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
+        rest = Outcome(zero[:, None]), metrics, key, step
         return ProbeState(hidden, obs, privileged, obs, privileged, reward, zero > 0, zero > 0, *rest)
 
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:

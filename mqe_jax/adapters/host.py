@@ -174,8 +174,8 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
             ended = shown if same else state
             after = select(env, ended.terminated | ended.truncated, fresh, shown)
             shown = shown if same else after
-        out: Any = (after.obs, shown.final_obs, shown.reward, shown.terminated, shown.truncated)
-        return after, Step(*out, info_of(shown))
+        out: Any = (after.obs, shown.final_obs, shown.reward, shown.terminated, shown.truncated, info_of(shown))
+        return after, Step(*out)
 
     def steps(state: State, action: jax.Array, reset: AutoresetMode) -> tuple[State, Step]:
         return jax.vmap(functools.partial(step, reset))(state, action)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from mqe_jax.errors import InputError
 from mqe_jax.policies import SimplePolicy, load_as
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
 from mqe_jax.train.types import AnySingle, Memory
 
 
@@ -59,6 +59,8 @@ class TeamEnv:
         self.match = match
         self.opponent = load_as("opponent", opponent, match)
         self.num_agents = len(match.teams[0])
+        if further := groups_of(self.opponent) - {"policy"}:
+            raise InputError(f"opponent: sees the groups {sorted(further)}; here it must see the group 'policy'")
         self._source = str(opponent) if isinstance(opponent, str | Path) else None
 
     def __repr__(self) -> str:
@@ -134,9 +136,9 @@ class TeamEnv:
         after: Any = self.match.advance(own, both)
         return with_final(self.observed(self._of_team(dataclasses.replace(after, rival_memory=memory))))
 
-    def observed(self, state: TeamState) -> TeamState:
+    def observed(self, state: TeamState, groups: Sequence[str] = ()) -> TeamState:
         """Returns the state with the observations of both teams that belong to it."""
-        seen: Any = self.match.observed(state)
+        seen: Any = self.match.observed(state, groups)
         return dataclasses.replace(seen, obs=seen.obs[: self.num_agents], rival_obs=seen.obs[self.num_agents :])
 
     def _of_team(self, state: TeamState) -> TeamState:

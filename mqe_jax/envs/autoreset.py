@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Self
 
 import jax
@@ -21,11 +21,11 @@ from mqe_jax.settings import check, checked, fail
 from mqe_jax.train import devices
 from mqe_jax.train.types import RandomKey
 
-KEPT = ("assistance", "reward", "terminated", "truncated", "outcome", "metrics", "final_obs", "final_privileged_obs")
-"""Fields that an auto-reset keeps; all but the first describe the last step."""
+SEEN = ("obs", "privileged_obs", "groups")
+"""Fields that are observed once after the reset, and of which a batch may have those at the end of a step too."""
 
-FINAL = ("obs", "privileged_obs")
-"""Observations of which a batch may have those at the end of a step too."""
+KEPT = ("assistance", "reward", "terminated", "truncated", "outcome", "metrics", *(f"final_{name}" for name in SEEN))
+"""Fields that an auto-reset keeps; all but the first describe the last step."""
 
 _SMALL = 4096
 """Number of environments whose memory is not checked, which saves a trace."""
@@ -34,11 +34,12 @@ Start = Callable[[jax.Array, jax.Array], State]
 """Returns an initial state from a random key and the assistance, as `QuadrupedEnv.begin`."""
 
 
-def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> State:
+def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None, groups: Sequence[str] = ()) -> State:
     """Replaces the state of one environment by a new initial state if its episode has ended, and observes it.
 
     Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step that ended the episode;
-    `assistance` is kept. The new episode starts in the state of `start`, by default of the task's reset.
+    `assistance` is kept. The new episode starts in the state of `start`, by default of the task's reset; `groups` are
+    observed besides the group `policy`.
     """
     done = state.terminated | state.truncated
     with jax.named_scope("reset"):
@@ -49,10 +50,10 @@ def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None) -> St
                 lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
             )
             for field in dataclasses.fields(state)
-            if field.name not in ("data", "key", *FINAL, *KEPT)
+            if field.name not in ("data", "key", *SEEN, *KEPT)
         }
         data = env.physics.merge(done, fresh.data, state.data)
-    return env.observed(dataclasses.replace(state, data=data, key=key, **merged))
+    return env.observed(dataclasses.replace(state, data=data, key=key, **merged), groups)
 
 
 class Batch:
@@ -70,6 +71,8 @@ class Batch:
     """Length of an agent's action."""
     max_episode_steps: int
     """Environment steps until the time limit."""
+    group_sizes: Mapping[str, int]
+    """Lengths of the agents' observations by group."""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
@@ -95,25 +98,27 @@ class VectorEnv(Batch):
     copies: int
     """Batches for which buffers are sized."""
     final: tuple[str, ...]
-    """Which of `FINAL` are observed at the end of a step too, before any reset."""
+    """Which of `SEEN` are observed at the end of a step too, before any reset."""
+    groups: tuple[str, ...] = ()
+    """Groups that are observed besides `policy`."""
 
-    def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = FINAL) -> None:
+    def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = SEEN) -> None:
         """Creates the batch.
 
         Args:
             env: the task.
             num_envs: number of environments N.
             copies: batches under an outer `vmap`, such as one per seed, for which buffers are sized.
-            final: which of the observations `final_obs` and `final_privileged_obs` a step returns, by the names in
-                `FINAL`; a critic needs them where an episode is cut by the time limit, and each takes time.
+            final: which of the observations `final_obs`, `final_privileged_obs` and `final_groups` a step returns, by
+                the names in `SEEN`; a critic needs what it reads, and each takes time.
         """
         if isinstance(env, type) or not hasattr(env, "with_num_envs"):  # of tasks and of `walk.env.WalkEnv`
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
         num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
         self.num_envs, self.copies, self.final = num_envs, copies, tuple(final)
-        if not {*final} <= {*FINAL}:
-            fail("final", final, f"some of {', '.join(FINAL)}")
+        if not {*final} <= {*SEEN}:
+            fail("final", final, f"some of {', '.join(SEEN)}")
         if num_envs * copies > _SMALL:
             state = jax.eval_shape(functools.partial(VectorEnv.reset, self), jax.random.PRNGKey(0))
             check_memory("num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count())
@@ -124,12 +129,22 @@ class VectorEnv(Batch):
         self.observation_size = env.observation_size
         self.privileged_observation_size = env.privileged_observation_size
         self.action_size = env.action_size
+        further = {name: layout.size for name, layout in getattr(env, "groups", {}).items()}
+        self.group_sizes = {"policy": self.observation_size, **further}
+
+    def with_groups(self, names: Iterable[str]) -> Self:
+        """Returns the batch that also observes further groups; InputError for one that the task does not have."""
+        other = copy.copy(self)
+        other.groups = tuple(sorted({*names} - {"policy"}))
+        for name in other.groups:
+            if name not in self.group_sizes:
+                fail("group", name, f"one of {self.name}: {', '.join(self.group_sizes)}")
+        return other
 
     @checked(key=RandomKey)
     def reset(self, key: jax.Array) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
-        state = jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
-        return dataclasses.replace(state, **{f"final_{name}": None for name in FINAL if name not in self.final})
+        return jax.vmap(self._reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
 
     def share(self, parts: int) -> Self:
         """Returns the batch of one of several processes; raises an InputError for a fraction of an environment."""
@@ -148,10 +163,17 @@ class VectorEnv(Batch):
         return jax.vmap(self._step)(state, action)
 
     @single
+    def _reset(self, key: jax.Array) -> State:
+        return self._with_final(self.env.observed(self.env.begin(key), self.groups))
+
+    def _with_final(self, state: State) -> State:
+        """Returns a state whose observations, as far as `final` names them, are also those at the end of its step."""
+        return dataclasses.replace(state, **{f"final_{name}": getattr(state, name) for name in self.final})
+
+    @single
     def _step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
         """Advances one environment, and resets it to `start` if its episode ended; see `autoreset`."""
         state = self.env.advance(state, action)
         if self.final:
-            seen = self.env.observed(state)
-            state = dataclasses.replace(state, **{f"final_{name}": getattr(seen, name) for name in self.final})
-        return autoreset(self.env, state, start)
+            state = self._with_final(self.env.observed(state, self.groups))
+        return autoreset(self.env, state, start, self.groups)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import jax
@@ -140,8 +141,6 @@ class QuadrupedEnv(Task[S, P]):
         changed = [f"{name}={value!r}" for name, value in differences(self.params, self.Params()).items()]
         facts = [f"{agents} agents", f"observation {size}", f"action {actions}", f"engine {self.impl}", *changed]
         return f"<{self.name}: {', '.join(facts)}>"
-
-    # -- public API ---------------------------------------------------------------------------------------------
 
     @property
     def teams(self) -> tuple[tuple[int, ...], ...]:
@@ -291,18 +290,20 @@ class QuadrupedEnv(Task[S, P]):
         return dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
 
     @jax.named_scope("task")
-    def observed(self, state: State[S]) -> State[S]:
-        """Returns the state with the observations that belong to it."""
-        layout, robot_state = self.observation_layout, self.read(state.data, state.active)
-        obs = layout.pack(self.observe(state, robot_state), self.num_agents)
-        noise = self.params.randomization.observation_noise
-        if noise:
-            obs = obs + noise * layout.continuous * jax.random.normal(jax.random.fold_in(state.key, _NOISE), obs.shape)
-        clock = self.controller.clock(state.control)
-        privileged = self.privileged.observe(robot_state, state.data, state.anchors, state.randomized, clock)
-        obs, privileged = (jnp.clip(jnp.nan_to_num(x), -1e4, 1e4) for x in (obs, privileged))
-        obs = jnp.where(state.active[:, None], obs, 0.0)
-        return dataclasses.replace(state, obs=obs, privileged_obs=privileged)
+    def observed(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
+        """Returns the state with the observations that belong to it, and those of further groups."""
+        robots, noise, seen = self.read(state.data, state.active), self.params.randomization.observation_noise, {}
+        for number, (name, layout) in enumerate({"policy": self.observation_layout, **self.groups}.items()):
+            if name != "policy" and name not in groups:
+                continue
+            blocks = self.observe(state, robots) if name == "policy" else self.observe_group(name, state, robots)
+            obs = layout.pack(blocks, self.num_agents)
+            if noise:
+                key = jax.random.fold_in(state.key, _NOISE + number)
+                obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
+            seen[name] = jnp.where(state.active[:, None], _bounded(obs), 0.0)
+        privileged = self.privileged.observe(robots, state, self.controller.clock(state.control))
+        return dataclasses.replace(state, obs=seen.pop("policy"), privileged_obs=_bounded(privileged), groups=seen)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
         """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""
@@ -348,13 +349,10 @@ class QuadrupedEnv(Task[S, P]):
 
     def fallen(self, robot_state: RobotState) -> jax.Array:
         """Returns which active robots exceed the roll, pitch or height limits (R,) bool."""
-        params = self.params
+        params, height = self.params, robot_state.position_w[:, 2]
         roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
-        height = robot_state.position_w[:, 2]
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
         return (out | (height < params.min_height) | (height > params.max_height)) & robot_state.active
-
-    # -- internals of reset and step ----------------------------------------------------------------------------
 
     def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
         params, model, index = self.params, self.compiled.model, self.index
@@ -396,3 +394,7 @@ class QuadrupedEnv(Task[S, P]):
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
+
+
+def _bounded(x: jax.Array) -> jax.Array:
+    return jnp.clip(jnp.nan_to_num(x), -1e4, 1e4)

@@ -16,7 +16,7 @@ import numpy as np
 from mqe_jax.appearance import grounds
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.limits import Distance, Few, Fraction, Length, TimeLimit
@@ -263,13 +263,13 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
     @property
     def observation_layout(self) -> ObservationLayout:
         team = self.num_agents // 2
-        teammate = (Block("teammate", 6 * (team - 1), BASE_INFO),) if team > 1 else ()
+        teammate = (entities("teammate", "robot", team - 1, 6, BASE_INFO),) if team > 1 else ()
         return ObservationLayout(
             (
                 one_hot(team, "agent's id within its team"),
                 Block("base", 6, BASE_INFO),
                 *teammate,
-                Block("opponents", 6 * team, BASE_INFO),
+                entities("opponents", "robot", team, 6, BASE_INFO),
                 *BALL_BLOCKS,
             )
         )

@@ -19,6 +19,20 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
+class Entities:
+    """What a block holds of each of several entities of one kind, such as the teammates."""
+
+    kind: str
+    """Kind, such as robot or sheep; networks may share parameters between blocks of one kind."""
+    count: int
+    """Number of entities, at most."""
+    width: int
+    """Number of entries of each, without its mask."""
+    masked: bool = False
+    """Whether a last entry of each says if it is there, 1 or 0; the others of one that is not there are 0."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Block:
     """One block of an observation."""
 
@@ -30,6 +44,8 @@ class Block:
     """Meaning, with unit and frame."""
     categorical: bool = False
     """Whether the entries encode a category, such as a one-hot, and get no observation noise."""
+    entities: Entities | None = None
+    """What the entries are, one entity after the other; None if they are not of several entities."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,9 +68,11 @@ class ObservationLayout:
     @functools.cached_property
     def continuous(self) -> np.ndarray:
         """1 where an entry is a continuous quantity, 0 where it is categorical (size,)."""
-        return np.repeat(
-            [0.0 if block.categorical else 1.0 for block in self.blocks], [block.width for block in self.blocks]
-        ).astype(np.float32)
+        rows = [np.full(block.width, not block.categorical, np.float32) for block in self.blocks]
+        for row, block in zip(rows, self.blocks, strict=True):
+            if block.entities is not None and block.entities.masked:
+                row.reshape(block.entities.count, -1)[:, -1] = 0.0
+        return np.concatenate(rows)
 
     def slice(self, name: str) -> slice:
         """Returns the position of a block in the vector.
@@ -70,7 +88,7 @@ class ObservationLayout:
         raise KeyError(f"observation block: unknown name {name!r}; allowed: {', '.join(self.names)}")
 
     def pack(self, values: Mapping[str, jax.Array], agents: int | None = None) -> jax.Array:
-        """Concatenates named blocks (A, width) into observations (A, size).
+        """Concatenates named blocks (A, width) into observations (A, size); see `entities` for those of entities.
 
         Raises:
             ValueError: if names, widths or A, where it is given, do not match.
@@ -79,6 +97,20 @@ class ObservationLayout:
         rows = (agents or len(values[self.names[0]]),)
         parts = [shaped(f"observe: {block.name}", values[block.name], (*rows, block.width)) for block in self.blocks]
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
+
+    def entities(self, observation: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
+        """Returns a block of observations (..., size) by entity.
+
+        Entries are (..., count, width), and whether each is there (..., count) bool.
+
+        Raises:
+            KeyError: if there is no such block, or it is not of entities.
+        """
+        found = next((block.entities for block in self.blocks if block.name == name), None)
+        if found is None:
+            raise KeyError(f"observation block: {name!r} has no entities")
+        rows = observation[..., self.slice(name)].reshape(*observation.shape[:-1], found.count, -1)
+        return rows[..., : found.width], rows[..., -1] > 0.5 if found.masked else jnp.ones(rows.shape[:-1], bool)
 
     def split(self, observation: jax.Array) -> dict[str, jax.Array]:
         """Returns the blocks (..., width) of observations (..., size) by name: the inverse of `pack`.
@@ -93,6 +125,17 @@ class ObservationLayout:
         return " | ".join(f"{block.name} {block.width}" for block in self.blocks) + f" = {self.size}"
 
 
+def entities(name: str, kind: str, count: int, width: int, meaning: str = "", *, masked: bool = False) -> Block:
+    """Returns the block of several entities of a kind; `by_entity` fills a masked one."""
+    return Block(name, count * (width + masked), meaning, entities=Entities(kind, count, width, masked))
+
+
+def by_entity(values: jax.Array, there: jax.Array) -> jax.Array:
+    """Returns a masked block (A, count (width + 1)) from entries (A, count, width) and who is there (A, count)."""
+    rows = jnp.concatenate([jnp.where(there[..., None], values, 0.0), there[..., None].astype(values.dtype)], axis=-1)
+    return rows.reshape(len(rows), -1)
+
+
 BASE_INFO = "position, m, and roll, pitch, yaw, rad; environment frame"
 
 
@@ -104,6 +147,16 @@ def one_hot(agents: int, meaning: str = "agent's id") -> Block:
 # The first blocks of two cooperating robots; `pair` fills them.
 PAIR = (one_hot(2), Block("base", 6, BASE_INFO), Block("teammate", 6, BASE_INFO))
 GATE = Block("gate", 2, "centre of the gap, m")
+
+
+PROPRIOCEPTION = ObservationLayout(
+    (
+        Block("gravity", 3, "unit vector in the trunk's frame"),
+        Block("joint_position", 12, "rad, minus default"),
+        Block("joint_velocity", 12, "rad/s"),
+    )
+)
+"""What an agent's own sensors measure."""
 
 
 def pair(info: jax.Array) -> dict[str, jax.Array]:

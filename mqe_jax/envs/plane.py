@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, one_hot, others
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.limits import Length
@@ -62,7 +62,7 @@ class Go1Plane(QuadrupedEnv[None, PlaneParams]):
     def observation_layout(self) -> ObservationLayout:
         agents = self.num_agents
         blocks = [one_hot(agents), Block("base", 6, BASE_INFO)]
-        blocks += [Block("teammates", 6 * (agents - 1), BASE_INFO)] if agents > 1 else []
+        blocks += [entities("teammates", "robot", agents - 1, 6, BASE_INFO)] if agents > 1 else []
         return ObservationLayout(tuple(blocks))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,9 @@ import mujoco
 import numpy as np
 
 from mqe_jax.envs.observation import Block, ObservationLayout
-from mqe_jax.envs.randomization import RandomizedParams
+from mqe_jax.envs.state import State
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
-
-if TYPE_CHECKING:
-    from mujoco import mjx
 
 _ROBOT = (
     Block("position", 3, "m"),
@@ -77,15 +74,9 @@ class PrivilegedObservation:
             )
         )
 
-    def observe(
-        self,
-        robot_state: RobotState,
-        data: mjx.Data,
-        anchors: jax.Array,
-        randomized: RandomizedParams,
-        clock: jax.Array,
-    ) -> jax.Array:
+    def observe(self, robot_state: RobotState, state: State[Any], clock: jax.Array) -> jax.Array:
         """Returns the observation of one environment (P,); `clock` is that of the skills (R, clock_size)."""
+        data, randomized = state.data, state.randomized
         robots = jnp.concatenate(
             [
                 robot_state.position_w,
@@ -101,7 +92,7 @@ class PrivilegedObservation:
             robots,
             data.qpos[self._qpos],
             data.qvel[self._qvel],
-            anchors,
+            state.anchors,
             randomized.friction,
             randomized.payload,
             randomized.center_of_mass,

@@ -23,7 +23,7 @@ from mqe_jax.settings import Parameters, PathText, check, checked, fail, to_mapp
 from mqe_jax.train.types import AnySingle
 
 # Fields on which a step depends; the others are recomputed by it.
-_FIELDS = ("step", "anchors", "control", "actuators", "randomized", "task", "assistance", "frozen_steps", "key")
+_FIELDS = tuple("step anchors control actuators randomized task assistance frozen_steps key active".split())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.appearance import grounds
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
+from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, entities, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.limits import Buffer, Coordinate, Distance, Few, Friction, Length, NonNegative, TimeLimit
@@ -171,7 +171,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((*PAIR, GATE, Block("sheep", 2 * self.num_sheep, "x, y of each, m")))
+        return ObservationLayout((*PAIR, GATE, entities("sheep", "sheep", self.num_sheep, 2, "x, y of each, m")))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         sheep = for_all(self.sheep(state.data), 2)

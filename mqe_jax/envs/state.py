@@ -32,10 +32,10 @@ class EnvironmentState:
     """The agents' observations (A, O); after an auto-reset, those of the new episode."""
     privileged_obs: jax.Array
     """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new episode."""
-    final_obs: jax.Array | None
+    final_obs: Any
     """Observations at the end of the last step (A, O), which differ from `obs` after an auto-reset alone; None in a
     batch without them (`VectorEnv.final`)."""
-    final_privileged_obs: jax.Array | None
+    final_privileged_obs: Any
     """Privileged observation at the end of the last step (P,), or None."""
     reward: jax.Array
     """Reward (A,)."""
@@ -53,8 +53,12 @@ class EnvironmentState:
     """Curriculum level () in [0, 1]; 0 is the unmodified task."""
     key: jax.Array
     """Random key."""
-    active: jax.Array | None = dataclasses.field(default=None, kw_only=True)
+    active: Any = dataclasses.field(default=None, kw_only=True)
     """Which agents take part (A,) bool; the others count nowhere. None: all."""
+    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict, kw_only=True)
+    """Observations of further groups by name (A, O_g); `obs` is the group `policy`."""
+    final_groups: Any = dataclasses.field(default=None, kw_only=True)
+    """Those at the end of the last step, or None."""
 
 
 @jax.tree_util.register_dataclass
@@ -84,7 +88,8 @@ class State(EnvironmentState, Generic[S]):
 
 def with_final(state: Any) -> Any:
     """Returns a state whose observations are also those at the end of its step."""
-    return dataclasses.replace(state, final_obs=state.obs, final_privileged_obs=state.privileged_obs)
+    final = {"final_obs": state.obs, "final_privileged_obs": state.privileged_obs, "final_groups": state.groups}
+    return dataclasses.replace(state, **final)
 
 
 class Moment(NamedTuple, Generic[S]):

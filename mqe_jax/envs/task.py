@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.robots.index import RobotIndex, RobotState
@@ -111,6 +111,17 @@ class Task(Generic[S, P]):
     def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
+
+    @property
+    def groups(self) -> Mapping[str, ObservationLayout]:
+        """Layouts of further groups of observations by name, which are computed if a policy or a critic names them."""
+        return {"proprioception": PROPRIOCEPTION}
+
+    def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
+        """Returns the blocks of one of `groups` by name (A, width)."""
+        sensed = jax.tree.map(lambda x: x[: self.num_agents], robot_state.proprioception)
+        joints = sensed.joint_position - self.robot.default_joints
+        return {"gravity": sensed.gravity_b, "joint_position": joints, "joint_velocity": sensed.joint_velocity}
 
     def step_task(self, before: Moment[S], after: Moment[S]) -> S:
         """Returns the task's own state fields after a step; `after` still has those before it."""

@@ -35,7 +35,7 @@ class Outer(Batch):
     def __init__(self, inner: Any) -> None:
         self.inner, self.env, self.name, self.num_envs = inner, inner.env, inner.name, inner.num_envs
         self.num_agents, self.teams, self.action_size = inner.num_agents, inner.teams, inner.action_size
-        self.observation_size = inner.observation_size
+        self.observation_size, self.group_sizes = inner.observation_size, getattr(inner, "group_sizes", {})
         self.privileged_observation_size = inner.privileged_observation_size
         self.max_episode_steps = inner.max_episode_steps
 

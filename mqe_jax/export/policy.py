@@ -28,6 +28,7 @@ import onnx
 import mqe_jax
 from mqe_jax import skills
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.errors import InputError
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.policies import check_policy
 from mqe_jax.robots.index import Proprioception
@@ -48,6 +49,8 @@ def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
         InputError: for another task than the policy's, or a network with an operation that has no translation.
     """
     check_policy(policy, env)
+    if policy.config.group != "policy":
+        raise InputError(f"group: {policy.config.group!r} is not allowed; graphs of policies see the group 'policy'")
     step = functools.partial(policy_step, policy, env)
     return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
 

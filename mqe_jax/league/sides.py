@@ -46,6 +46,8 @@ class BothSides(Wrapper):
             "final_privileged_obs": jax.tree.map(told, inner.final_privileged_obs),
             "reward": self._exchanged(inner.reward),
             "active": jax.tree.map(self._exchanged, inner.active),
+            "groups": jax.tree.map(self._exchanged, inner.groups),
+            "final_groups": jax.tree.map(self._exchanged, inner.final_groups),
             "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
             "metrics": metrics,
         }

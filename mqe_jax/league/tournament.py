@@ -67,7 +67,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
 
     def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
         state, memory, finished, outcome = carry
-        action, memory = policy.act(observations(state), memory, key)
+        action, memory = policy.act(observations(state).to(policy), memory, key)
         state = env.step(state, action)
         done = state.terminated | state.truncated
         now = state.outcome.result[:, 0] > 0

@@ -35,13 +35,17 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
         "terminated": (count,),
         "truncated": (count,),
     }
+    reads, other = config.network.critic_reads, config.group != "policy"
+    if other and "obs" in reads and config.group not in (getattr(state, "final_groups", None) or {}):
+        raise InputError(f"env: final_groups of {env.name} lacks {config.group!r}, which the critic reads")
+    left_out = {f"final_{name}" for name in ("obs", "privileged_obs") if name not in reads or (name == "obs" and other)}
     for name, shape in expected.items():
         value = getattr(state, name)
-        if value is None and name.removeprefix("final_") not in config.network.critic_reads:
+        if value is None and name in left_out:
             continue
         if value is None or value.shape != shape:
-            found = "missing" if value is None else f"of shape {value.shape}"
-            raise InputError(f"env: {name} of {env.name} is {found}; expected {shape}")
+            found = "is missing" if value is None else f"has shape {value.shape}"
+            raise InputError(f"env: {name} of {env.name} {found}; expected {shape}")
     numbers = env.num_agents * (env.observation_size + env.action_size + 4) + privileged
     check_memory("rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update / processes)
     assistance = config.curriculum.assistance
@@ -56,6 +60,8 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
 def check_teacher(config: TrainConfig, teacher: Any) -> None:
     """Checks that there is a teacher if the settings name one, and that it has no recurrent state."""
     name = config.imitation.teacher
+    if getattr(teacher, "groups", ()) not in ((), (config.group,)):
+        fail("imitation.teacher", name, f"a policy that sees the group {config.group!r}")
     if (name is None) != (teacher is None) or (teacher is not None and jax.tree.leaves(teacher.initial_memory(1))):
         fail("imitation.teacher", name, "a policy without recurrent state, which is the learner's argument `teacher`")
 

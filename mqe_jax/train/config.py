@@ -210,6 +210,8 @@ class TrainConfig:
     start: FileName | None = None
     """Run folder, policy file or, for its shipped policy, task whose policy the run starts from: its parameters and
     observation statistics; none starts from nothing."""
+    group: str = "policy"
+    """Group of observations that the policy sees (`env.groups`), and its critic if that reads observations."""
     seed: Seed = 0
     """Random seed."""
     num_envs: Environments = 500

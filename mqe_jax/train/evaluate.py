@@ -175,7 +175,8 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
         fail("policy", f"one of {agents} agents", allowed)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
-    act = functools.partial(_acted, either.act, (num_envs, env.num_agents, env.action_size))
+    function = either.act if hasattr(either, "groups") else functools.partial(_given, either.act)
+    act = functools.partial(_acted, function, (num_envs, env.num_agents, env.action_size))
     return act, either.initial_memory(num_envs)
 
 
@@ -218,7 +219,7 @@ def evaluate_batch(
     """
     act, memory = acting(policy, env, env.num_envs, memory)
 
-    def act_of(params: Any, obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    def act_of(params: Any, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         return act(obs, memory, key)
 
     evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps)
@@ -245,7 +246,7 @@ class Evaluator:
         self._env, self._block, self._max_steps = env, block, max_steps
 
         def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> _Progress:
-            def own_act(obs: jax.Array, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+            def own_act(obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
                 return act(params, obs, memory, key)
 
             return _run_block(env, own_act, progress, key, memory, quota, block)

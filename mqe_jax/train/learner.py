@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.precision import single
+from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.checks import check_divisible, check_environment, check_teacher
 from mqe_jax.train.config import TrainConfig
@@ -81,10 +82,13 @@ class Learner(NamedTuple):
 
 
 def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
-    """Returns the sizes from which a network is built."""
+    """Returns the sizes from which a network is built; InputError if the environment lacks the policy's group."""
+    sizes = {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
+    if config.group not in sizes:
+        fail("group", config.group, f"one of {env.name}: {', '.join(sizes)}")
     return EnvDims(
         agents=env.num_agents,
-        observation=env.observation_size,
+        observation=sizes[config.group],
         privileged=env.privileged_observation_size,
         action=env.action_size,
         values=1 if config.ppo.value == "joint" else env.num_agents,
@@ -108,7 +112,8 @@ def make_learner(
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)
-    network = config.network.build(env_dims(env, config))
+    dims = env_dims(env, config)
+    network = config.network.build(dims)
     check_divisible(config, network, processes)
     optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
@@ -123,9 +128,7 @@ def make_learner(
             TrainState(
                 params=params,
                 optimizer=optimizer.init(params),
-                obs_normalizer=ObservationNormalizer(
-                    running_init(env.observation_size), running_init(env.privileged_observation_size)
-                ),
+                obs_normalizer=ObservationNormalizer(running_init(dims.observation), running_init(dims.privileged)),
                 value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
                 assistance=jnp.float32(config.curriculum.assistance),
@@ -157,6 +160,7 @@ def make_learner(
             config.rollout_steps,
             normalize=config.normalization.observations,
             action_scale=config.action_scale,
+            group=config.group,
         )
         batch, value_normalizer, batch_metrics = _prepare(network, config, now, state, transitions)
         if teacher is not None:
@@ -235,10 +239,10 @@ def _prepare(
         state.obs_normalizer, transitions.obs, transitions.privileged_obs, active, normalize
     )
     # What the critic does not read may be missing; these observations take its place.
-    final = (transitions.final_obs, transitions.obs), (transitions.final_privileged_obs, transitions.privileged_obs)
-    final_obs, final_privileged = normalize_obs(
-        state.obs_normalizer, *(b if a is None else a for a, b in final), active, normalize
-    )
+    last = transitions.obs if transitions.final_obs is None else transitions.final_obs
+    last_privileged = transitions.final_privileged_obs
+    last_privileged = transitions.privileged_obs if last_privileged is None else last_privileged
+    final_obs, final_privileged = normalize_obs(state.obs_normalizer, last, last_privileged, active, normalize)
     pair, _ = network.value(
         state.params,
         transitions.memory.critic,

@@ -62,7 +62,7 @@ class Monitor:
 
         def act(params: Any, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
             arrays, mode = params
-            sampled, mean = (act_of(arrays, seen.obs, memory, k, seen.active) for k in (key, None))
+            sampled, mean = (act_of(arrays, seen.group(config.group), memory, k, seen.active) for k in (key, None))
             return jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
 
         self._config = config

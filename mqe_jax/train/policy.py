@@ -31,7 +31,8 @@ class Policy(Protocol):
     """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled code.
 
     `initial_memory(num_envs)` is the recurrent state at an episode's start, leading axis N;
-    `act(obs (N, A, O), memory, key) -> (action (N, A, D) in [-1, 1], memory)`; `obs` may also be `Observations`.
+    `act(obs (N, A, O), memory, key) -> (action (N, A, D) in [-1, 1], memory)`; one with `groups`, the names of those
+    that it sees, also accepts `Observations`.
     """
 
     @property
@@ -46,6 +47,11 @@ class Policy(Protocol):
 
     def initial_memory(self, num_envs: int) -> Memory: ...
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]: ...
+
+
+def groups_of(*policies: Any) -> set[str]:
+    """Returns the groups of observations that policies see, which `VectorEnv.with_groups` adds."""
+    return {name for policy in policies for name in getattr(policy, "groups", ())}
 
 
 class PolicyArrays(NamedTuple):
@@ -101,6 +107,11 @@ class TrainedPolicy:
         return self.dims.agents
 
     @property
+    def groups(self) -> tuple[str, ...]:
+        """The group of observations that it sees."""
+        return (self.config.group,)
+
+    @property
     def arrays(self) -> PolicyArrays:
         """All arrays of the policy."""
         return PolicyArrays(self.params, self.normalizer, jnp.float32(self.config.action_scale))
@@ -108,7 +119,7 @@ class TrainedPolicy:
     @property
     def architecture(self) -> Any:
         """Everything but the arrays; policies of equal architecture can be exchanged within compiled code."""
-        sizes = (self.task, self.dims.agents, self.dims.observation, self.dims.action)
+        sizes = (self.task, self.config.group, self.dims.agents, self.dims.observation, self.dims.action)
         return (*sizes, self.config.network, self.config.normalization.observations, self.deterministic)
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
@@ -134,7 +145,8 @@ class TrainedPolicy:
     ) -> tuple[jax.Array, Memory]:
         """Returns what a policy of the same architecture with other arrays does; see `act`."""
         seen = Observations.at(obs)
-        obs = check_obs(seen.obs, self.dims.agents, self.dims.observation)
+        given = seen.group(self.config.group) if isinstance(obs, Observations) else obs
+        obs = check_obs(given, self.dims.agents, self.dims.observation)
         check("key", key, RandomKey | None)
         expected = jax.tree.structure(self.initial_memory())
         if jax.tree.structure(memory) != expected:

@@ -11,7 +11,7 @@ from mqe_jax.train import devices
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, reset_memory
+from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, observations, reset_memory
 
 
 class RolloutState(NamedTuple):
@@ -66,6 +66,7 @@ def rollout(
     *,
     normalize: bool,
     action_scale: float,
+    group: str = "policy",
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
@@ -74,11 +75,12 @@ def rollout(
     without any, of their length, return and outcome.
     """
 
-    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, jax.Array]]:
+    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
         active = active_of(before)
-        obs, privileged = normalize_obs(normalizer, before.obs, before.privileged_obs, active, normalize)
+        seen = observations(before).group(group)
+        obs, privileged = normalize_obs(normalizer, seen, before.privileged_obs, active, normalize)
         action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key, active)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None], active[None])
@@ -87,9 +89,9 @@ def rollout(
         transition = Transition(
             memory=memory,
             is_first=state.is_first,
-            obs=before.obs,
+            obs=seen,
             privileged_obs=before.privileged_obs,
-            final_obs=after.final_obs,
+            final_obs=after.final_obs if group == "policy" else (after.final_groups or {}).get(group),
             final_privileged_obs=after.final_privileged_obs,
             action=action,
             log_prob=log_prob,

@@ -117,7 +117,8 @@ class VectorEnv(Protocol):
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
     which `curriculum.assistance` sets (see `replace_fields`); `state.active` (N, A) bool, the agents that take part: no
-    others enter statistics, losses and results. In several processes, `share(parts)` returns the batch of
+    others enter statistics, losses and results; `state.groups` and `state.final_groups`, further observations by
+    name (N, A, O_g), with `group_sizes`, their lengths. In several processes, `share(parts)` returns the batch of
     one, whose states are consecutive rows of those of all (`devices.rows`).
     """
 
@@ -216,13 +217,13 @@ def teams_of(env: VectorEnv) -> Teams:
 class Outcome:
     """How an episode ended, for K teams; before its last step, as if it ended there. Any leading axes."""
 
-    success: jax.Array | None = None
+    success: Any = None
     """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None where there is no such measure."""
-    win: jax.Array | None = None
+    win: Any = None
     """Whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss."""
-    draw: jax.Array | None = None
+    draw: Any = None
     """Whether it was a draw (K,)."""
-    loss: jax.Array | None = None
+    loss: Any = None
     """Whether each team lost (K,)."""
     further: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Further results of each team by name (K,), such as a distance, m."""
@@ -258,13 +259,28 @@ class Observations:
     """What agents see: the input of a policy. Leading axis N, or none for a single environment."""
 
     obs: jax.Array
-    """Observations (N, A, O)."""
+    """Observations of the group `policy` (N, A, O)."""
     active: jax.Array | None = None
     """Which agents take part (N, A) bool; None: all."""
+    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """Observations of further groups by name (N, A, O_g)."""
 
     def of(self, agents: slice) -> Observations:
         """Returns what some of the agents see."""
-        return Observations(self.obs[..., agents, :], None if self.active is None else self.active[..., agents])
+        cut = lambda x: x[..., agents, :]  # noqa: E731
+        active = None if self.active is None else self.active[..., agents]
+        return Observations(cut(self.obs), active, jax.tree.map(cut, self.groups))
+
+    def group(self, name: str) -> jax.Array:
+        """Returns the observations of a group (N, A, O_g); InputError if they are missing."""
+        if name != "policy" and name not in self.groups:
+            allowed = ", ".join(["policy", *self.groups])
+            raise InputError(f"group: {name!r} is missing in the state; `VectorEnv.with_groups` adds it to {allowed}")
+        return self.obs if name == "policy" else self.groups[name]
+
+    def to(self, policy: Any) -> Any:
+        """Returns the argument of a policy's `act`: these, or an array for a policy that declares no `groups`."""
+        return self if hasattr(policy, "groups") else self.obs
 
     @classmethod
     def at(cls, seen: Any) -> Observations:
@@ -274,7 +290,7 @@ class Observations:
 
 def observations(state: Any) -> Observations:
     """Returns what all agents see in an environment's state."""
-    return Observations(state.obs, getattr(state, "active", None))
+    return Observations(state.obs, getattr(state, "active", None), getattr(state, "groups", {}))
 
 
 RESULTS = ("win", "draw", "loss")

@@ -182,7 +182,7 @@ class Session:
 
     def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
         env = self.env
-        action, memory = self._policy.act(observations(state), memory, key)
+        action, memory = self._policy.act(observations(state).to(self._policy), memory, key)
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.

@@ -1,6 +1,7 @@
 """Recording of episodes as numpy arrays."""
 
 import dataclasses
+import functools
 from typing import Annotated, Any
 
 import jax
@@ -14,7 +15,7 @@ from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength, Positive
 from mqe_jax.precision import single
 from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.evaluate import Act, acting
-from mqe_jax.train.policy import Policy
+from mqe_jax.train.policy import Policy, groups_of
 from mqe_jax.train.types import AnySingle, PolicyOrAct, RandomKey, observations
 
 
@@ -77,13 +78,15 @@ def record(
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     length = 50
     act, memory = acting(policy, env, episodes)
+    groups = tuple(groups_of(policy) - {"policy"})
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
         state, memory = carry
-        action, memory = act(observations(state), memory, key)
+        seen = jax.vmap(functools.partial(env.observed, groups=groups))(state) if groups else state
+        action, memory = act(observations(seen), memory, key)
         state = jax.vmap(env.step)(state, action)
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))

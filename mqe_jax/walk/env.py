@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -321,7 +322,7 @@ class WalkEnv:
         forces = forces.at[trunk, :2].add(force[0] * along + force[1] * left)
         return forces.at[trunk].add(shove) if self.task.shove else forces
 
-    def observed(self, state: WalkState) -> WalkState:
+    def observed(self, state: WalkState, groups: Sequence[str] = ()) -> WalkState:
         """Returns the state with the observations that belong to it."""
         robot_state = self.read(state.data)
         quaternion = robot_state.quaternion[0]
