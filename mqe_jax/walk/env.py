@@ -120,27 +120,29 @@ class WalkEnv:
 
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0, spec: EpisodeSpec | None = None) -> WalkState:
         """Returns the state of `reset` without observations."""
-        next_key, spec_key, random_key, pose_key, _ = jax.random.split(key, 5)
+        keys = jax.random.split(key, 9)  # as those of `QuadrupedEnv.begin`
+        next_key, spawn_key, body_key, random_key, spec_key = (keys[i] for i in (0, 2, 3, 5, 6))
         assistance = jnp.asarray(assistance, jnp.float32)
         if spec is None:
             spec = sample_spec(spec_key, self.task, self.trainee, assistance)
         offset = jnp.zeros(NUM_JOINTS)
         if self.task.randomize:
-            offset = MOTOR_OFFSET * jax.random.uniform(
-                jax.random.fold_in(random_key, 1), (NUM_JOINTS,), minval=-1.0, maxval=1.0
+            offset = jax.random.uniform(
+                jax.random.fold_in(random_key, 6), (NUM_JOINTS,), minval=-MOTOR_OFFSET, maxval=MOTOR_OFFSET
             )
-        a, b, c, d = jax.random.split(pose_key, 4)
+        yaw_key, height_key = jax.random.split(spawn_key)
+        joint_key, velocity_key = jax.random.split(body_key)
         model, index = self.compiled.model, self.index
-        yaw = jax.random.uniform(a, (), minval=-jnp.pi, maxval=jnp.pi)
+        yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
         # Fixed specs (evaluation) start along +x, so that slope and heading have a known relation.
         yaw = jnp.where(self.task.command_period > 0, yaw, 0.0)
-        joints = self.robot.default_joints * jax.random.uniform(b, (NUM_JOINTS,), minval=0.7, maxval=1.3)
+        joints = self.robot.default_joints * jax.random.uniform(joint_key, (NUM_JOINTS,), minval=0.7, maxval=1.3)
         stand = self.robot.stand_height
-        height = jax.random.uniform(c, (), minval=stand + 0.03, maxval=stand + 0.12)
+        height = jax.random.uniform(height_key, (), minval=stand + 0.03, maxval=stand + 0.12)
         quaternion = euler_to_quaternion(jnp.stack([jnp.zeros(()), jnp.zeros(()), yaw]))
         qpos = jnp.zeros(model.nq).at[index.joint_qpos[0]].set(joints)
         qpos = qpos.at[index.base_qpos[0]].set(jnp.concatenate([jnp.stack([0.0, 0.0, height]), quaternion]))
-        speed = jax.random.uniform(d, (6,), minval=-0.5, maxval=0.5)
+        speed = jax.random.uniform(velocity_key, (6,), minval=-0.5, maxval=0.5)
         qvel = jnp.zeros(model.nv).at[index.base_qvel[0]].set(speed)
         ctrl = self.actuators.control(jnp.asarray(self.robot.default_joints))
         data = self.physics.init(qpos, qvel, jnp.zeros((0, 3)), ctrl)
