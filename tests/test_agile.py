@@ -104,7 +104,7 @@ def test_the_trained_network_acts_as_the_skill() -> None:
         action, _, seen = network.act(network.policy_params(params), seen, state.obs[None], None)
         robot = env.read(state.data)
         now = Proprioception(state.obs[0, :3], robot.joint_position[0], robot.joint_velocity[0])
-        target, memory = SKILL.targets(params["policy"], memory, state.spec.commands[:3], now)
+        target, memory = SKILL.targets(params["policy"], memory, state.task.spec.commands[:3], now)
         return env.step(state, action[0]), seen, memory, GO1.joint_targets(action[0, 0]) - target
 
     for _ in range(12):
@@ -134,7 +134,7 @@ def test_a_shove_acts_at_one_point_of_the_trunk_for_its_time() -> None:
     for _ in range(20):
         orientations.append(np.asarray(state.data.qpos[3:7]))
         state = step(state, jnp.zeros((1, 12)))
-        shoves.append(np.asarray(state.shove))
+        shoves.append(np.asarray(state.task.shove))
     starts = [i for i in range(20) if i == 0 or (shoves[i] != shoves[i - 1]).any()]
     assert starts == [0, 5, 10, 15]
     for i in starts:
@@ -148,7 +148,7 @@ def test_a_delayed_robot_has_the_targets_of_the_step_before() -> None:
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     step, moved = jax.jit(env.step), []
     for lag in (0, 1):
-        late = dataclasses.replace(state, random=dataclasses.replace(state.random, action_lag=jnp.int32(lag)))
+        late = dataclasses.replace(state, randomized=dataclasses.replace(state.randomized, action_lag=jnp.int32(lag)))
         after = [step(late, jnp.full((1, 12), size)) for size in (0.0, 1.0)]
         moved.append(float(jnp.abs(after[0].data.qpos - after[1].data.qpos).max()))
     assert moved[0] > 1e-3 and moved[1] == 0.0

@@ -190,6 +190,10 @@ def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate
         (lambda: make("go1gate", min_height=2.0), r"min_height: 2.0 .* less than max_height, 1.5"),
         (lambda: make("go1gate", randomization={"payload": (3, 1)}), r"randomization.payload: .*lowest"),
         (lambda: make("go1gate", randomization={"payload": (-9, 1)}), r"randomization.payload: .*mass of the trunk"),
+        (
+            lambda: make("go1gate", control="torque", randomization={"motor_offset": 0.1}),
+            r"randomization.motor_offset: 0.1 .*0 with control torque",
+        ),
         (lambda: make("go1gate", randomization={"friction": (0, 1)}), r"randomization.friction: .*greater than 0"),
         (lambda: make("go1gate", randomization={"action_lag": 1.5}), r"randomization.action_lag: 1.5 .*valid integer"),
         (lambda: make("go1seesaw", plank_start=-0.3), r"plank_start: -0.3 .*within \+-plank.limit"),

@@ -247,9 +247,15 @@ def test_randomised_joint_mechanics_reach_the_physics() -> None:
 
 
 def test_randomisation_reaches_the_physics() -> None:
-    """Each environment's friction, payload, motors, pushes and lag differ, and a heavier trunk sags more."""
+    """Each environment's friction, payload, motors, offsets, pushes and lag differ, and a heavier trunk sags more."""
     drawn: dict[str, Any] = {"friction": (0.5, 1.25), "payload": (0.0, 6.0), "center_of_mass": (-0.02, 0.02)}
-    drawn |= {"motor_strength": (0.9, 1.1), "action_lag": 2, "push": 0.3, "observation_noise": 0.01}
+    drawn |= {
+        "motor_strength": (0.9, 1.1),
+        "motor_offset": 0.02,
+        "action_lag": 2,
+        "push": 0.3,
+        "observation_noise": 0.01,
+    }
     still: dict[str, Any] = {"spawn_velocity": 0.0, "spawn_joint_scale": (1.0, 1.0), "spawn_height": 0.31}
     env = make("go1plane", impl="c", control="position", randomization=drawn, **still)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
@@ -258,7 +264,10 @@ def test_randomisation_reaches_the_physics() -> None:
     step, neutral = jax.jit(jax.vmap(env.step)), states.data.ctrl
     for waited in range(3):  # steps since the only action
         states = step(states, jnp.full((16, 2, 12), float(waited == 0)))
-        moved = np.abs(np.asarray(states.data.ctrl - neutral)).max(-1) > 0.1
+        change = np.asarray(states.data.ctrl - neutral)
+        moved = np.abs(change).max(-1) > 0.1
+        offset = np.asarray(params.motor_offset).reshape(change.shape)
+        np.testing.assert_allclose(change[~moved], offset[~moved], atol=1e-6)
         np.testing.assert_array_equal(moved, np.asarray(params.action_lag) == waited)
     for _ in range(60):
         states = step(states, jnp.zeros((16, 2, 12)))

@@ -27,7 +27,14 @@ KEY = jax.random.PRNGKey(0)
 
 DRAWN: dict[str, Any] = {
     **{"friction": (0.5, 1.25), "payload": (-1.0, 3.0), "center_of_mass": (-0.02, 0.04), "motor_strength": (0.7, 1.2)},
-    **{"joint_mechanics": (0.5, 2.0), "action_lag": 3, "observation_noise": 0.05, "push": 0.4, "push_period": 0.1},
+    **{
+        "joint_mechanics": (0.5, 2.0),
+        "action_lag": 3,
+        "motor_offset": 0.1,
+        "observation_noise": 0.05,
+        "push": 0.4,
+        "push_period": 0.1,
+    },
 }
 
 
@@ -73,6 +80,7 @@ def test_everything_drawn_at_a_reset_is_uniform_and_independent(box: Any, resets
         "box": (qpos[:, box.objects["box"].qpos[:2]] - [2.5, 0.0]) / 0.5 / 2 + 0.5,
         "frozen": (resets.frozen_steps.max(axis=1) + 0.5) / (0.5 * params.frozen_time / box.dt),
         "lag": (drawn.action_lag + 0.5) / 4,
+        "motor_offset": drawn.motor_offset / 0.1 / 2 + 0.5,
     }
     for name in ("friction", "payload", "center_of_mass", "motor_strength", "joint_mechanics"):
         low, high = DRAWN[name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pathlib
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -135,10 +135,10 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
 
 
 def test_walking_is_a_batch_of_one_agent() -> None:
-    batch = VectorEnv(cast(Any, WalkEnv(GO1, impl="c", num_envs=2)), 2)
+    batch = VectorEnv(WalkEnv(GO1, impl="c", num_envs=2), 2)
     state = jax.eval_shape(batch.reset, jax.random.PRNGKey(0))
-    assert jax.eval_shape(batch.step, state, jnp.zeros((2, 1, 12))).obs.shape == (2, 1, walk_policy.OBSERVATION_SIZE)
-    assert state.reward.shape == (2, 1)
+    state = jax.eval_shape(batch.step, state, jnp.zeros((2, 1, 12)))
+    assert state.obs.shape == (2, 1, walk_policy.OBSERVATION_SIZE) and state.reward.shape == (2, 1)
 
 
 @pytest.mark.soak

@@ -112,7 +112,7 @@ class VectorEnv(Batch):
             final: which of the observations `final_obs`, `final_privileged_obs` and `final_groups` a step returns, by
                 the names in `SEEN`; a critic needs what it reads, and each takes time.
         """
-        if isinstance(env, type) or not hasattr(env, "with_num_envs"):  # of tasks and of `walk.env.WalkEnv`
+        if not isinstance(env, QuadrupedEnv):
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
         num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
@@ -159,7 +159,7 @@ class VectorEnv(Batch):
         Raises:
             InputError: as `QuadrupedEnv.step`, and for another number of environments.
         """
-        self.check_step(state, action, self.env.state_type)
+        self.check_step(state, action, State)
         return jax.vmap(self._step)(state, action)
 
     @single

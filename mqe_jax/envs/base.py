@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,6 @@ from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.returned import alike, results, shaped, weights_of
-from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
 from mqe_jax.errors import InputError, warn
@@ -48,18 +47,18 @@ _NOISE = 7919  # folded into a state's key for the noise of its observations
 class QuadrupedEnv(Task[S, P]):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
 
-    state_type = State
-
     @single
     def __init__(
         self, params: P | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
     ) -> None:
         self.params = self.Params() if params is None else params
         self.weights = weights_of(self.params)
-        expected = self.Params().num_agents
+        offset, expected = self.params.randomization.motor_offset, self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
             raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
         self.control = check_mode(control)
+        if offset and control == "torque":
+            fail("randomization.motor_offset", offset, "0 with control torque, which has no joint targets")
         num_envs = check("num_envs", num_envs, Environments)
         self.num_agents = self.params.num_agents
         self.robot = robots.get(self.params.robot)
@@ -143,19 +142,9 @@ class QuadrupedEnv(Task[S, P]):
         return f"<{self.name}: {', '.join(facts)}>"
 
     @property
-    def teams(self) -> tuple[tuple[int, ...], ...]:
-        """Agents of each team; a single team in cooperative tasks."""
-        return (tuple(range(self.num_agents)),)
-
-    @property
     def action_size(self) -> int:
         """Length of an agent's action."""
         return self.controller.action_size
-
-    @property
-    def observation_size(self) -> int:
-        """Length of an agent's observation O."""
-        return self.observation_layout.size
 
     @property
     def privileged_layout(self) -> ObservationLayout:
@@ -169,8 +158,8 @@ class QuadrupedEnv(Task[S, P]):
 
     @property
     def action_space(self) -> Box:
-        """All agents' actions (A, action_size) in [-1, 1]."""
-        return box(1.0, (self.num_agents, self.action_size))
+        """All agents' actions (A, action_size), within `action_limit`."""
+        return box(self.action_limit, (self.num_agents, self.action_size))
 
     @property
     def observation_space(self) -> Box:
@@ -217,6 +206,7 @@ class QuadrupedEnv(Task[S, P]):
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
         robot_state = self.read(data)
         no, empty = jnp.zeros((), bool), jnp.zeros((0,))
+        nothing: Any = None
         state = State(
             data=data,
             obs=empty,
@@ -233,14 +223,15 @@ class QuadrupedEnv(Task[S, P]):
             control=self.controller.reset(),
             actuators=self.actuators.init_memory(),
             randomized=self.randomizer.sample(physics_key),
-            task=self.reset_task(task_key, robot_state, data, anchors),
+            task=nothing,
             assistance=assistance,
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
             key=next_key,
             active=jnp.ones(self.num_agents, bool),
         )
+        state = dataclasses.replace(state, task=self.reset_task(task_key, state, robot_state))
         now = Moment(state, robot_state)
-        _, logged = weigh(self.rewards(now, now, no), self.weights, self.teams, state.active)
+        _, logged = self.score(now, now, no)
         names = (*logged, "collision", "diverged", "overflow")
         outcome = dataclasses.replace(self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no))
         outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
@@ -267,7 +258,7 @@ class QuadrupedEnv(Task[S, P]):
         self._check_state(state)
         action = self.controller.checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
-        action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -1.0, 1.0)
+        action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~state.active
         action = self.unmirror_action(jnp.where(still[:, None], 0.0, action))
         key, push_key, _, npc_key = jax.random.split(state.key, 4)
@@ -280,6 +271,8 @@ class QuadrupedEnv(Task[S, P]):
             self.npc_commands(before.state, before.robots),
             state.randomized.action_lag,
         )
+        if self.params.randomization.motor_offset:
+            target = target + state.randomized.motor_offset
         data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
         fields, forces = self.randomizer.fields(state.randomized), self.external_forces(state)
         data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
@@ -302,7 +295,7 @@ class QuadrupedEnv(Task[S, P]):
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             seen[name] = jnp.where(state.active[:, None], _bounded(obs), 0.0)
-        privileged = self.privileged.observe(robots, state, self.controller.clock(state.control))
+        privileged = self.observe_privileged(state, robots)
         return dataclasses.replace(state, obs=seen.pop("policy"), privileged_obs=_bounded(privileged), groups=seen)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
@@ -311,10 +304,7 @@ class QuadrupedEnv(Task[S, P]):
         diverged = bad_action | self._diverged(state.data)
         collision = jnp.any(robot_state.count(robot_state.trunk_force[: self.num_agents] > self.params.collision_force))
         state = dataclasses.replace(state, task=alike("step_task", self.step_task(before, after), state.task))
-        terms = self.rewards(before, Moment(state, robot_state), collision)
-        if (floor := self.params.shaping_floor) < 1.0:
-            terms = faded(terms, weights_of(self.Params()), floor + (1.0 - floor) * state.assistance)
-        reward, logged = weigh(terms, self.weights, self.teams, state.active)
+        reward, logged = self.score(before, Moment(state, robot_state), collision)
         fall, crash = jnp.any(self.fallen(robot_state)), collision & self.params.end_on_collision
         failed = diverged | fall | crash
         decided = shaped("ending", self.ending(state, robot_state), (), dtype=bool)
@@ -331,6 +321,10 @@ class QuadrupedEnv(Task[S, P]):
         metrics["diverged"] = diverged.astype(jnp.float32)
         ended = {"terminated": terminated, "truncated": ~terminated & late}
         return dataclasses.replace(state, reward=clean(reward), **ended, outcome=outcome, metrics=metrics)
+
+    def observe_privileged(self, state: State[S], robot_state: RobotState) -> jax.Array:
+        """Returns the privileged observation (P,), whose blocks are those of `privileged_layout`."""
+        return self.privileged.observe(robot_state, state, self.controller.clock(state.control))
 
     def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
         """Returns the outcome if the episode ends in this step, without its cause; arguments as of `outcome`."""

@@ -244,10 +244,8 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
         side = jax.random.randint(key, (), 0, 2)
         return jnp.asarray(GOALS)[side], jnp.asarray(self.team_of) == side
 
-    def reset_task(
-        self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array
-    ) -> FootballMatchState:
-        return FootballMatchState(self.goal_distance(data), self.kick_off_play())
+    def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> FootballMatchState:
+        return FootballMatchState(self.goal_distance(state.data), self.kick_off_play())
 
     def step_task(self, before: Moment[FootballMatchState], after: Moment[FootballMatchState]) -> FootballMatchState:
         was = before.state.task

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +14,6 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
 from mqe_jax.robots.index import RobotState
 from mqe_jax.settings import record
-
-if TYPE_CHECKING:
-    from mujoco import mjx
 
 
 @record
@@ -90,7 +86,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
             commands = commands.at[self.controller.npc_skill.index(self.npc_varied)].set(move)
         return commands[None]
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> DefenderState:
+    def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> DefenderState:
         return DefenderState(jnp.zeros((), bool), self.kick_off_play())
 
     def step_task(self, before: Moment[DefenderState], after: Moment[DefenderState]) -> DefenderState:

@@ -6,7 +6,6 @@ The box is too heavy for one robot to push effectively.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +22,6 @@ from mqe_jax.robots.index import RobotState
 from mqe_jax.scene import Scene
 from mqe_jax.settings import fail, record
 from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
-
-if TYPE_CHECKING:
-    from mujoco import mjx
-
 
 _SPAWN_LENGTH, _GATE_LENGTH, _GATE_DEPTH = 2.0, 5.0, 0.1  # m, along x
 _BEHIND = 0.3  # of a robot's centre behind the box's rear face, m
@@ -132,8 +127,8 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
             qpos = qpos.at[forward].add(start)
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> PushBoxState:
-        return PushBoxState(self.object_pose(data, "box")[0])
+    def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> PushBoxState:
+        return PushBoxState(self.object_pose(state.data, "box")[0])
 
     def distances(self, now: Moment[PushBoxState]) -> tuple[jax.Array, jax.Array]:
         """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""

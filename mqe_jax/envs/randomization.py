@@ -29,6 +29,8 @@ class Randomization:
     """Shift of the trunk's centre of mass along each axis, m."""
     motor_strength: Range | None = None
     """Factor on all torques."""
+    motor_offset: NonNegative = 0.0
+    """Maximum offset of each joint target, rad."""
     joint_mechanics: Range | None = None
     """Factor on rotor inertia, damping and dry friction of the joints; needs the task parameter `joint_mechanics`."""
     action_lag: Lag = 0
@@ -60,6 +62,8 @@ class RandomizedParams:
     """Shift of the trunk's centre of mass (R, 3), m."""
     motor_strength: jax.Array
     """Factor on all torques (R,)."""
+    motor_offset: jax.Array
+    """Offset of the joint targets (R, 12), rad; not in the privileged observation."""
     joint_mechanics: jax.Array
     """Factor on rotor inertia, damping and dry friction of the joints (R,); not in the privileged observation."""
     action_lag: jax.Array
@@ -91,11 +95,13 @@ class Randomizer:
                 return jnp.full(shape, default, jnp.float32)
             return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
 
+        offset = (-random.motor_offset, random.motor_offset) if random.motor_offset else None
         return RandomizedParams(
             friction=uniform(keys[0], random.friction, (robots,), self.friction),
             payload=uniform(keys[1], random.payload, (robots,), 0.0),
             center_of_mass=uniform(keys[2], random.center_of_mass, (robots, 3), 0.0),
             motor_strength=uniform(keys[3], random.motor_strength, (robots,), 1.0),
+            motor_offset=uniform(jax.random.fold_in(key, 6), offset, self.index.joint_qpos.shape, 0.0),
             joint_mechanics=uniform(jax.random.fold_in(key, 5), random.joint_mechanics, (robots,), 1.0),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
         )

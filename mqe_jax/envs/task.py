@@ -11,6 +11,8 @@ import numpy as np
 
 from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout
 from mqe_jax.envs.params import P, TaskParams
+from mqe_jax.envs.returned import weights_of
+from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.robots.index import RobotIndex, RobotState
 from mqe_jax.robots.robot import Robot
@@ -41,6 +43,8 @@ class Task(Generic[S, P]):
     """The commands that `npc_commands` changes; without names it may change all."""
     npc_skill: ClassVar[str] = "walk"
     """Skill of the NPC robots."""
+    action_limit: ClassVar[float] = 1.0
+    """Greatest magnitude of an action; greater ones are clipped."""
     variable_num_agents: ClassVar[bool] = False
     """Whether `num_agents` may differ from the task's default."""
 
@@ -69,6 +73,11 @@ class Task(Generic[S, P]):
         """Returns the scene: track, robots and objects."""
         raise NotImplementedError(f"{type(self).__name__}: scene() is not defined")
 
+    @property
+    def teams(self) -> tuple[tuple[int, ...], ...]:
+        """Agents of each team; a single team in cooperative tasks."""
+        return (tuple(range(self.num_agents)),)
+
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the track's blocks."""
         return self.compiled.layout.spawn
@@ -86,8 +95,8 @@ class Task(Generic[S, P]):
         """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,), at a curriculum level ()."""
         return qpos, qvel
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> S:
-        """Returns the task's own state fields at the start of an episode; by default None."""
+    def reset_task(self, key: jax.Array, state: State[Any], robot_state: RobotState) -> S:
+        """Returns the task's own state fields, not yet in `state`, at the start of an episode; by default None."""
         none: Any = None
         return none
 
@@ -107,6 +116,11 @@ class Task(Generic[S, P]):
     def observation_layout(self) -> ObservationLayout:
         """The blocks of an agent's observation, in order."""
         raise NotImplementedError(f"{type(self).__name__}: observation_layout is not defined")
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an agent's observation O."""
+        return self.observation_layout.size
 
     def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
@@ -136,6 +150,15 @@ class Task(Generic[S, P]):
             collision: whether there is any trunk contact of an agent () bool.
         """
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
+
+    def score(
+        self, before: Moment[S], after: Moment[S], collision: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Returns the reward (A,) of a step and what is logged of it, as `weigh`; arguments as of `rewards`."""
+        terms = self.rewards(before, after, collision)
+        if (floor := self.params.shaping_floor) < 1.0:
+            terms = faded(terms, weights_of(self.Params()), floor + (1.0 - floor) * after.state.assistance)
+        return weigh(terms, self.weights, self.teams, after.state.active)
 
     def ending(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns whether the task's own rules end the episode () bool."""

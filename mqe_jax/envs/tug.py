@@ -112,8 +112,8 @@ class Go1Tug(Duel[TugState, TugParams]):
         shift = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
         return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(shift)
 
-    def reset_task(self, key: jax.Array, robot_state: RobotState, data: mjx.Data, anchors: jax.Array) -> TugState:
-        return TugState(self.cylinder_y(data))
+    def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> TugState:
+        return TugState(self.cylinder_y(state.data))
 
     def step_task(self, before: Moment[TugState], after: Moment[TugState]) -> TugState:
         return TugState(self.cylinder_y(before.state.data))

@@ -174,11 +174,12 @@ def _run(
     width = len(env.skill.commands)
 
     def one(state: Any, memory: Any, commands: jax.Array) -> Any:
-        state = dataclasses.replace(state, spec=dataclasses.replace(state.spec, commands=commands))
+        spec = dataclasses.replace(state.task.spec, commands=commands)
+        state = dataclasses.replace(state, task=dataclasses.replace(state.task, spec=spec))
         robot_state = env.read(state.data)
         sensed = Proprioception(state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0])
         _, memory = env.skill.targets(params, memory, commands[:width], sensed)
-        state = env.step(state, memory.action[None])
+        state = env.observed(env.advance(state, memory.action[None]))
         robot_state = env.read(state.data)
         quaternion = robot_state.quaternion[0]
         feet = foot_positions(env.robot, robot_state.joint_position[0])
@@ -195,7 +196,7 @@ def _run(
         state, memory, record = jax.vmap(one)(state, memory, commands[number])
         return (state, memory), record
 
-    state = jax.vmap(lambda key, spec: env.reset(key, spec=spec))(keys, specs)
+    state = jax.vmap(lambda key, spec: env.observed(env.with_spec(env.begin(key), spec)))(keys, specs)
     memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
     return jax.lax.scan(advance, (state, memory), numbers)[1]
 
@@ -268,7 +269,7 @@ def evaluate_skill(
     return {
         "skill": skill,
         "robot": robot.name,
-        "impl": env.physics.impl,
+        "impl": env.impl,
         "episodes": episodes,
         **{key: top[key] for key in keys if key in top},
         "scenarios": results,

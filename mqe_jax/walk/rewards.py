@@ -6,13 +6,11 @@ of the negative ones.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import walk_policy
 from mqe_jax.robots.index import RobotState, foot_positions, knee_positions
 from mqe_jax.robots.robot import Robot
 from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
@@ -48,29 +46,7 @@ class WalkRewards:
     roll_pitch_rate: float = -0.001
 
 
-@dataclasses.dataclass(frozen=True)
-class RewardInputs:
-    """Inputs of the reward terms; shapes and units as in `WalkState`.
-
-    `phases` are those of the feet (4,). Joint targets: `target`, `previous_target` one step before it, `earlier_target`
-    two steps before it, `applied` the one that the motors had. `tolerance` is that of `WalkTask`.
-    """
-
-    robot: Robot
-    robot_state: RobotState
-    commands: jax.Array
-    error: jax.Array
-    mean_error: jax.Array
-    phases: jax.Array
-    target: jax.Array
-    previous_target: jax.Array
-    earlier_target: jax.Array
-    applied: jax.Array
-    foot_force: jax.Array
-    strength: jax.Array
-    tolerance: float
-
-
+POSITIVE_TERMS = ("track_velocity", "track_mean_velocity", "track_yaw", "track_mean_yaw")
 _BLUR = 0.07  # of a gait period: standard deviation of the smoothing of desired contacts
 
 
@@ -85,12 +61,28 @@ def _closeness(error: jax.Array, half: float) -> jax.Array:
     return 1.0 / (1.0 + jnp.sum(jnp.square(error / half)))
 
 
-def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
-    """Computes all terms (), named as their weights in `WalkRewards`."""
-    robot, robot_state, commands = inputs.robot, inputs.robot_state, inputs.commands
+def reward_terms(
+    robot: Robot,
+    robot_state: RobotState,
+    commands: jax.Array,
+    *,
+    error: jax.Array,
+    mean_error: jax.Array,
+    phases: jax.Array,
+    targets: jax.Array,
+    applied: jax.Array,
+    foot_force: jax.Array,
+    strength: jax.Array,
+    tolerance: float,
+) -> dict[str, jax.Array]:
+    """Computes all terms (), named as their weights in `WalkRewards`.
+
+    `phases` are those of the feet (4,), `targets` the joint targets of the last three steps, newest first (3, 12),
+    `applied` the one that the motors had; `tolerance` is that of `WalkTask`. The others are as in `WalkState`.
+    """
+    target, previous_target, earlier_target = targets
     quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
     joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
-    phases, tolerance = inputs.phases, inputs.tolerance
     contact = desired_contact(phases)
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
@@ -118,28 +110,28 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
     up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
     tilt = euler_to_quaternion(jnp.stack([commands[11], commands[10], jnp.zeros(())]))
     wanted_up = rotate_inverse(tilt, jnp.array([0.0, 0.0, 1.0]))
-    torque = inputs.strength * (robot.kp * (inputs.applied - joint_position) - robot.kd * joint_velocity)
+    torque = strength * (robot.kp * (applied - joint_position) - robot.kd * joint_velocity)
     torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
     margin = 0.05 * (robot.joint_upper - robot.joint_lower)
     beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
     beyond += jnp.maximum(robot.joint_lower + margin - joint_position, 0)
     knees = rotate(turn, knee_positions(robot, joint_position))[:, 2] + height
-    on_ground = inputs.foot_force > 1.0
+    on_ground = foot_force > 1.0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     return {
-        "track_velocity": jnp.exp(-jnp.sum(jnp.square(inputs.error[:2] / (0.5 * tolerance)))),
-        "track_mean_velocity": _closeness(inputs.mean_error[:2], 0.055 * tolerance),
-        "track_yaw": _closeness(inputs.error[2:], 0.14 * tolerance),
-        "track_mean_yaw": _closeness(inputs.mean_error[2:], 0.055 * tolerance),
-        "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(inputs.foot_force) / 100.0))),
+        "track_velocity": jnp.exp(-jnp.sum(jnp.square(error[:2] / (0.5 * tolerance)))),
+        "track_mean_velocity": _closeness(mean_error[:2], 0.055 * tolerance),
+        "track_yaw": _closeness(error[2:], 0.14 * tolerance),
+        "track_mean_yaw": _closeness(mean_error[2:], 0.055 * tolerance),
+        "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(foot_force) / 100.0))),
         "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
         "body_height": jnp.square(height - robot.stand_height - commands[3]),
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
         "raibert": jnp.sum(jnp.square(feet_heading - place)),
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
         "foot_slip": jnp.sum(jnp.where(on_ground, jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1), 0.0)),
-        "smoothness": jnp.sum(jnp.square(inputs.target - inputs.previous_target)),
-        "second_smoothness": jnp.sum(jnp.square(inputs.target - 2 * inputs.previous_target + inputs.earlier_target)),
+        "smoothness": jnp.sum(jnp.square(target - previous_target)),
+        "second_smoothness": jnp.sum(jnp.square(target - 2 * previous_target + earlier_target)),
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
@@ -147,14 +139,3 @@ def reward_terms(inputs: RewardInputs) -> dict[str, jax.Array]:
         "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }
-
-
-POSITIVE_TERMS = ("track_velocity", "track_mean_velocity", "track_yaw", "track_mean_yaw")
-
-
-def combine(terms: dict[str, jax.Array], weights: WalkRewards) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Returns the reward () and the weighted terms: (sum of positive) x exp(sum of negative), times the step."""
-    weighted = {name: getattr(weights, name) * value for name, value in terms.items()}
-    positive = sum(weighted[name] for name in POSITIVE_TERMS)
-    negative = sum(value for name, value in weighted.items() if name not in POSITIVE_TERMS)
-    return walk_policy.STEP * positive * jnp.exp(negative), weighted

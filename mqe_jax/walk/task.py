@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from annotated_types import Ge, Le
 
-from mqe_jax.envs.randomization import Randomization, RandomizedParams
-from mqe_jax.envs.state import EnvironmentState
-from mqe_jax.limits import Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
+from mqe_jax.envs.params import TaskParams
+from mqe_jax.envs.randomization import Randomization
+from mqe_jax.limits import Buffer, Distance, Few, Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
 from mqe_jax.settings import Range, record
 from mqe_jax.walk.rewards import WalkRewards
 from mqe_jax.walk.trainees import VELOCITY, Trainee
-from mqe_jax.walk_policy import WalkMemory
-
-if TYPE_CHECKING:
-    from mujoco import mjx
 
 LATENT_TARGET = slice(-2, None)  # of the privileged observation: friction and payload, scaled
 RANDOMIZATION = Randomization(
-    friction=(0.35, 1.8), payload=(-1.0, 2.5), center_of_mass=(-0.025, 0.025), motor_strength=(0.9, 1.1)
+    friction=(0.35, 1.8),
+    payload=(-1.0, 2.5),
+    center_of_mass=(-0.025, 0.025),
+    motor_strength=(0.9, 1.1),
+    motor_offset=0.02,
 )
 
 
@@ -81,17 +81,31 @@ class EpisodeSpec:
     """Maximum force of a shove (), N."""
 
 
+@record
+class WalkParams(TaskParams):
+    """Parameters of the walking environment: a `WalkTask`, and what the environment core needs to know of it."""
+
+    num_agents: Few = 1
+    spawn_noise: Distance = 0.0
+    end_on_collision: bool = True
+    contacts_per_robot: Buffer = 16
+    constraints_per_robot: Buffer = 80
+    privileged_contact_forces: bool = True
+    frozen_time: Time = 0.0
+    walk: WalkTask = WalkTask()
+    """Parameters of the walking task."""
+
+    @property
+    def rewards(self) -> WalkRewards:
+        """Weights of the reward terms."""
+        return self.walk.rewards
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class WalkState(EnvironmentState):
-    """State of one environment: the skill's observation (1, O), noisy if randomised, and the critic's (P,).
+class WalkState:
+    """The task's own state. Slopes, forces, pushes and shoves are scaled by 1 - `assistance`."""
 
-    `LATENT_TARGET` of the latter is the regression target of the adaptation network. Slopes, forces, pushes and shoves
-    are scaled by 1 - `assistance`.
-    """
-
-    data: mjx.Data
-    """Physics state."""
     spec: EpisodeSpec
     """Commands and disturbances."""
     slope: jax.Array
@@ -102,16 +116,12 @@ class WalkState(EnvironmentState):
     """Force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)."""
     shove_steps: jax.Array
     """Steps until the current shove ends () int32."""
-    random: RandomizedParams
-    """Randomised physics parameters."""
-    motor_offset: jax.Array
-    """Offset added to the joint targets (12,), rad."""
-    memory: WalkMemory
-    """Gait phase and last actions; the history is empty."""
+    actions: jax.Array
+    """The last three actions, newest first (3, 12)."""
+    gait: jax.Array
+    """Phase of the gait cycle () in [0, 1)."""
     mean_error: jax.Array
     """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
-    episode_steps: jax.Array
-    """Steps since the reset () int32."""
 
 
 def sample_spec(key: jax.Array, task: WalkTask, trainee: Trainee, assistance: jax.Array | float) -> EpisodeSpec:

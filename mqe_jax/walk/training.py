@@ -71,10 +71,10 @@ def train_skill(
     """
     if config.opponents:
         fail("opponents", list(config.opponents), "empty: walking is not a match")
-    network, task = config.network, task or SETTINGS[skill][1]
+    network = config.network
     assert isinstance(network, HistorySettings)
-    config = override(config, {"env": {"robot": robot.name, **to_mapping(task)}})
-    env = WalkEnv(robot, task, skill=skill, impl=impl, num_envs=config.num_envs)
+    env = WalkEnv(robot, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs)
+    config = override(config, {"env": {"control": env.control, **to_mapping(env.params)}})
 
     def save(state: TrainState, row: dict[str, float]) -> None:
         updates = int(row["updates"])
@@ -85,5 +85,4 @@ def train_skill(
             weights = run_dir / f"{skill}.safetensors"
             network.form().networks.save(state.params["policy"], weights, about, half=True)
 
-    batch = VectorEnv(env, config.num_envs)  # pyright: ignore[reportArgumentType]: no task, but all that a batch uses
-    return train(batch, config, run_dir, resume, on_update=save)
+    return train(VectorEnv(env, config.num_envs), config, run_dir, resume, on_update=save)
