@@ -30,6 +30,7 @@ from mqe_jax.train.folder import CONFIG_FILE, load_run_config
 from mqe_jax.train.learner import Learner, env_dims
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
+from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import initial_key, policy_to_start
 from mqe_jax.train.types import Cast
 from mqe_jax.train.types import VectorEnv as AnyVectorEnv
@@ -78,7 +79,13 @@ def prepare(
 
 @checked(seeds=Seeds)
 def make_learner(
-    task: Task, config: Config = None, *, env: Mapping[str, Any] | None = None, impl: str = "auto", seeds: int = 1
+    task: Task,
+    config: Config = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    seeds: int = 1,
+    stages: type[Stages] = Stages,
 ) -> Learner:
     """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure functions, not compiled.
 
@@ -95,12 +102,13 @@ def make_learner(
         env: task parameters.
         impl: physics engine.
         seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
+        stages: the algorithm; a subclass has other advantages, another loss or another update (examples/happo.py).
 
     Raises:
         InputError: as `mqe_jax.learn`.
     """
     (settings, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
-    return learner.make_learner(cast.env, settings, league=cast.league, teacher=cast.teacher)
+    return learner.make_learner(cast.env, settings, league=cast.league, teacher=cast.teacher, stages=stages)
 
 
 def make_env(

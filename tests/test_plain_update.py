@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.settings import build, override
 from mqe_jax.train import learner as learning
-from mqe_jax.train import nn
+from mqe_jax.train import nn, stages
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_init
 from mqe_jax.train.optim import AdamState
@@ -333,7 +333,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
     monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, data, {"ended": {"episodes": 0.0}}))
     length = config.network.build(learning.env_dims(env, config)).chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
-    monkeypatch.setattr(learning, "minibatches", lambda *_: jnp.asarray(order))
+    monkeypatch.setattr(stages, "minibatches", lambda *_: jnp.asarray(order))
     after, metrics = jax.jit(learner_of(env, config).update)(state)
 
     plain = Plain(config, state, data)
@@ -367,7 +367,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
 def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None:
     rows = ((0.0201, 1e-3, 1e-3 / 1.5), (0.0199, 1e-3, 1e-3), (0.0051, 1e-3, 1e-3), (0.0049, 1e-3, 1.5e-3))
     for kl, before, after in (*rows, (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)):
-        rate = learning._adapted(jnp.float32(before), jnp.float32(kl), 0.01)
+        rate = stages._adapted(jnp.float32(before), jnp.float32(kl), 0.01)
         assert float(rate) == pytest.approx(after), (kl, before)
 
 

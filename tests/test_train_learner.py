@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import runpy
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +19,8 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.normalize import value_denormalize
-from mqe_jax.train.types import Outcome, VectorEnv
+from mqe_jax.train.stages import Stages
+from mqe_jax.train.types import Batch, NetworkMemory, Outcome, VectorEnv
 from tests import training as probes
 from tests.training import Probe, assert_same
 
@@ -35,9 +38,11 @@ def small(**values: Any) -> TrainConfig:
     return override(build(TrainConfig, settings), {name.replace("__", "."): value for name, value in values.items()})
 
 
-def learn(env: VectorEnv, config: TrainConfig, updates: int) -> tuple[TrainState, dict[str, jax.Array]]:
+def learn(
+    env: VectorEnv, config: TrainConfig, updates: int, stages: type[Stages] = Stages
+) -> tuple[TrainState, dict[str, jax.Array]]:
     """Runs updates and returns the last state and metrics."""
-    learner = make_learner(env, config)
+    learner = make_learner(env, config, stages=stages)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     update = jax.jit(learner.update)
     metrics = {}
@@ -91,15 +96,50 @@ VARIANTS = {
         "optimizer__target_kl": 0.02,
         "normalization__observations": True,
     },
+    "happo": {"network__share_policy": False, "ppo__value": "joint", "ppo__epochs": 2},
 }
+Happo: type[Stages] = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "happo.py"))["Happo"]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=32)
-    _, metrics = learn(env, small(**VARIANTS[variant]), 60)
+    _, metrics = learn(env, small(**VARIANTS[variant]), 60, Happo if variant == "happo" else Stages)
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["ended"]["episode_length"]) == 4.0
+
+
+def test_in_happo_an_actor_learns_in_its_turn_from_the_ratios_of_those_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A turn in which gradient steps would add 0.1 to all parameters."""
+    env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=8)
+    config = small(**VARIANTS["happo"])
+    network = config.network.build(env_dims(env, config))
+    params, stages, turns = probes.random_params(network), Happo(network, config), []
+    draw = iter(jax.random.split(jax.random.PRNGKey(0), 4))
+    normal = lambda *shape: jax.random.normal(next(draw), shape)  # noqa: E731
+    seen = NetworkMemory((), ()), jnp.zeros((1, 8), bool), normal(1, 8, 2, 3), normal(1, 8, 1)
+    action, active, zero = normal(1, 8, 2, 1), jnp.ones((1, 8, 2), bool), jnp.zeros((1, 8, 1))
+    density = lambda params: network.evaluate(params, *seen, action, active).log_prob[..., 0]  # noqa: E731
+    batch = Batch(*seen, action, density(params)[..., None], normal(1, 8, 1), zero, zero, active)
+
+    def update(self: Stages, carry: Any, batch: Batch, *_: Any) -> Any:
+        turns.append(batch)
+        return (jax.tree.map(lambda x: x + 0.1, carry[0]), *carry[1:]), {}
+
+    monkeypatch.setattr(Stages, "update", update)
+    with jax.disable_jit():
+        now: Any = None
+        start = params, stages.optimizer.init(params), jnp.float32(0.1)
+        (after, *_), _ = stages.update(start, batch, now, jax.random.PRNGKey(1))
+    first = int(turns[0].active[0, 0].argmax())
+    for turn, agent in zip(turns, (first, 1 - first), strict=True):
+        np.testing.assert_array_equal(turn.active, jnp.broadcast_to(jnp.arange(2) == agent, (1, 8, 2)))
+    np.testing.assert_array_equal(turns[0].advantage, batch.advantage)
+    moved = {**params, **jax.tree.map(lambda x: x.at[first].add(0.1), network.policy_params(params))}
+    ratio = jnp.exp(density(moved) - density(params))[..., first]
+    np.testing.assert_allclose(turns[1].advantage[..., 0], batch.advantage[..., 0] * ratio, rtol=1e-5)
+    for new, old in zip(*map(jax.tree.leaves, map(network.policy_params, (after, params))), strict=True):
+        np.testing.assert_allclose(new, old + 0.1, rtol=1e-6)  # once
 
 
 def test_an_environment_of_two_teams_is_refused() -> None:

@@ -19,8 +19,7 @@ from mqe_jax.settings import fail
 from mqe_jax.train import devices
 from mqe_jax.train.checks import check_divisible, check_environment, check_teacher
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss
-from mqe_jax.train.networks import EnvDims, Network
+from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import (
     ValueStatistics,
     running_init,
@@ -30,26 +29,11 @@ from mqe_jax.train.normalize import (
     value_normalize,
     value_update,
 )
-from mqe_jax.train.optim import AdamState, Optimizer, adam, begun_anew
-from mqe_jax.train.rollout import (
-    ObservationNormalizer,
-    RolloutState,
-    chunks,
-    mean_of_team,
-    minibatches,
-    normalize_obs,
-    rollout,
-    take,
-)
+from mqe_jax.train.optim import AdamState, begun_anew
+from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, normalize_obs, rollout
 from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
+from mqe_jax.train.stages import Metrics, Stages
 from mqe_jax.train.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
-
-Metrics = dict[str, Any]
-Carry = tuple[Params, AdamState, jax.Array]
-"""Carry of a gradient step: parameters, optimiser state, learning rate () before the schedule."""
-
-_LEARNING_RATE_RANGE = (1e-5, 1e-2)
-_ADAPTATION = 1.5
 
 
 @jax.tree_util.register_dataclass
@@ -96,7 +80,13 @@ def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
 
 
 def make_learner(
-    env: VectorEnv, config: TrainConfig, *, league: Matchmaker | None = None, teacher: Any = None, processes: int = 1
+    env: VectorEnv,
+    config: TrainConfig,
+    *,
+    league: Matchmaker | None = None,
+    teacher: Any = None,
+    processes: int = 1,
+    stages: type[Stages] = Stages,
 ) -> Learner:
     """Returns the learner of an environment.
 
@@ -106,6 +96,7 @@ def make_learner(
         league: gives the environments their opponents between updates.
         teacher: the policy that `imitation` imitates, without recurrent state.
         processes: number of processes; `devices.Processes` compiles the functions of several.
+        stages: advantages, loss and update; a subclass is another algorithm.
 
     Raises:
         InputError: if the settings do not fit the environment.
@@ -115,7 +106,7 @@ def make_learner(
     dims = env_dims(env, config)
     network = config.network.build(dims)
     check_divisible(config, network, processes)
-    optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
+    algorithm = stages(network, config)
 
     @single
     def init(key: jax.Array) -> TrainState:
@@ -127,7 +118,7 @@ def make_learner(
         state = _strongly_typed(
             TrainState(
                 params=params,
-                optimizer=optimizer.init(params),
+                optimizer=algorithm.optimizer.init(params),
                 obs_normalizer=ObservationNormalizer(running_init(dims.observation), running_init(dims.privileged)),
                 value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
@@ -162,13 +153,14 @@ def make_learner(
             action_scale=config.action_scale,
             group=config.group,
         )
-        batch, value_normalizer, batch_metrics = _prepare(network, config, now, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(algorithm, now, state, transitions)
         if teacher is not None:
             shown = _teacher_actions(teacher, transitions.obs) / config.action_scale
             batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
-        params, optimizer_state, learning_rate, loss_metrics = _learn(
-            network, optimizer, config, now, state, value_normalizer, batch, epoch_key
-        )
+        carry = state.params, begun_anew(state.optimizer, now.actor_begins), state.learning_rate
+        carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
+        params, optimizer_state, learning_rate = carry
+        loss_metrics["learning_rate"] = learning_rate * now.learning_rate_factor
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
             obs_normalizer = ObservationNormalizer(
@@ -227,13 +219,14 @@ def _teacher_actions(teacher: Any, obs: jax.Array) -> jax.Array:
 
 
 def _prepare(
-    network: Network, config: TrainConfig, now: Scheduled, state: TrainState, transitions: Transition
+    stages: Stages, now: Scheduled, state: TrainState, transitions: Transition
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
     The critic evaluates each step's observation and final observation as a chunk of two, batched over all steps: the
     next value uses the recurrent state after the step's observation, whether or not the episode ended there.
     """
+    network, config = stages.network, stages.config
     active, normalize = transitions.active, config.normalization.observations
     obs, privileged = normalize_obs(
         state.obs_normalizer, transitions.obs, transitions.privileged_obs, active, normalize
@@ -253,29 +246,12 @@ def _prepare(
     )
     value_normalizer = state.value_normalizer
     value, next_value = value_denormalize(value_normalizer, pair)
-    reward, counted = jnp.where(active, transitions.reward, 0), active
-    if config.ppo.value == "joint":
-        reward, counted = mean_of_team(reward, active)[..., None], jnp.any(active, axis=-1, keepdims=True)
-    advantage, target = gae(
-        reward,
-        value,
-        next_value,
-        transitions.terminated.astype(jnp.float32) * (1.0 - now.failure_bootstrap),
-        transitions.done,
-        gamma=config.ppo.gamma,
-        gae_lambda=config.ppo.gae_lambda,
-    )
+    advantage, target = stages.advantages(now, transitions, value, next_value)
+    counted = stages.counted(active)
     if config.normalization.values:
         value_normalizer = value_update(value_normalizer, target, counted, config.normalization.value_decay)
     unexplained = devices.variance(target - value, counted) / jnp.maximum(devices.variance(target, counted), 1e-8)
     metrics = {"value_mean": devices.mean_where(value, counted), "explained_variance": 1.0 - unexplained}
-    if config.ppo.advantage_clip is not None:
-        scale = devices.median(jnp.abs(advantage), counted) + 1e-8
-        advantage = jnp.clip(advantage / scale, -now.advantage_clip, now.advantage_clip)
-    if config.normalization.advantages:
-        deviation = jnp.sqrt(devices.variance(advantage, counted))
-        advantage = (advantage - devices.mean_where(advantage, counted)) / (deviation + 1e-8)
-
     steps = network.chunk_length
     batch = Batch(
         memory=jax.tree.map(lambda x: x[::steps].reshape(-1, *x.shape[2:]), transitions.memory),
@@ -285,102 +261,8 @@ def _prepare(
         action=chunks(transitions.action, steps),
         log_prob=chunks(transitions.log_prob, steps),
         advantage=chunks(advantage, steps),
-        target=chunks(target, steps),
+        target=chunks(value_normalize(value_normalizer, target), steps),
         old_value=chunks(pair[0], steps),
         active=chunks(active, steps),
     )
     return batch, value_normalizer, metrics
-
-
-def _loss(
-    params: Params,
-    network: Network,
-    config: TrainConfig,
-    now: Scheduled,
-    value_normalizer: ValueStatistics,
-    batch: Batch,
-) -> tuple[jax.Array, Metrics]:
-    """Returns the PPO loss () of a minibatch and its parts, means over active agents."""
-    ppo, active = config.ppo, batch.active
-    seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
-    new = network.evaluate(params, *seen, batch.action, active)
-    old, now_taken = (jnp.where(active[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
-    log_ratio = RATIOS[ppo.ratio](now_taken, old)
-    surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
-    policy_loss = _mean(jnp.sum(surrogate, axis=-1), active)
-    target = value_normalize(value_normalizer, batch.target)
-    critic_loss = _mean(value_loss(new.value, batch.old_value, target, ppo.value_clip, ppo.huber_delta), active)
-    mean_entropy = _mean(new.entropy, active)
-    per_agent = RATIOS["agent"](now_taken, old)[..., 0]
-    metrics = {
-        "loss/policy": policy_loss,
-        "loss/value": critic_loss,
-        "entropy": mean_entropy,
-        "approx_kl": _mean(jnp.exp(per_agent) - 1.0 - per_agent, active),
-        "clip_fraction": _mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), active),
-    }
-    metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
-    actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
-    if config.imitation.teacher is not None:
-        taught = network.evaluate(params, *seen, batch.teacher_action, active)
-        metrics["loss/imitation"] = -_mean(jnp.sum(taught.log_prob, axis=-1), active)
-        actor_loss += now.imitation * metrics["loss/imitation"]
-    return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
-
-
-def _mean(x: jax.Array, active: jax.Array) -> jax.Array:
-    """Returns the mean over active agents of values (L, C, A, ...); of a team's, (L, C, 1, ...), over teams with any.
-
-    The count is a mean over processes, over which the gradient is averaged.
-    """
-    mask = active if x.shape[:3] == active.shape else jnp.any(active, axis=-1, keepdims=True)
-    mask = jnp.broadcast_to(mask.reshape(*mask.shape, *(1,) * (x.ndim - mask.ndim)), x.shape)
-    count = devices.mean(jnp.sum(mask.astype(jnp.float32)))
-    return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(count, 1.0)
-
-
-def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
-    """Returns a smaller learning rate where the KL divergence exceeds the target, a larger one where it is below."""
-    factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
-    return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
-
-
-def _learn(
-    network: Network,
-    optimizer: Optimizer,
-    config: TrainConfig,
-    now: Scheduled,
-    state: TrainState,
-    value_normalizer: ValueStatistics,
-    batch: Batch,
-    key: jax.Array,
-) -> tuple[Params, AdamState, jax.Array, Metrics]:
-    """Runs the epochs over the batch; returns parameters, optimiser state, learning rate and mean metrics."""
-    parts = config.rollout_steps // batch.is_first.shape[0]
-
-    def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
-        params, optimizer_state, learning_rate = carry
-        own = jax.grad(_loss, has_aux=True)(params, network, config, now, value_normalizer, minibatch)
-        gradient, metrics = devices.mean(own)
-        if config.optimizer.target_kl is not None:
-            adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
-            falls_only = (now.learning_rate_factor < 1.0) | (jnp.float32(now.actor_coef) < 1.0)
-            learning_rate = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
-        params, optimizer_state, grad_norm = optimizer.update(
-            gradient, optimizer_state, params, learning_rate * now.learning_rate_factor
-        )
-        return (params, optimizer_state, learning_rate), {**metrics, "grad_norm": grad_norm}
-
-    def epoch(carry: Carry, epoch_key: jax.Array) -> tuple[Carry, Metrics]:
-        if config.ppo.minibatches == 1:
-            return step(carry, batch)
-        index = minibatches(config.ppo, epoch_key, parts, batch.is_first.shape[1] // parts)
-        carry, metrics = jax.lax.scan(lambda c, i: step(c, take(batch, i)), carry, index)
-        return carry, jax.tree.map(jnp.mean, metrics)
-
-    carry = (state.params, begun_anew(state.optimizer, now.actor_begins), state.learning_rate)
-    carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.ppo.epochs))
-    params, optimizer_state, learning_rate = carry
-    metrics = jax.tree.map(jnp.mean, metrics)
-    metrics["learning_rate"] = learning_rate * now.learning_rate_factor
-    return params, optimizer_state, learning_rate, metrics

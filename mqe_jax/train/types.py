@@ -358,7 +358,7 @@ class Batch(NamedTuple):
     advantage: jax.Array
     """Advantages (L, C, V)."""
     target: jax.Array
-    """Value targets in units of reward (L, C, V)."""
+    """Value targets, normalised (L, C, V)."""
     old_value: jax.Array
     """Normalised values at collection (L, C, V)."""
     active: jax.Array

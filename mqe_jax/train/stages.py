@@ -1,0 +1,142 @@
+"""The stages of an update of the learner: advantages, loss, gradient steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.train import devices
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss
+from mqe_jax.train.networks import Network
+from mqe_jax.train.optim import AdamState, adam
+from mqe_jax.train.rollout import mean_of_team, minibatches, take
+from mqe_jax.train.schedules import Scheduled
+from mqe_jax.train.types import Batch, Params, Transition
+
+Metrics = dict[str, Any]
+Carry = tuple[Params, AdamState, jax.Array]
+"""What gradient steps change: parameters, optimiser state, learning rate () before the schedule."""
+
+_LEARNING_RATE_RANGE = (1e-5, 1e-2)
+_ADAPTATION = 1.5
+
+
+class Stages:
+    """The stages of PPO, pure functions; a subclass that overrides some of them is another algorithm."""
+
+    def __init__(self, network: Network, config: TrainConfig) -> None:
+        self.network, self.config = network, config
+        self.optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
+
+    def counted(self, active: jax.Array) -> jax.Array:
+        """Returns which values (..., V) count, of agents of which some are active (..., A)."""
+        return jnp.any(active, axis=-1, keepdims=True) if self.config.ppo.value == "joint" else active
+
+    def advantages(
+        self, now: Scheduled, transitions: Transition, value: jax.Array, next_value: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Returns the advantages and the value targets, in units of reward, of a rollout (T, N, V).
+
+        Args:
+            now: scheduled settings of this update.
+            transitions: the rollout, leading axes (T, N).
+            value: values of the observations, in units of reward (T, N, V).
+            next_value: values of the states that the steps reached.
+        """
+        config, active = self.config, transitions.active
+        reward, counted = jnp.where(active, transitions.reward, 0), self.counted(active)
+        if config.ppo.value == "joint":
+            reward = mean_of_team(reward, active)[..., None]
+        advantage, target = gae(
+            reward,
+            value,
+            next_value,
+            transitions.terminated.astype(jnp.float32) * (1.0 - now.failure_bootstrap),
+            transitions.done,
+            gamma=config.ppo.gamma,
+            gae_lambda=config.ppo.gae_lambda,
+        )
+        if config.ppo.advantage_clip is not None:
+            scale = devices.median(jnp.abs(advantage), counted) + 1e-8
+            advantage = jnp.clip(advantage / scale, -now.advantage_clip, now.advantage_clip)
+        if config.normalization.advantages:
+            deviation = jnp.sqrt(devices.variance(advantage, counted))
+            advantage = (advantage - devices.mean_where(advantage, counted)) / (deviation + 1e-8)
+        return advantage, target
+
+    def loss(self, params: Params, batch: Batch, now: Scheduled) -> tuple[jax.Array, Metrics]:
+        """Returns the PPO loss () of a minibatch and its parts, means over active agents."""
+        network, config, ppo, active = self.network, self.config, self.config.ppo, batch.active
+        seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
+        new = network.evaluate(params, *seen, batch.action, active)
+        old, now_taken = (jnp.where(active[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
+        log_ratio = RATIOS[ppo.ratio](now_taken, old)
+        surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
+        policy_loss = _mean(jnp.sum(surrogate, axis=-1), active)
+        critic_loss = _mean(
+            value_loss(new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta), active
+        )
+        mean_entropy = _mean(new.entropy, active)
+        per_agent = RATIOS["agent"](now_taken, old)[..., 0]
+        metrics = {
+            "loss/policy": policy_loss,
+            "loss/value": critic_loss,
+            "entropy": mean_entropy,
+            "approx_kl": _mean(jnp.exp(per_agent) - 1.0 - per_agent, active),
+            "clip_fraction": _mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), active),
+        }
+        metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
+        actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
+        if config.imitation.teacher is not None:
+            taught = network.evaluate(params, *seen, batch.teacher_action, active)
+            metrics["loss/imitation"] = -_mean(jnp.sum(taught.log_prob, axis=-1), active)
+            actor_loss += now.imitation * metrics["loss/imitation"]
+        return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
+
+    def update(self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array) -> tuple[Carry, Metrics]:
+        """Runs the epochs of gradient steps over a rollout's batch; returns their result and mean metrics."""
+        config = self.config
+        parts = config.rollout_steps // batch.is_first.shape[0]
+
+        def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
+            params, optimizer_state, learning_rate = carry
+            own = jax.grad(self.loss, has_aux=True)(params, minibatch, now)
+            gradient, metrics = devices.mean(own)
+            if config.optimizer.target_kl is not None:
+                adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
+                falls_only = (now.learning_rate_factor < 1.0) | (jnp.float32(now.actor_coef) < 1.0)
+                learning_rate = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
+            params, optimizer_state, grad_norm = self.optimizer.update(
+                gradient, optimizer_state, params, learning_rate * now.learning_rate_factor
+            )
+            return (params, optimizer_state, learning_rate), {**metrics, "grad_norm": grad_norm}
+
+        def epoch(carry: Carry, epoch_key: jax.Array) -> tuple[Carry, Metrics]:
+            if config.ppo.minibatches == 1:
+                return step(carry, batch)
+            index = minibatches(config.ppo, epoch_key, parts, batch.is_first.shape[1] // parts)
+            carry, metrics = jax.lax.scan(lambda c, i: step(c, take(batch, i)), carry, index)
+            return carry, jax.tree.map(jnp.mean, metrics)
+
+        carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(key, config.ppo.epochs))
+        return carry, jax.tree.map(jnp.mean, metrics)
+
+
+def _mean(x: jax.Array, active: jax.Array) -> jax.Array:
+    """Returns the mean over active agents of values (L, C, A, ...); of a team's, (L, C, 1, ...), over teams with any.
+
+    The count is a mean over processes, over which the gradient is averaged.
+    """
+    mask = active if x.shape[:3] == active.shape else jnp.any(active, axis=-1, keepdims=True)
+    mask = jnp.broadcast_to(mask.reshape(*mask.shape, *(1,) * (x.ndim - mask.ndim)), x.shape)
+    count = devices.mean(jnp.sum(mask.astype(jnp.float32)))
+    return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(count, 1.0)
+
+
+def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
+    """Returns a smaller learning rate where the KL divergence exceeds the target, a larger one where it is below."""
+    factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
+    return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
