@@ -165,8 +165,7 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
         else:
             policy = load_as("curriculum.demonstrator", demonstrator, both)
             everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
-            backward = config.curriculum.backward
-            made = Demonstrated(both, num_envs, everyone, seeds, backward=backward, final=final)
+            made = Demonstrated(both, num_envs, everyone, seeds, final=final)
         made = made.with_groups(groups)
         return Deadline(made) if config.time_limit_ends else made
 

@@ -259,12 +259,12 @@ def test_walk_commands_are_those_of_the_skill_walk() -> None:
     assert arguments.parse(["walk", "eval", "--seed", "3"]) == arguments.parse(["skill", "eval", "walk", "--seed", "3"])
 
 
-@pytest.mark.parametrize("words", ["--run-dir go1tug", "--curriculum.no-backward --run_dir go1tug", "--start go1tug"])
+@pytest.mark.parametrize("words", ["--run-dir go1tug", "--no-both-sides --run_dir go1tug", "--start go1tug"])
 def test_the_task_comes_first(words: str, capfd: pytest.CaptureFixture[str]) -> None:
     """A task that a flag names is not the one to train."""
     parsed, alone = parse_train(["go1gate", *words.split()]), parse_train(["go1gate"]).settings
     assert parsed.target == "go1gate"
-    assert override(parsed.settings, {"start": None, "curriculum.backward": alone.curriculum.backward}) == alone
+    assert override(parsed.settings, {"start": None, "both_sides": alone.both_sides}) == alone
     assert cli.main(["train", *words.split(), "go1gate"]) == 2
     assert capfd.readouterr().err.startswith("mqe: task: is missing; it comes first: mqe train TASK --")
 

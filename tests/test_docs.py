@@ -50,7 +50,7 @@ def blocks(text: str, language: str) -> list[str]:
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an empty folder."""
     few: dict[str, Any] = {"num_envs": 8, "rollout_steps": 16, "total_steps": 256, "network.recurrent": False}
-    few |= {"ppo": {"minibatches": 1, "epochs": 1}, "curriculum": {"demonstrator": None, "backward": False}}
+    few |= {"ppo": {"minibatches": 1, "epochs": 1}, "curriculum": {"demonstrator": None}}
     real = build.for_task
     monkeypatch.setattr(build, "for_task", lambda *arguments: override(real(*arguments), few))
     monkeypatch.setattr(QuadrupedEnv, "max_steps", 20)

@@ -137,7 +137,7 @@ def test_rewards_that_are_always_zero_leave_everything_finite() -> None:
         TrainConfig,
         {
             **{"num_envs": 4, "rollout_steps": 4, "total_steps": 160, "network": {"recurrent": False}},
-            "ppo": {"epochs": 1, "advantage_clip": 2.0},
+            "ppo": {"epochs": 1},
         },
     )
     env = Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4)

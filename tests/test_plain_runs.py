@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import demonstrations
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.league import league, pool, tournament
 from mqe_jax.policies import SimplePolicy
@@ -49,16 +48,10 @@ class Fields(EnvironmentState):
 
 
 class Help:
-    """One agent in four environments; its reward is its assistance; every step is an episode.
-
-    It is a success where the assistance is at most `needed`.
-    """
+    """One agent in four environments; its reward is its assistance; every step is an episode."""
 
     name, num_envs, num_agents, action_size = "help", N, 1, 1
     observation_size, privileged_observation_size = 1, 1
-
-    def __init__(self, needed: float) -> None:
-        self.needed = needed
 
     def reset(self, key: jax.Array) -> Fields:
         return self._state(jnp.zeros(N))
@@ -68,28 +61,16 @@ class Help:
 
     def _state(self, assistance: jax.Array) -> Fields:
         obs, done = jnp.zeros((N, 1, 1)), jnp.ones(N, bool)
-        outcome = Outcome((assistance <= self.needed).astype(jnp.float32)[:, None])
-        rest = outcome, {"pay": assistance}, jnp.zeros(N, jnp.int32), assistance, KEY
+        rest = Outcome(), {"pay": assistance}, jnp.zeros(N, jnp.int32), assistance, KEY
         return Fields(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, *rest)
 
 
-@pytest.mark.parametrize(
-    ("step", "needed", "expected"),
-    [
-        (0.3, 1.0, (0.8, 0.5, 0.2, 0.0)),  # falls by 0.3 with every update, all of which succeed
-        (0.3, -1.0, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0)),  # annealed to 0 within 5 of 10 updates, none of which succeeds
-        (0.0, 1.0, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0)),
-        (0.3, 0.5, (0.8, 0.64, 0.48, 0.18, 0.0)),  # success takes 0.3 from what it is annealed to
-    ],
-)
-def test_environments_get_the_assistance_of_the_schedule_and_of_their_success(
-    step: float, needed: float, expected: tuple[float, ...]
-) -> None:
+def test_environments_get_the_assistance_of_the_schedule() -> None:
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
-    values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5, "assistance_step": step}}
-    learner = make_learner(Help(needed), build(TrainConfig, {**values, "network": {"recurrent": False}}))
+    values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5}}
+    learner = make_learner(Help(), build(TrainConfig, {**values, "network": {"recurrent": False}}))
     state, update = jax.jit(learner.init)(KEY), jax.jit(learner.update)
-    for assistance in expected:
+    for assistance in (0.8, 0.64, 0.48, 0.32, 0.16, 0.0):  # annealed to 0 within 5 of 10 updates
         state, metrics = update(state)
         assert float(metrics["pay"]) == pytest.approx(assistance, abs=1e-6) == float(metrics["assistance"])
 
@@ -198,24 +179,3 @@ def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
     for count, expected in ((1, [[4, 4, 4]]), (2, [[2, 2, 2]] * 2), (3, [[4, 0, 0], [0, 4, 0], [0, 0, 4]])):
         matches: Any = Matches()
         assert tournament.play(matches, idle, [idle] * count, KEY).tolist() == expected
-
-
-class Decided(Matches):
-    """Episodes of eight steps; from the sixth on team 0 has won every third match, and team 1 the next ones."""
-
-    def _state(self, step: jax.Array) -> Fields:
-        state, late = super()._state(step), step >= 6
-        won = [late & (jnp.arange(12) % 3 == team) for team in (0, 1)]
-        return dataclasses.replace(state, outcome=Outcome(1.0 * jnp.stack(won, axis=-1)), terminated=step == 8)
-
-
-def test_phases_of_a_match_lead_to_either_teams_win(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstrations, "EPISODES", 12)
-    monkeypatch.setattr(demonstrations, "MOMENTS", 4)
-    monkeypatch.setattr(demonstrations, "_fields", lambda state: {"step": state.step})
-    batch: Any = object.__new__(demonstrations.Demonstrated)
-    batch._guide, batch.backward, batch.max_episode_steps = Decided(), True, 8
-    batch.demonstrator = SimplePolicy("match", 2, lambda obs, key: jnp.zeros((len(obs), 2, 1)))
-    found = batch._record()
-    np.testing.assert_allclose(found["phase"], [*[2 / 6] * 8, *[4 / 6] * 8, *[np.inf] * 32])
-    assert found["step"][:16].tolist() == [2] * 8 + [4] * 8

@@ -46,7 +46,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "joint": {
         "ppo": {
             **{"ratio": "joint", "value": "joint", "dual_clip": 1.2, "value_clip": None, "huber_delta": None},
-            **{"advantage_clip": 0.8, "entropy_coef": 0.1, "entropy_coef_final": 0.02},
+            **{"entropy_coef": 0.1, "entropy_coef_final": 0.02},
         },
         "network": {"critic_input": "observations", "recurrent": True, "gru_size": 4, "chunk_length": 2},
         "optimizer": {"schedule": "linear", "target_kl": 100.0},
@@ -215,9 +215,6 @@ class Plain:
             self.statistics = ValueStatistics(
                 *(jnp.float32(decay * x + (1 - decay) * y) for x, y in zip(state.value_normalizer, new, strict=True))
             )
-        if config.ppo.advantage_clip is not None:
-            advantage = advantage / np.median(np.abs(advantage))
-            advantage = np.clip(advantage, -config.ppo.advantage_clip, config.ppo.advantage_clip)
         if config.normalization.advantages:
             advantage = (advantage - advantage.mean()) / advantage.std()
         mean, deviation = self.value_scale(self.statistics)

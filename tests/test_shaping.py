@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.demonstrations import Demonstrated, _earlier, _phases
+from mqe_jax.demonstrations import Demonstrated
 from mqe_jax.envs import Moment, State, make
 from mqe_jax.envs.reward import faded
 from mqe_jax.errors import InputError
@@ -308,27 +308,3 @@ def test_a_demonstrator_needs_assistance() -> None:
     """A demonstrator that would never be used is refused."""
     with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
         build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})
-
-
-def test_phases_end_at_the_success_of_the_first_episode() -> None:
-    """Eight steps in moments of two; episodes: decided in step 5, never, decided in step 7 after an end in step 3."""
-    success = np.zeros((8, 4))
-    success[4:, 0] = 1.0
-    success[6, 2] = 1.0
-    success[:, 3] = [0, 0.2, 0.2, 0.6, 0.6, 0.6, 0.6, 0.6]  # partly, from step 4 on
-    ended = np.zeros((8, 4), bool)
-    ended[2, 2] = True
-    phases = _phases(jnp.asarray(success).reshape(4, 2, 4), jnp.asarray(ended).reshape(4, 2, 4))
-    none = [np.inf] * 4
-    np.testing.assert_allclose(phases.T, [[0.4, 0.8, np.inf, np.inf], none, none, [0.5, *none[:3]]])
-
-
-def test_backward_starts_follow_the_assistance() -> None:
-    """The states of a start have phases in the quarter below the assistance; without such a state there is none."""
-    phase = jnp.array([0.1, 0.3, 0.5, 0.6, 0.8, 0.95, jnp.inf, jnp.inf])
-    keys = jax.random.split(jax.random.PRNGKey(0), 64)
-    for assistance, expected in ((1.0, {0.8, 0.95}), (0.7, {0.5, 0.6}), (0.4, {0.3}), (0.2, {0.1}), (0.05, set())):
-        level = jnp.float32(assistance)
-        index, chosen = jax.vmap(lambda key: _earlier(phase, level, key))(keys)  # noqa: B023
-        found = {round(float(phase[i]), 3) for i, yes in zip(index, chosen, strict=True) if yes}
-        assert found == expected and bool(chosen.all()) == bool(expected)

@@ -110,7 +110,7 @@ def test_networks_train_with_all_switches(changes: dict[str, Any], tmp_path: Pat
 
 
 def test_switches_do_not_change_a_training(tmp_path: Path) -> None:
-    config = settings(rollout_steps=2, total_steps=32, network__recurrent=False, ppo__advantage_clip=3.0)
+    config = settings(rollout_steps=2, total_steps=32, network__recurrent=False)
     switches: dict[str, Callable[[], Any]] = {
         "plain": contextlib.nullcontext,
         "strict": strict_nans,

@@ -24,7 +24,7 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import adam, begun_anew
-from mqe_jax.train.schedules import next_assistance, scheduled
+from mqe_jax.train.schedules import scheduled
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
@@ -57,31 +57,19 @@ def test_schedules_by_hand() -> None:
         num_envs=1,
         rollout_steps=10,
         total_steps=100,
-        ppo=PPO(
-            entropy_coef=0.01, entropy_coef_final=0.0, advantage_clip=3.0, advantage_clip_until=0.5, critic_warmup=0.2
-        ),
+        ppo=PPO(entropy_coef=0.01, entropy_coef_final=0.0, critic_warmup=0.2),
         optimizer=OptimizerSettings(schedule="linear", anneal=0.2),
         curriculum=Curriculum(assistance=1.0, assistance_until=0.5, failure_bootstrap=0.8, failure_bootstrap_until=0.4),
         imitation=Imitation(weight=3.0, until=0.6),
     )
     expected = {
-        0: (1.0, 0.8, 3.0, 0.01, 3.0, 0.0, 0.0, 1.0),
-        2: (0.6, 0.4, 3.0, 0.008, 2.0, 1.0, 1.0, 1.0),
-        5: (0.0, 0.0, math.inf, 0.005, 0.5, 1.0, 0.0, 1.0),
-        9: (0.0, 0.0, math.inf, 0.001, 0.0, 1.0, 0.0, 0.5),
+        0: (1.0, 0.8, 0.01, 3.0, 0.0, 0.0, 1.0),
+        2: (0.6, 0.4, 0.008, 2.0, 1.0, 1.0, 1.0),
+        5: (0.0, 0.0, 0.005, 0.5, 1.0, 0.0, 1.0),
+        9: (0.0, 0.0, 0.001, 0.0, 1.0, 0.0, 0.5),
     }
     for updates, values in expected.items():
         np.testing.assert_allclose(jnp.stack(scheduled(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
-
-
-def test_the_assistance_follows_success_below_its_annealed_value() -> None:
-    config = TrainConfig(curriculum=Curriculum(assistance=0.8, assistance_step=0.1))
-    fixed = TrainConfig(curriculum=Curriculum(assistance=0.8))
-    rows = (0.9, 0.5, 0.4), (0.5, 0.5, 0.5), (0.1, 0.5, 0.6), (1.0, 0.05, 0.0), (0.0, 0.75, 0.8)
-    for success, before, after, ended in (*((*row, 2) for row in rows), (0.0, 0.5, 0.5, 0)):
-        now = jnp.float32(before), jnp.float32(success), jnp.float32(ended)
-        assert float(next_assistance(config, *now)) == pytest.approx(after)
-        assert float(next_assistance(fixed, *now)) == pytest.approx(0.8)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:

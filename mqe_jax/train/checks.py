@@ -51,8 +51,6 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
     assistance = config.curriculum.assistance
     if assistance and not hasattr(state, "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
-    if config.curriculum.assistance_step and state.outcome.success is None:
-        fail("curriculum.assistance_step", config.curriculum.assistance_step, f"0: {env.name} measures no success")
     if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
         fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
 

@@ -62,11 +62,6 @@ class PPO:
     """Weight of the entropy bonus."""
     entropy_coef_final: NonNegative | None = None
     """Weight of the entropy bonus at the end, annealed linearly; none keeps it constant."""
-    advantage_clip: Positive | None = None
-    """Clips advantages to this many times their median magnitude, and divides them by it, so that rare large losses
-    do not dominate; none disables it."""
-    advantage_clip_until: Positive = 1.0
-    """Fraction of training during which `advantage_clip` applies."""
     critic_warmup: Fraction = 0.0
     """Initial fraction of training in which only the critic is trained, for a policy that starts from weights."""
 
@@ -98,15 +93,9 @@ class Curriculum:
     """Initial assistance of the environment (its state's `assistance`), annealed linearly to 0."""
     assistance_until: Positive = 0.5
     """Fraction of training after which the assistance is 0."""
-    assistance_step: Fraction = 0.0
-    """Change of the assistance per update by success: down where more than 80% of the update's episodes succeed, up
-    where fewer than 20% do, but never above the annealed value; 0 leaves it at that value."""
     demonstrator: str | None = None
     """Policy in states of whose episodes training episodes start, with the probability `assistance`: scripted, a run
     folder or a policy file; none starts all as the task does."""
-    backward: bool = False
-    """Start in states of the demonstrator's successful episodes (of a match: the decided ones) alone, all of them: at
-    assistance 1 in the last quarter before the success, at less in earlier ones, at 0 as the task does."""
     failure_bootstrap: Fraction = 0.0
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
@@ -239,8 +228,6 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.curriculum.demonstrator is not None and not self.curriculum.assistance:
             fail("curriculum.assistance", self.curriculum.assistance, "above 0 where curriculum.demonstrator is set")
-        if self.curriculum.backward and self.curriculum.demonstrator is None:
-            fail("curriculum.backward", True, "false where curriculum.demonstrator is not set")
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":
             fail("ppo.value", self.ppo.value, "'joint' when ppo.ratio is 'joint'")
         shares = len(self.opponents) or 1

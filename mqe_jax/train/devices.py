@@ -82,12 +82,6 @@ def variance(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Arra
     return mean_where(jnp.square(x - mean_where(x, mask, axis)), mask, axis)
 
 
-def median(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """Returns the median () of the elements of all processes where a mask is true; 0 without any."""
-    x = jnp.where(mask, x, jnp.nan)
-    return jnp.nan_to_num(jnp.nanmedian(x if size() == 1 else jax.lax.all_gather(x, AXIS)))
-
-
 def rows(draw: Callable[[int], jax.Array], count: int) -> jax.Array:
     """Returns this process's `count` rows of `draw(n)`, which returns those of all processes (n, ...).
 

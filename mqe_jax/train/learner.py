@@ -31,7 +31,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, begun_anew
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, normalize_obs, rollout
-from mqe_jax.train.schedules import Scheduled, next_assistance, scheduled
+from mqe_jax.train.schedules import Scheduled, scheduled
 from mqe_jax.train.stages import Metrics, Stages
 from mqe_jax.train.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
 
@@ -47,8 +47,6 @@ class TrainState:
     value_normalizer: ValueStatistics
     learning_rate: jax.Array
     """Learning rate before the schedule () float32."""
-    assistance: jax.Array
-    """Assistance of the next update () float32, unless its annealed value is below."""
     rollout: RolloutState
     key: jax.Array
     """Random key."""
@@ -122,7 +120,6 @@ def make_learner(
                 obs_normalizer=ObservationNormalizer(running_init(dims.observation), running_init(dims.privileged)),
                 value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
-                assistance=jnp.float32(config.curriculum.assistance),
                 rollout=RolloutState(
                     env_state=env_state,
                     memory=network.initial_memory(env.num_envs),
@@ -140,7 +137,6 @@ def make_learner(
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
         now = scheduled(config, state.updates)
-        now = now._replace(assistance=jnp.minimum(now.assistance, state.assistance))
         rollout_state, transitions, metrics = rollout(
             env,
             network,
@@ -175,9 +171,6 @@ def make_learner(
             obs_normalizer=obs_normalizer,
             value_normalizer=value_normalizer,
             learning_rate=learning_rate,
-            assistance=next_assistance(
-                config, now.assistance, metrics["ended"].get("success", jnp.float32(0.5)), metrics["ended"]["episodes"]
-            ),
             rollout=rollout_state,
             key=key,
             updates=state.updates + 1,

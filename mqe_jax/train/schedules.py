@@ -9,8 +9,6 @@ import jax.numpy as jnp
 
 from mqe_jax.train.config import TrainConfig
 
-_FAILING, _SUCCEEDING = 0.2, 0.8
-
 
 class Scheduled(NamedTuple):
     """Values of the scheduled settings in one update, () float32 each."""
@@ -19,8 +17,6 @@ class Scheduled(NamedTuple):
     """`curriculum.assistance`."""
     failure_bootstrap: jax.Array
     """`curriculum.failure_bootstrap`."""
-    advantage_clip: jax.Array
-    """`ppo.advantage_clip`; infinite where it does not apply."""
     entropy_coef: jax.Array
     """`ppo.entropy_coef`."""
     imitation: jax.Array
@@ -41,7 +37,6 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
     def falling(start: float, until: float) -> jax.Array:
         return start * jnp.maximum(1.0 - progress / until, 0.0)
 
-    clip = jnp.inf if ppo.advantage_clip is None else ppo.advantage_clip
     entropy_coef = jnp.float32(ppo.entropy_coef)
     if ppo.entropy_coef_final is not None:
         entropy_coef += jnp.minimum(progress, 1.0) * (ppo.entropy_coef_final - ppo.entropy_coef)
@@ -52,23 +47,9 @@ def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
     return Scheduled(
         assistance=falling(curriculum.assistance, curriculum.assistance_until),
         failure_bootstrap=falling(curriculum.failure_bootstrap, curriculum.failure_bootstrap_until),
-        advantage_clip=jnp.where(progress < ppo.advantage_clip_until, clip, jnp.inf),
         entropy_coef=entropy_coef,
         imitation=falling(config.imitation.weight, config.imitation.until),
         actor_coef=warm.astype(jnp.float32) if ppo.critic_warmup else 1.0,
         actor_begins=warm & (before < ppo.critic_warmup) if ppo.critic_warmup else False,
         learning_rate_factor=factor,
     )
-
-
-def next_assistance(config: TrainConfig, assistance: jax.Array, success: jax.Array, episodes: jax.Array) -> jax.Array:
-    """Returns the assistance () after an update, before annealing, by `curriculum.assistance_step`.
-
-    `success` is the rate of the `episodes` that ended in the update (); without any, the assistance stays.
-    """
-    curriculum = config.curriculum
-    if not curriculum.assistance_step:
-        return jnp.float32(curriculum.assistance)
-    up = (success < _FAILING).astype(jnp.float32) - (success > _SUCCEEDING).astype(jnp.float32)
-    up = jnp.where(episodes > 0, up, 0.0)
-    return jnp.clip(assistance + curriculum.assistance_step * up, 0.0, curriculum.assistance)

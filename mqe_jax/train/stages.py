@@ -59,9 +59,6 @@ class Stages:
             gamma=config.ppo.gamma,
             gae_lambda=config.ppo.gae_lambda,
         )
-        if config.ppo.advantage_clip is not None:
-            scale = devices.median(jnp.abs(advantage), counted) + 1e-8
-            advantage = jnp.clip(advantage / scale, -now.advantage_clip, now.advantage_clip)
         if config.normalization.advantages:
             deviation = jnp.sqrt(devices.variance(advantage, counted))
             advantage = (advantage - devices.mean_where(advantage, counted)) / (deviation + 1e-8)
