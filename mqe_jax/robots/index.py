@@ -149,7 +149,7 @@ class RobotState:
 
     def count(self, values: jax.Array) -> jax.Array:
         """Returns values (R',) of the first R' robots, 0 for those that take no part."""
-        return jnp.where(self.active[: len(values)], values, 0)
+        return jnp.where(self.active[: len(values)], values, jnp.zeros_like(values))
 
     @property
     def euler(self) -> jax.Array:
