@@ -52,7 +52,7 @@ def active_of(state: Any) -> jax.Array:
 def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
     """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
     count = jnp.sum(active.astype(jnp.float32), axis=-1)
-    return jnp.sum(jnp.where(active, reward, 0.0), axis=-1) / jnp.maximum(count, 1.0)
+    return jnp.sum(jnp.where(active, reward.astype(jnp.float32), 0.0), axis=-1) / jnp.maximum(count, 1.0)
 
 
 def rollout(

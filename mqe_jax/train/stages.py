@@ -47,7 +47,8 @@ class Stages:
             next_value: values of the states that the steps reached.
         """
         config, active = self.config, transitions.active
-        reward, counted = jnp.where(active, transitions.reward, 0), self.counted(active)
+        reward = jnp.where(active, transitions.reward, jnp.zeros_like(transitions.reward))
+        counted = self.counted(active)
         if config.ppo.value == "joint":
             reward = mean_of_team(reward, active)[..., None]
         advantage, target = gae(
