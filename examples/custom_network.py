@@ -10,11 +10,11 @@ import foreign_env
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.settings import PositiveInt
+from mqe_jax.core.settings import PositiveInt
+from mqe_jax.core.types import NetworkMemory
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
-from mqe_jax.train.types import NetworkMemory
 
 
 @register_network("mean_field")

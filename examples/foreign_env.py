@@ -11,14 +11,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.settings import build
+from mqe_jax.core.settings import build
+from mqe_jax.core.types import Outcome
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.runner import train
-from mqe_jax.train.types import Outcome
 
 
 class State(NamedTuple):
-    """N environments of two agents; see `mqe_jax.train.types.VectorEnv`."""
+    """N environments of two agents; see `mqe_jax.core.types.VectorEnv`."""
 
     position: jax.Array
     """Positions of both agents (N, 2, 2), m."""

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 
 import mqe_jax
+from mqe_jax.core.types import Batch, where_rows
 from mqe_jax.train.loss import ratio_per_agent
 from mqe_jax.train.schedules import Scheduled
 from mqe_jax.train.stages import Carry, Metrics, Stages
-from mqe_jax.train.types import Batch, where_rows
 
 SETTINGS = {"network.share_policy": False, "network.critic_input": "privileged", "ppo.value": "joint"}
 

@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mqe_jax.collision import OBJECT_BIT, WALL_BIT
+from mqe_jax.core.settings import NonNegative, Positive, PositiveInt, record
 from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
-from mqe_jax.objects import Object, add_body, add_slides, add_solid
-from mqe_jax.planners import Observation, go_to, pose, scripted_policy
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.physics.collision import OBJECT_BIT, WALL_BIT
+from mqe_jax.physics.objects import Object, add_body, add_slides, add_solid
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
+from mqe_jax.policies.scripted import Observation, go_to, pose, scripted_policy
 from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall
 from mqe_jax.train.evaluate import evaluate_batch
 

@@ -11,7 +11,7 @@ import dataclasses
 import jax
 
 from mqe_jax import VectorEnv, make, versus
-from mqe_jax.settings import build
+from mqe_jax.core.settings import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Result, evaluate_batch
 from mqe_jax.train.learner import env_dims, make_learner

@@ -17,12 +17,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mqe_jax.build import make_learner
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
-    from mqe_jax.opponents import versus
     from mqe_jax.policies import load_policy
+    from mqe_jax.runs.build import make_learner
     from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
     from mqe_jax.runs.playing import Clip, evaluate, render
+    from mqe_jax.selfplay.opponents import versus
     from mqe_jax.train.config import TrainConfig
     from mqe_jax.train.evaluate import Result
 
@@ -55,8 +55,8 @@ _HOMES = {
     "Result": "train.evaluate",
     "TrainConfig": "train.config",
     "load_policy": "policies",
-    "make_learner": "build",
-    "versus": "opponents",
+    "make_learner": "runs.build",
+    "versus": "selfplay.opponents",
 }
 """Modules of the names; those of the others are in `envs`."""
 

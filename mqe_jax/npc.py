@@ -8,7 +8,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.objects import GRAVITY
+from mqe_jax.physics.objects import GRAVITY
 
 
 def flock(

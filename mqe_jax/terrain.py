@@ -14,10 +14,10 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from mqe_jax.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SITE_GROUP
-from mqe_jax.appearance.shapes import WALL_COLOR, WALL_GROUP, Ground, Style, gate_wall, side_wall
-from mqe_jax.collision import GROUND_BIT, WALL_BIT
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
+from mqe_jax.physics.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SITE_GROUP
+from mqe_jax.physics.appearance.shapes import WALL_COLOR, WALL_GROUP, Ground, Style, gate_wall, side_wall
+from mqe_jax.physics.collision import GROUND_BIT, WALL_BIT
 
 
 @dataclasses.dataclass(frozen=True)

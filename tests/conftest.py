@@ -70,8 +70,8 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The task `fake` in addition to the real ones, for `mqe`, and an empty working folder."""
     import fake_env
 
-    from mqe_jax import build
     from mqe_jax.envs import TASKS
+    from mqe_jax.runs import build
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(TASKS, "fake", fake_env.FakeEnv)  # pyright: ignore[reportArgumentType]

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.envs import VectorEnv, make
-from mqe_jax.robots.motors import leg_response
-from mqe_jax.robots.robot import JOINTS
+from mqe_jax.physics.robots.motors import leg_response
+from mqe_jax.physics.robots.robot import JOINTS
 
 MODES = ("saturated", "random")
 WALK = "walk"

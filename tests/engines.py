@@ -19,11 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import robots
-from mqe_jax.control import MODES
-from mqe_jax.engines import STATE_FIELDS
 from mqe_jax.envs import PLANNERS, TASKS, State, VectorEnv, make
-from mqe_jax.planners import scripted_policy
+from mqe_jax.physics import robots
+from mqe_jax.physics.engines import STATE_FIELDS
+from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.skills.control import MODES
 
 SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
 

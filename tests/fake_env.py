@@ -18,11 +18,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import build
 from mqe_jax.cli import launch, main
+from mqe_jax.core import devices
+from mqe_jax.core.types import Outcome
 from mqe_jax.envs import TASKS, EnvironmentState
-from mqe_jax.train import devices
-from mqe_jax.train.types import Outcome
+from mqe_jax.runs import build
 
 SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
 """Flags of a training that ends within seconds."""
@@ -143,7 +143,7 @@ class FakeVectorEnv:
 
 
 def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, *_: Any) -> Any:
-    """Replaces `mqe_jax.build.make_env`."""
+    """Replaces `mqe_jax.runs.build.make_env`."""
     return made(num_envs)
 
 

@@ -1,4 +1,4 @@
-"""Bad input as strategies of hypothesis: values that `mqe_jax.limits` refuses, hostile texts, damaged files.
+"""Bad input as strategies of hypothesis: values that `mqe_jax.core.limits` refuses, hostile texts, damaged files.
 
 `refused(kind)` of a kind of numbers is outside its bounds or no such number; nothing of it may be accepted. Texts and
 damaged files may be accepted where they happen to be valid.
@@ -17,10 +17,10 @@ from typing import Annotated, Any
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from mqe_jax import limits
 from mqe_jax.cli.arguments import COMMANDS
+from mqe_jax.core import limits
+from mqe_jax.core.settings import hints_of, is_record
 from mqe_jax.envs import TASKS
-from mqe_jax.settings import hints_of, is_record
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import NETWORKS

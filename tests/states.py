@@ -14,9 +14,9 @@ import numpy as np
 from mqe_jax.envs import Moment, QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.envs.state import ENDINGS
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import RobotState
-from mqe_jax.rotation import euler_to_quaternion
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.rotation import euler_to_quaternion
 
 
 @functools.cache

@@ -21,9 +21,9 @@ from mqe_jax.adapters import task_env
 from mqe_jax.adapters.gymnasium import SingleEnv, VectorEnv, register
 from mqe_jax.adapters.host import HostEnvs, _compile
 from mqe_jax.adapters.opponent import TeamEnv
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.errors import InputError
 from mqe_jax.policies import SimplePolicy
 
 COUNT, STEPS, ENDS = 3, 14, 5

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
-from mqe_jax.errors import InputError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import agile, make
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
-from mqe_jax.settings import override
+from mqe_jax import make
+from mqe_jax.core.settings import override
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
+from mqe_jax.skills import agile
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.walk import trainees
 from mqe_jax.walk.env import SHOVED, WalkEnv

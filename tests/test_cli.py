@@ -14,15 +14,16 @@ import pytest
 from fake_env import SMALL, FakeEnv
 
 import mqe_jax
-from mqe_jax import build, cli
+from mqe_jax import cli
 from mqe_jax.cli import arguments, demo
 from mqe_jax.cli.skill_train import parse_skill_train
 from mqe_jax.cli.train import parse_train
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
-from mqe_jax.errors import InputError
 from mqe_jax.policies import load_policy
-from mqe_jax.settings import override
+from mqe_jax.runs import build
 from mqe_jax.train import checkpoint
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
@@ -300,7 +301,7 @@ for command in ("train go1gate --sed 1", "train go1gate --config demo --ppo.epoc
 print({"jax", "mujoco"} & {*sys.modules})
 import mqe_jax
 assert mqe_jax.tasks()
-from mqe_jax.engines.private import load_mjx
+from mqe_jax.physics.engines.private import load_mjx
 print(load_mjx().__name__)
 """
 

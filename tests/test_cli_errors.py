@@ -11,10 +11,10 @@ import jax
 import pytest
 from fake_env import SMALL
 
-from mqe_jax import build, cli
+from mqe_jax import cli
 from mqe_jax.cli import commands
-from mqe_jax.errors import NonFiniteError
-from mqe_jax.runs import learning
+from mqe_jax.core.errors import NonFiniteError
+from mqe_jax.runs import build, learning
 from mqe_jax.train.nn import mlp_init
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import VectorEnv, agile, cli, learn, make
-from mqe_jax.control import Controller
-from mqe_jax.errors import InputError
+from mqe_jax import VectorEnv, cli, learn, make
+from mqe_jax.core.errors import InputError
 from mqe_jax.export.task import TaskFunctions
+from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import load_as, load_policy
-from mqe_jax.robots.go1 import GO1
+from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
+from mqe_jax.skills.control import Controller
 from mqe_jax.train.policy import save_policy
 from mqe_jax.walk_policy import WalkPolicy
 

@@ -11,13 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import objects
 from mqe_jax.envs import TASKS, Moment, QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
-from mqe_jax.objects import Door, Seesaw
-from mqe_jax.planners.cooperative import plan_seesaw
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.physics import objects
+from mqe_jax.physics.objects import Door, Seesaw
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene, compile_scene
+from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import angles, ending, initial, made, moving, placed, robot_state, stepper, still
 

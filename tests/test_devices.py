@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.errors import InputError
-from mqe_jax.settings import build
-from mqe_jax.train import devices
+from mqe_jax.core import devices
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build
 from mqe_jax.train.config import PPO, TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.rollout import minibatches

@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax import build
 from mqe_jax.cli.arguments import COMMANDS, FIRST_STEPS, parse
+from mqe_jax.core.settings import override
 from mqe_jax.envs import PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
-from mqe_jax.planners import scripted_policy
-from mqe_jax.settings import override
+from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.runs import build
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.networks import NETWORKS
 

@@ -24,15 +24,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import engines
-from mqe_jax.engines import Engine, private
-from mqe_jax.engines.host_call import host_call
-from mqe_jax.engines.mjx import WarpEngine
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, VectorEnv, make
-from mqe_jax.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import read_robots
-from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax.physics import engines
+from mqe_jax.physics.engines import Engine, private
+from mqe_jax.physics.engines.host_call import host_call
+from mqe_jax.physics.engines.mjx import WarpEngine
+from mqe_jax.physics.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import read_robots
+from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, SpawnArea, Track
 from tests import engines as comparison
 from tests.states import made
@@ -388,7 +388,7 @@ def test_a_used_environment_can_be_copied() -> None:
 
 def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     """JAX still runs it when the caller has its result; the environment's buffers are freed."""
-    monkeypatch.setattr("mqe_jax.engines.host_call._owners", {})  # no other environment of this physics
+    monkeypatch.setattr("mqe_jax.physics.engines.host_call._owners", {})  # no other environment of this physics
     seen: list[Any] = []
 
     def walk() -> Any:
@@ -414,7 +414,7 @@ def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_program_of_an_environment_long_gone_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mqe_jax.engines.host_call._KEPT", 1)
+    monkeypatch.setattr("mqe_jax.physics.engines.host_call._KEPT", 1)
     owner, zeros = Owner(), jnp.zeros((1, 3))
     program = called(lambda x, y: x + y, 3, owner).lower(zeros, zeros).compile()
     del owner
@@ -469,8 +469,8 @@ def test_a_program_that_still_runs_at_the_end_of_the_interpreter_is_awaited() ->
     code = """
 import time
 import jax, numpy as np
-from mqe_jax.engines.host_call import host_call
-from mqe_jax.engines.mjx import WarpEngine
+from mqe_jax.physics.engines.host_call import host_call
+from mqe_jax.physics.engines.mjx import WarpEngine
 class Owner: pass
 owner = Owner()
 def slow(x):
@@ -488,7 +488,7 @@ def test_mjx_imports_what_meshes_need_when_a_model_has_one() -> None:
     """A tetrahedron above a plane; in a process of its own, since imports stay."""
     code = """
 import sys, mujoco, jax
-from mqe_jax.engines.private import load_mjx
+from mqe_jax.physics.engines.private import load_mjx
 mjx = load_mjx()
 print([name in sys.modules for name in ("trimesh", "scipy.spatial")])
 model = mujoco.MjModel.from_xml_string('''<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task, replay
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entities
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.registry import SHIPPED
-from mqe_jax.errors import InputError
 from tests import engines
 from tests.states import ending, initial, made, placed, stepper
 

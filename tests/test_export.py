@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from test_policies import StandAndLean
 
-from mqe_jax import cli, load_policy, make, zoo
-from mqe_jax.errors import InputError
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.settings import build
+from mqe_jax import cli, load_policy, make
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build
+from mqe_jax.core.types import NetworkMemory
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.policies import zoo
 from mqe_jax.skills import SKILLS
 from mqe_jax.train import networks, nn
 from mqe_jax.train.config import TrainConfig
@@ -23,7 +25,6 @@ from mqe_jax.train.loss import log_prob
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
-from mqe_jax.train.types import NetworkMemory
 from tests.training import random_params
 
 onnx = pytest.importorskip("onnx")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import QuadrupedEnv, State, make
-from mqe_jax.planners import scripted_policy
+from mqe_jax.policies.scripted import scripted_policy
 from tests.states import ending, initial, made, moment, observation, placed, stepper, still, terms_of, with_object
 
 NO = jnp.array(False)

@@ -14,16 +14,16 @@ import pytest
 from fake_env import SMALL, FakeEnv, FakeVectorEnv
 
 import mqe_jax
-from mqe_jax import build, cli
+from mqe_jax import cli
 from mqe_jax.cli.train import parse_train
-from mqe_jax.errors import InputError
-from mqe_jax.league.sides import BothSides
-from mqe_jax.runs import playing
-from mqe_jax.settings import to_mapping
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import to_mapping
+from mqe_jax.core.types import Outcome
+from mqe_jax.runs import build, playing
+from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Rate, evaluate_batch
 from mqe_jax.train.runner import Training
-from mqe_jax.train.types import Outcome
 from tests.training import assert_same
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")

@@ -18,19 +18,21 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import mqe_jax
-from mqe_jax import limits, load_policy, memory, robots
+from mqe_jax import load_policy
 from mqe_jax.adapters import gymnasium
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.arguments import parse
 from mqe_jax.cli.options import parse_overrides
-from mqe_jax.demonstrations import Demonstrated
+from mqe_jax.core import limits, memory
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build, check, load_yaml, override
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
-from mqe_jax.errors import InputError
 from mqe_jax.export.scene import scene_xml
-from mqe_jax.league import tournament
-from mqe_jax.opponents import Mirror, versus
-from mqe_jax.settings import build, check, load_yaml, override
+from mqe_jax.physics import robots
+from mqe_jax.selfplay.demonstrations import Demonstrated
+from mqe_jax.selfplay.league import tournament
+from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.checkpoint import load_tree, save_tree

@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from mqe_jax import limits
 from mqe_jax.cli.options import parse_overrides
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import linear_layers, parse_json, parse_yaml, read_rows, read_tensors
+from mqe_jax.core.settings import build, override
 from mqe_jax.envs.replay import load_recording
-from mqe_jax.errors import InputError
-from mqe_jax.files import linear_layers, parse_json, parse_yaml, read_rows, read_tensors
-from mqe_jax.league import pool
-from mqe_jax.settings import build, override
+from mqe_jax.selfplay.league import pool
 from mqe_jax.study.runs import read_curve, read_runs
 from mqe_jax.train import checkpoint
 from mqe_jax.train.config import TrainConfig, load_config

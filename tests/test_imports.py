@@ -1,8 +1,9 @@
-"""Modules import only from those above them in the table of docs/architecture.md."""
+"""Rooms import only from those above them in the table of docs/architecture.md."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 import re
 from pathlib import Path
 
@@ -10,24 +11,44 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mqe_jax"
 
 
-def modules_of(tree: ast.AST) -> set[str]:
+def modules() -> dict[str, Path]:
+    """Returns the source files by module, without the package's own name."""
+    paths = {path.relative_to(PACKAGE).with_suffix(""): path for path in PACKAGE.rglob("*.py")}
+    return {".".join(parts.parts).removesuffix(".__init__"): path for parts, path in paths.items() if len(parts.parts)}
+
+
+def imported(path: Path, names: set[str]) -> set[str]:
     """Returns the modules of this package that a source file imports, at any nesting depth."""
-    names = [f"{n.module}.{a.name}" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names]
-    names += [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
-    return {name.split(".")[1] for name in names if name.startswith("mqe_jax.")}
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mqe_jax"):
+            base = (node.module or "").removeprefix("mqe_jax").removeprefix(".")
+            for alias in node.names:
+                full = f"{base}.{alias.name}" if base else alias.name
+                found.add(full if full in names else base)
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.removeprefix("mqe_jax.") for alias in node.names if alias.name.startswith("mqe_jax.")}
+    return found - {""}
 
 
-def test_imports_follow_the_table_of_modules() -> None:
-    """The table names every module, each after those that it imports."""
-    order = re.findall(r"^\| `(\w+)", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
-    modules = {path.stem for path in PACKAGE.glob("*.py")} | {
-        path.parent.name for path in PACKAGE.glob("*/__init__.py")
-    }
-    assert sorted(order) == sorted(modules - {"__init__"})
-    for path in {*PACKAGE.rglob("*.py")} - {PACKAGE / "__init__.py"}:
-        module = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        above = {*order[: order.index(module) + 1]}
-        assert modules_of(ast.parse(path.read_text(encoding="utf-8"))) <= above, path
+def test_rooms_import_from_those_above() -> None:
+    """The table names every folder and every module at the top, each after those that it imports."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    cells = re.findall(r"^\| (`\w+(?:/|\.py)`[^|]*)\|", text, re.MULTILINE)
+    rows = [re.findall(r"`(\w+)(?:/|\.py)`", cell) for cell in cells]
+    order = {name: place for place, names in enumerate(rows) for name in names}
+    every = modules()
+    assert order.keys() == {name.split(".")[0] for name in every} - {"__init__"}
+    for name, path in every.items():
+        if name != "__init__":
+            above = {room for room, place in order.items() if place <= order[name.split(".")[0]]}
+            assert {module.split(".")[0] for module in imported(path, {*every})} <= above, name
+
+
+def test_commands_do_not_import_each_other() -> None:
+    every = {name: path for name, path in modules().items() if name.startswith("cli")}
+    graph = {name: imported(path, {*every}) & every.keys() - {name} for name, path in every.items()}
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 def test_networks_and_optimisers_are_our_own() -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from mqe_jax import cli, interrupts
+from mqe_jax import cli
+from mqe_jax.core import interrupts
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests import fake_env
 from tests.training import assert_same_run, rows, without_progress
@@ -97,7 +98,7 @@ def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, mo
 PREFIX = """
 import hashlib, sys, time
 from pathlib import Path
-from mqe_jax import files, interrupts
+from mqe_jax.core import files, interrupts
 interrupts.install()
 folder = Path(sys.argv[1])
 """

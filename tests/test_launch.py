@@ -23,8 +23,8 @@ from safetensors.numpy import load_file
 from mqe_jax import cli
 from mqe_jax.cli import launch
 from mqe_jax.cli.arguments import parse
-from mqe_jax.errors import InputError
-from mqe_jax.train import devices
+from mqe_jax.core import devices
+from mqe_jax.core.errors import InputError
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests.test_interrupts import updates, wait_for
 from tests.training import rows, without_progress

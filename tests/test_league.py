@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import build as setup
 from mqe_jax import cli
-from mqe_jax.build import base_config
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build, override, to_mapping
 from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.errors import InputError
-from mqe_jax.league import pool, tournament
-from mqe_jax.league.league import League
-from mqe_jax.opponents import versus
-from mqe_jax.settings import build, override, to_mapping
+from mqe_jax.runs import build as setup
+from mqe_jax.runs.build import base_config
+from mqe_jax.selfplay.league import pool, tournament
+from mqe_jax.selfplay.league.league import League
+from mqe_jax.selfplay.opponents import versus
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims, make_learner

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mqe_jax.errors import InputError, one_line
-from mqe_jax.league import tournament
-from mqe_jax.literal import to_html, to_markdown
+from mqe_jax.core.errors import InputError, one_line
+from mqe_jax.core.literal import to_html, to_markdown
+from mqe_jax.selfplay.league import tournament
 from mqe_jax.study import figures
 from mqe_jax.study.report import markdown
 

@@ -14,8 +14,8 @@ import pytest
 from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.state import Moment
-from mqe_jax.objects import Cylinder, Door
-from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.physics.objects import Cylinder, Door
+from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import initial, made, observation, placed, stepper, still, terms_of
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from mqe_jax import robots
-from mqe_jax.engines import c
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import Randomization, VectorEnv, make
-from mqe_jax.errors import InputError
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.motors import BAND, CLAMP, Motors, leg_response
-from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.physics import robots
+from mqe_jax.physics.engines import c
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.motors import BAND, CLAMP, Motors, leg_response
+from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 from tests.driving import MODES, drive, start_in_air
 from tests.states import initial

@@ -18,15 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.agile import FRAME_SIZE, NOW_SIZE
 from mqe_jax.cli.train import parse_train
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build, override
+from mqe_jax.core.types import NetworkMemory, Params, VectorEnv
 from mqe_jax.export import translate
 from mqe_jax.export.check import errors
 from mqe_jax.export.policy import input_shapes, policy_step
-from mqe_jax.presets import base_config, preset
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.settings import build, override
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.runs.presets import base_config, preset
+from mqe_jax.skills.agile import FRAME_SIZE, NOW_SIZE
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import make_learner
@@ -34,7 +35,6 @@ from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import NETWORKS, ActorCritic, EnvDims, Network
 from mqe_jax.train.policy import TrainedPolicy, read_policy
 from mqe_jax.train.runner import train_seeds
-from mqe_jax.train.types import NetworkMemory, Params, VectorEnv
 from mqe_jax.view.session import Session
 from mqe_jax.walk import network as walk_network  # registers it
 from mqe_jax.walk_policy import OBSERVATION_SIZE

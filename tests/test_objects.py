@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import objects
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import Moment, QuadrupedEnv, VectorEnv, make
-from mqe_jax.errors import InputError
 from mqe_jax.npc import defend, flock
-from mqe_jax.objects import Ball, Box, Sheep
-from mqe_jax.planners import go_to, scripted_policy
-from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.physics import objects
+from mqe_jax.physics.objects import Ball, Box, Sheep
+from mqe_jax.physics.scene import Scene, compile_scene
+from mqe_jax.policies.scripted import go_to, scripted_policy
 from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import angles, initial, made, placed, terms_of, with_object
 

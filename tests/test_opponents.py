@@ -14,22 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import build as setup
 from mqe_jax import cli
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build, override
+from mqe_jax.core.types import observations
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.wrestling import WrestlingRewards
-from mqe_jax.errors import InputError
-from mqe_jax.league.sides import BothSides
-from mqe_jax.opponents import Mirror, Versus, versus
 from mqe_jax.policies import BothTeams, all_agents, load_policy
-from mqe_jax.settings import build, override
+from mqe_jax.runs import build as setup
+from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.selfplay.opponents import Mirror, Versus, versus
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import env_dims, make_learner
 from mqe_jax.train.monitor import score
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
-from mqe_jax.train.types import observations
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)

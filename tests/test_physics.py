@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from mqe_jax import engines, make
-from mqe_jax.collision import GROUND_BIT
-from mqe_jax.engines import private
-from mqe_jax.engines.c import CEngine
-from mqe_jax.engines.mjx_step import MarginStep
+from mqe_jax import make
 from mqe_jax.envs import TASKS, QuadrupedEnv, VectorEnv
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax.physics import engines
+from mqe_jax.physics.collision import GROUND_BIT
+from mqe_jax.physics.engines import private
+from mqe_jax.physics.engines.c import CEngine
+from mqe_jax.physics.engines.mjx_step import MarginStep
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 from tests.states import initial, made
 

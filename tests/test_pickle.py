@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 import mqe_jax.adapters.gymnasium  # noqa: F401  (registers the tasks)
-from mqe_jax.demonstrations import Demonstrated
+from mqe_jax.core.settings import build
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.league.league import League
-from mqe_jax.league.sides import BothSides
-from mqe_jax.opponents import Mirror, versus
 from mqe_jax.policies import all_agents, load_policy
-from mqe_jax.settings import build
+from mqe_jax.selfplay.demonstrations import Demonstrated
+from mqe_jax.selfplay.league.league import League
+from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.train.config import TrainConfig
 from tests.states import made
 from tests.training import assert_same

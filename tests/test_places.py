@@ -11,12 +11,11 @@ from typing import Any
 import pytest
 from fake_env import SMALL
 
-from mqe_jax import zoo
 from mqe_jax.cli.arguments import parse
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS
-from mqe_jax.errors import InputError
-from mqe_jax.policies import load_policy
-from mqe_jax.presets import named_config
+from mqe_jax.policies import load_policy, zoo
+from mqe_jax.runs.presets import named_config
 from mqe_jax.train.policy import save_policy
 
 TESTS = Path(__file__).parent

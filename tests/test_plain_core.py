@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import rotation
-from mqe_jax.control import Controller
 from mqe_jax.envs import VectorEnv, make, replay
 from mqe_jax.envs.autoreset import KEPT, SEEN, autoreset
 from mqe_jax.envs.observation import others
 from mqe_jax.envs.reward import crowding
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import Proprioception
+from mqe_jax.physics import rotation
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.skills.control import Controller
 from tests.states import initial, made, moment, placed, stepper
 
 KEY = jax.random.PRNGKey(0)

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build
 from mqe_jax.envs import TASKS, Randomization
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import crowding
-from mqe_jax.errors import InputError
-from mqe_jax.league import league, pool
 from mqe_jax.npc import defend, flock, slowed
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.settings import build
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.selfplay.league import league, pool
 from mqe_jax.terrain import Gate, Track
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.settings import build
+from mqe_jax.core.settings import build
+from mqe_jax.core.types import NetworkMemory
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import ActorCritic, EnvDims, Mat
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
-from mqe_jax.train.types import NetworkMemory
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)

@@ -11,17 +11,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import engines, robots, terrain
-from mqe_jax.engines import c
+from mqe_jax import terrain
 from mqe_jax.envs import make
 from mqe_jax.npc import flock
-from mqe_jax.objects import GRAVITY, Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
-from mqe_jax.robots import motors as motor
-from mqe_jax.robots.build import build_robot
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.motors import Motors
-from mqe_jax.robots.robot import JOINT_NAMES
-from mqe_jax.scene import Scene, compile_scene
+from mqe_jax.physics import engines, robots
+from mqe_jax.physics.engines import c
+from mqe_jax.physics.objects import GRAVITY, Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
+from mqe_jax.physics.robots import motors as motor
+from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.motors import Motors
+from mqe_jax.physics.robots.robot import JOINT_NAMES
+from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.terrain import EndWall, Gate, Plane, RoughGround, SpawnArea, Track
 from tests.states import initial
 

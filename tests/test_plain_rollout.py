@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.league import league, pool
-from mqe_jax.opponents import Mirror, Opponent, exchange
+from mqe_jax.core.types import RESULTS, NetworkMemory, Outcome
 from mqe_jax.policies import BothTeams, load_policy
+from mqe_jax.selfplay.league import league, pool
+from mqe_jax.selfplay.opponents import Mirror, Opponent, exchange
 from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, rollout
-from mqe_jax.train.types import RESULTS, NetworkMemory, Outcome
 from tests import training as probes
 from tests.states import made
 from tests.test_opponents import matches

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.core.settings import build, to_mapping
+from mqe_jax.core.types import Outcome
 from mqe_jax.envs.state import EnvironmentState
-from mqe_jax.league import league, pool, tournament
 from mqe_jax.policies import SimplePolicy
-from mqe_jax.settings import build, to_mapping
+from mqe_jax.selfplay.league import league, pool, tournament
 from mqe_jax.train import learner as learning
 from mqe_jax.train.checkpoint import save_checkpoint
 from mqe_jax.train.config import TrainConfig
@@ -25,7 +26,6 @@ from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
-from mqe_jax.train.types import Outcome
 from tests import training as probes
 from tests.training import Probe
 

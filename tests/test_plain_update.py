@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.settings import build, override
+from mqe_jax.core.settings import build, override
+from mqe_jax.core.types import Transition
 from mqe_jax.train import learner as learning
 from mqe_jax.train import nn, stages
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_init
 from mqe_jax.train.optim import AdamState
 from mqe_jax.train.rollout import ObservationNormalizer
-from mqe_jax.train.types import Transition
 from tests import training as probes
 from tests.training import Probe, assert_same
 

@@ -22,8 +22,8 @@ import pytest
 from viewer import open_page
 
 from mqe_jax import cli
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import PLANNERS
-from mqe_jax.errors import InputError
 from mqe_jax.export import libraries
 
 pytest.importorskip("jax2onnx")
@@ -169,7 +169,7 @@ def test_the_written_scene_is_the_tasks_physics(built: SimpleNamespace) -> None:
 
 def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     """Runs with the task's own parameters join the shipped policy; other parameters are another entry."""
-    from mqe_jax import zoo
+    from mqe_jax.policies import zoo
 
     run = tmp_path / "mine.safetensors"
     shutil.copy(zoo.file_of("go1wrestling"), run)
@@ -191,7 +191,7 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
 
 
 def test_no_policy_of_a_page_replaces_another(tmp_path: Path) -> None:
-    from mqe_jax import zoo
+    from mqe_jax.policies import zoo
 
     sources = ["go1gate"]
     for name in ("a/seed0", "b/seed0", "v1.2", "v1.3", "shipped", "c/scripted", "x/b/seed0", "run.safetensors"):

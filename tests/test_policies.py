@@ -14,22 +14,22 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax import cli, skills, zoo
+from mqe_jax import cli, skills
 from mqe_jax.adapters.opponent import TeamEnv
-from mqe_jax.build import players
 from mqe_jax.cli.commands import Eval
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
 from mqe_jax.envs.state import ENDINGS
-from mqe_jax.errors import InputError
-from mqe_jax.opponents import versus
-from mqe_jax.planners import planner_of
-from mqe_jax.planners.cooperative import plan_seesaw
-from mqe_jax.planners.matches import plan_tug
-from mqe_jax.policies import BothTeams, SimplePolicy, load_policy
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.settings import override
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.policies import BothTeams, SimplePolicy, load_policy, zoo
+from mqe_jax.policies.scripted import planner_of
+from mqe_jax.policies.scripted.cooperative import plan_seesaw
+from mqe_jax.policies.scripted.matches import plan_tug
+from mqe_jax.runs.build import players
+from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, save_policy
@@ -177,7 +177,7 @@ def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> Non
     """All tasks but the plane have one, of a module of their own package."""
     assert set(TASKS) - set(PLANNERS) == {"go1plane"}
     for task in PLANNERS:
-        assert planner_of(task).__module__.startswith("mqe_jax.planners.")
+        assert planner_of(task).__module__.startswith("mqe_jax.policies.scripted.")
     with pytest.raises(InputError, match=r"go1plane has no scripted policy; allowed for: go1gate, "):
         planner_of("go1plane")
 

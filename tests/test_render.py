@@ -17,9 +17,9 @@ from fake_env import FakeEnv
 from PIL import Image, ImageSequence
 
 from mqe_jax import make
-from mqe_jax.appearance import GOAL_SITE
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS
-from mqe_jax.errors import InputError
+from mqe_jax.physics.appearance import GOAL_SITE
 from mqe_jax.policies import all_agents, load_policy
 from mqe_jax.viz import cameras, clips, framing, geometry, recording, render
 from mqe_jax.viz.framing import Camera

@@ -17,11 +17,12 @@ import pytest
 from fake_env import SMALL
 from test_train_run import rows, settings
 
-from mqe_jax import cli, files, interrupts
+from mqe_jax import cli
 from mqe_jax.cli import programs
-from mqe_jax.errors import InputError
-from mqe_jax.files import locked, remove_temporaries, replacing, write_atomically
-from mqe_jax.settings import override
+from mqe_jax.core import files, interrupts
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import locked, remove_temporaries, replacing, write_atomically
+from mqe_jax.core.settings import override
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig

@@ -13,13 +13,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax import engines, make, robots
-from mqe_jax.errors import InputError
-from mqe_jax.kinematics import poses
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import foot_positions, knee_positions
-from mqe_jax.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
-from mqe_jax.scene import CompiledScene, Scene, compile_scene
+from mqe_jax import make
+from mqe_jax.core.errors import InputError
+from mqe_jax.physics import engines, robots
+from mqe_jax.physics.kinematics import poses
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import foot_positions, knee_positions
+from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
+from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Gate, Plane, RoughGround, SpawnArea, Track
 from tests.states import made
 

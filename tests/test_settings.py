@@ -13,9 +13,8 @@ import pytest
 import yaml
 from annotated_types import Gt, MinLen
 
-from mqe_jax.envs.gate import GateParams
-from mqe_jax.errors import InputError
-from mqe_jax.settings import (
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import (
     Fraction,
     FrozenMapping,
     Positive,
@@ -29,6 +28,7 @@ from mqe_jax.settings import (
     record,
     to_mapping,
 )
+from mqe_jax.envs.gate import GateParams
 from mqe_jax.train.config import TrainConfig, load_config
 
 

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.demonstrations import Demonstrated
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build
 from mqe_jax.envs import Moment, State, make
 from mqe_jax.envs.reward import faded
-from mqe_jax.errors import InputError
-from mqe_jax.settings import build
+from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.train.config import TrainConfig
 from tests.states import terms_of
 

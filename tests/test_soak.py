@@ -17,11 +17,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from mqe_jax import make, robots
-from mqe_jax.control import MODES
+from mqe_jax import make
 from mqe_jax.envs import PLANNERS, TASKS
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.planners import scripted_policy
+from mqe_jax.physics import robots
+from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.skills.control import MODES
 from tests import driving, engines
 from tests.states import initial, made, placed
 from tests.test_interrupts import start, updates

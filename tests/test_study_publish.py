@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
-from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.settings import override, to_mapping
+from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.study.estimates import group
 from mqe_jax.study.runs import REWARD, Cell, load_reference, table
 from mqe_jax.train.config import TrainConfig

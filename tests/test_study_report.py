@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import band, evaluated, group, score_matrices
 from mqe_jax.study.report import report, to_marl_eval, write_report

@@ -13,17 +13,18 @@ from typing import Any
 import pytest
 import yaml
 
-from mqe_jax import build as setup
-from mqe_jax import cli, zoo
-from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.files import locked
-from mqe_jax.presets import preset
-from mqe_jax.settings import build, override, to_mapping
+from mqe_jax import cli
+from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.files import locked
+from mqe_jax.core.settings import build, override, to_mapping
+from mqe_jax.core.types import Cast
+from mqe_jax.policies import zoo
+from mqe_jax.runs import build as setup
+from mqe_jax.runs.presets import preset
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.types import Cast
 from tests import training as probes
 from tests.training import Probe
 

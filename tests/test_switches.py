@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from test_train_run import settings
 
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
-from mqe_jax.errors import InputError
-from mqe_jax.league.league import League
 from mqe_jax.policies import all_agents, load_policy
-from mqe_jax.settings import build
+from mqe_jax.selfplay.league.league import League
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.extend.random import threefry_2x32
 
-from mqe_jax import threefry  # noqa: F401
+from mqe_jax.core import threefry  # noqa: F401
 
 VECTORS = [
     (0x00000000, 0x00000000, 0x00000000, 0x00000000, 0x6B200159, 0x99BA4EFE),
@@ -38,7 +38,7 @@ def test_numbers_of_a_key_after_several_splits_are_compiled() -> None:
     """jaxlib 0.11 did not finish in 25 minutes, so that no training began on a CPU."""
     code = """
 import jax
-from mqe_jax import threefry
+from mqe_jax.core import threefry
 
 def draw(key):
     first, _ = jax.random.split(key)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, load_tree, read_metadata, save_checkpoint, save_tree

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import build, override
+from mqe_jax.core.types import Batch, NetworkMemory, Outcome, VectorEnv
 from mqe_jax.policies import SimplePolicy
-from mqe_jax.settings import build, override
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
 from mqe_jax.train.normalize import value_denormalize
 from mqe_jax.train.stages import Stages
-from mqe_jax.train.types import Batch, NetworkMemory, Outcome, VectorEnv
 from tests import training as probes
 from tests.training import Probe, assert_same
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.settings import build
+from mqe_jax.core.settings import build
 from mqe_jax.train import nn
 from mqe_jax.train.config import PPO, Curriculum, Imitation, OptimizerSettings, TrainConfig
 from mqe_jax.train.loss import gae

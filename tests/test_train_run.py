@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.settings import build, override, to_mapping
 from mqe_jax.envs import VectorEnv, make
-from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.settings import build, override, to_mapping
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner, start
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
@@ -382,7 +382,7 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
 
 def test_a_start_by_name_says_what_to_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(start, "NAMED", {})
-    with pytest.raises(InputError, match=r"start: 'go1gate' is not allowed; .* after `import mqe_jax.zoo`"):
+    with pytest.raises(InputError, match=r"start: 'go1gate' is not allowed; .* after `import mqe_jax.policies.zoo`"):
         train(PROBE, settings(start="go1gate"), tmp_path)
 
 

@@ -14,7 +14,7 @@ from fake_env import FakeEnv
 from viewer import Driven, free_port, session
 
 from mqe_jax import cli, make
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 from mqe_jax.view.session import HOLD_TIME, Drive
 
 LIMIT = np.array([1.0, 0.5, 0.5])

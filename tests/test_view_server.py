@@ -15,7 +15,7 @@ pytest.importorskip("viser")
 import viser
 from websockets.exceptions import InvalidStatus
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 from mqe_jax.view.panel import HOLD_RATE, Panel
 from mqe_jax.view.server import authorities, open_server, refusal
 

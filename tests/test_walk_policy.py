@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from mqe_jax import actuators, cli, make, skills, walk_policy
-from mqe_jax.control import Controller
-from mqe_jax.errors import InputError
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.scene import Scene
+from mqe_jax import cli, make, skills, walk_policy
+from mqe_jax.core.errors import InputError
+from mqe_jax.physics import actuators
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.scene import Scene
+from mqe_jax.skills.control import Controller
 from mqe_jax.walk import torchscript
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from mqe_jax import cli, walk_policy
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override
+from mqe_jax.core.types import NetworkMemory
 from mqe_jax.envs import VectorEnv
-from mqe_jax.errors import InputError
-from mqe_jax.robots.go1 import GO1
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.robot import JOINT_NAMES
-from mqe_jax.settings import override
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import JOINT_NAMES
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import EnvDims
-from mqe_jax.train.types import NetworkMemory
 from mqe_jax.walk.env import WalkEnv
 from mqe_jax.walk.network import WALK_FORM, WalkNetwork, mirror_action, windows
 from mqe_jax.walk.training import WALK

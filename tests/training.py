@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from safetensors.numpy import load_file
 
+from mqe_jax.core.types import Outcome, Params
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.networks import Network
-from mqe_jax.train.types import Outcome, Params
 
 
 @jax.tree_util.register_dataclass

@@ -25,7 +25,7 @@ import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
 
-from mqe_jax import zoo
+from mqe_jax.policies import zoo
 
 ROOT = Path(__file__).parents[1]
 PLAY = ROOT / "build" / "play"

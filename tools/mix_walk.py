@@ -13,7 +13,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from mqe_jax import robots, walk_policy
+from mqe_jax import walk_policy
+from mqe_jax.physics import robots
 
 
 def main() -> None:

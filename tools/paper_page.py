@@ -15,8 +15,8 @@ from typing import Any
 
 from PIL import Image
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import write_atomically
 from mqe_jax.study.estimates import Cells, aggregate_tables, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles, draw_terms
 from mqe_jax.study.report import markdown

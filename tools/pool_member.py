@@ -12,8 +12,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from mqe_jax.errors import InputError
-from mqe_jax.league import pool
+from mqe_jax.core.errors import InputError
+from mqe_jax.selfplay.league import pool
 from mqe_jax.train.checkpoint import latest, load_tree
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import paper_page
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import write_atomically
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import write_atomically
 from mqe_jax.study.estimates import absolute
 from mqe_jax.study.runs import REWARD, Cell, Curve, Run, read_runs, table
 from mqe_jax.train.logs import number

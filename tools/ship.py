@@ -9,10 +9,10 @@ scripted team end.
 import argparse
 from tempfile import TemporaryDirectory
 
-from mqe_jax import zoo
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.match import Match
+from mqe_jax.policies import zoo
 from mqe_jax.train.policy import read_policy, save_policy
 
 DIGITS = 4

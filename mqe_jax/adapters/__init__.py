@@ -19,10 +19,10 @@ import numpy as np
 
 from mqe_jax import envs
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import PositiveInt
+from mqe_jax.core.settings import check
 from mqe_jax.envs import QuadrupedEnv, State
-from mqe_jax.errors import InputError
-from mqe_jax.limits import PositiveInt
-from mqe_jax.settings import check
 from mqe_jax.train.policy import Policy
 
 

@@ -10,7 +10,7 @@ import runpy
 import sys
 from pathlib import Path
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 
 LIBRARIES = ("gymnasium", "pettingzoo", "brax", "jaxmarl")
 

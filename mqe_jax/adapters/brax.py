@@ -20,13 +20,13 @@ from mqe_jax import envs
 from mqe_jax.adapters import missing, quietly, task_env, team_reward
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import PositiveInt
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.errors import InputError
-from mqe_jax.limits import PositiveInt
-from mqe_jax.precision import single
-from mqe_jax.settings import check, checked
 
 try:
     with quietly():

@@ -21,10 +21,10 @@ from gymnasium.vector.utils import batch_space
 from mqe_jax import envs
 from mqe_jax.adapters import task_env, team_reward
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Environments, Seed
+from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
-from mqe_jax.limits import Environments, Seed
-from mqe_jax.settings import check, checked, fail
 
 
 def register() -> None:

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 
 from mqe_jax.adapters import select
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Environments, Pixels, Seed
+from mqe_jax.core.settings import check, fail
 from mqe_jax.envs import State
-from mqe_jax.errors import InputError
-from mqe_jax.limits import Environments, Pixels, Seed
-from mqe_jax.settings import check, fail
 from mqe_jax.viz.cameras import default_camera
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.geometry import rendering_model

@@ -18,12 +18,12 @@ from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, quietly, select, task_env
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
+from mqe_jax.core.errors import InputError, shown
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import checked
+from mqe_jax.core.types import RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.errors import InputError, shown
-from mqe_jax.precision import single
-from mqe_jax.settings import checked
-from mqe_jax.train.types import RandomKey
 
 try:
     with quietly():

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked
+from mqe_jax.core.types import AnySingle, Memory
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.state import with_final
-from mqe_jax.errors import InputError
 from mqe_jax.policies import SimplePolicy, load_as
-from mqe_jax.precision import single
-from mqe_jax.settings import check, checked
 from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
-from mqe_jax.train.types import AnySingle, Memory
 
 
 @jax.tree_util.register_dataclass

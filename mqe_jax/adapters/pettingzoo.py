@@ -16,9 +16,9 @@ from gymnasium.utils import EzPickle
 from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
+from mqe_jax.core.errors import InputError, shown
+from mqe_jax.core.settings import check, checked
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError, shown
-from mqe_jax.settings import check, checked
 
 try:
     import pettingzoo

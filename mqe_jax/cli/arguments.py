@@ -11,11 +11,11 @@ from typing import Any
 
 import tyro
 
-from mqe_jax import limits
 from mqe_jax.cli import commands, export, programs, render, skill, study, view
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import TEXT, fail, is_text
 from mqe_jax.envs.registry import task_id
-from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import TEXT, fail, is_text
 
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 

@@ -12,11 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions, print_table
-from mqe_jax.limits import Environments, Episodes, Horizon
-from mqe_jax.literal import echo
-from mqe_jax.settings import record
+from mqe_jax.core.limits import Environments, Episodes, Horizon
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import record
 
-_ZOO = Path(__file__).parent.parent / "zoo"
+_ZOO = Path(__file__).parents[1] / "policies" / "zoo"
 _RATES = {
     "Success, % of the episodes": {"success": "success"},
     "Wins on both sides against three teams, and losses to the scripted one, %": {
@@ -77,8 +77,8 @@ class Zoo:
 
     def run(self) -> dict[str, Any]:
         """Lists the cards of all shipped policies, or prints that of a task."""
-        from mqe_jax import zoo
-        from mqe_jax.settings import to_mapping
+        from mqe_jax.core.settings import to_mapping
+        from mqe_jax.policies import zoo
 
         cards = {task: zoo.card(task) for task in (zoo.names() if self.task is None else [self.task])}
         params = {task: zoo.params(task) for task in cards}
@@ -203,8 +203,8 @@ class Bench(TaskOptions):
         """Measures throughput; prints a table, or returns the object for `--json`."""
         import jax
 
-        from mqe_jax import build
         from mqe_jax.cli import bench
+        from mqe_jax.runs import build
 
         env, vector_env = build.make_env(self.task, self.impl, self.overrides(), self.num_envs)
         key = jax.random.PRNGKey(self.seed)

@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 
-from mqe_jax import interrupts
-from mqe_jax.build import base_config, for_task, make_env
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, write_atomically
-from mqe_jax.literal import echo
+from mqe_jax.core import interrupts
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_folder, write_atomically
+from mqe_jax.core.literal import echo
+from mqe_jax.runs.build import base_config, for_task, make_env
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
 from mqe_jax.train.folder import CONFIG_FILE

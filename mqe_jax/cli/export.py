@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import tyro
 
 from mqe_jax.cli.options import Json, print_table
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, check_output, write_atomically
-from mqe_jax.literal import echo
-from mqe_jax.settings import record
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_folder, check_output, write_atomically
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import record
 
 
 @record
@@ -28,8 +28,8 @@ class Export:
 
     def run(self) -> dict[str, Any]:
         """Writes the graph if it agrees with JAX; prints a table, or returns the object for `--json`."""
-        from mqe_jax.build import make_env
         from mqe_jax.policies import load_policy
+        from mqe_jax.runs.build import make_env
 
         _check_installed()
         if self.onnx.suffix != ".onnx":

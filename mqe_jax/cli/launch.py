@@ -17,12 +17,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from mqe_jax import interrupts
-from mqe_jax.errors import InputError
-from mqe_jax.limits import NonNegativeInt, PositiveInt
-from mqe_jax.literal import echo
-from mqe_jax.settings import fail, record
-from mqe_jax.train.devices import PEER, PEER_ENDED
+from mqe_jax.core import interrupts
+from mqe_jax.core.devices import PEER, PEER_ENDED
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import NonNegativeInt, PositiveInt
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import fail, record
 
 MEMBER = "MQE_PROCESS"
 """Environment variable of a process that `launch` started: INDEX/COUNT@PORT, `AUTO` or `ALONE`."""

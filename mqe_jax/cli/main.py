@@ -11,9 +11,9 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from mqe_jax import interrupts
-from mqe_jax.errors import InputError, NonFiniteError, one_line, shown
-from mqe_jax.literal import line
+from mqe_jax.core import interrupts
+from mqe_jax.core.errors import InputError, NonFiniteError, one_line, shown
+from mqe_jax.core.literal import line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,7 +98,7 @@ def _run(command: Any) -> None:
     if not getattr(command, "light", False):
         programs.import_mujoco()
         programs.write_whole()
-        from mqe_jax.precision import single  # imports JAX
+        from mqe_jax.core.precision import single  # imports JAX
 
         run = single(run)
     as_json = bool(getattr(command, "json", False))

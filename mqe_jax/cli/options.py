@@ -12,11 +12,11 @@ from typing import Annotated, Any, TextIO
 
 import tyro
 
-from mqe_jax import settings
-from mqe_jax.errors import InputError, shown
-from mqe_jax.files import parse_yaml
-from mqe_jax.literal import line
-from mqe_jax.settings import joined, record
+from mqe_jax.core import settings
+from mqe_jax.core.errors import InputError, shown
+from mqe_jax.core.files import parse_yaml
+from mqe_jax.core.literal import line
+from mqe_jax.core.settings import joined, record
 
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[

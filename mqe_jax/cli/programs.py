@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 
 
 def hasten() -> None:
@@ -39,7 +39,7 @@ def keep() -> None:
     """Has JAX store compiled programs in the user's cache folder, one for each kind of processor, unless told where."""
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
-    from mqe_jax.files import user_cache
+    from mqe_jax.core.files import user_cache
 
     with contextlib.suppress(OSError, InputError):  # without a home, or one that cannot be written, nothing is stored
         lines = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
@@ -58,7 +58,7 @@ def write_whole() -> None:
     JAX itself writes them in place and never replaces one. A file cut off by a kill or a full disk would be read in
     vain at every later start, with a warning, and its program compiled anew. Imports JAX.
     """
-    from mqe_jax.files import remove_temporaries, write_atomically
+    from mqe_jax.core.files import remove_temporaries, write_atomically
 
     with contextlib.suppress(ImportError, AttributeError):  # a private class; another JAX writes as it does
         from jax._src.lru_cache import LRUCache

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mqe_jax.cli.options import Json, PolicyOptions
-from mqe_jax.limits import Candidates, ClipLength, FrameRate, ImageWidth, Speed, Time
-from mqe_jax.literal import echo
-from mqe_jax.settings import record
+from mqe_jax.core.limits import Candidates, ClipLength, FrameRate, ImageWidth, Speed, Time
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import record
 
 
 @record

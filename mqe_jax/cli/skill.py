@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mqe_jax.cli.options import Impl, Json, Repeated, Robot, Seed, print_table
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_output
-from mqe_jax.limits import Environments
-from mqe_jax.literal import echo
-from mqe_jax.settings import record
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_output
+from mqe_jax.core.limits import Environments
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import record
 
 
 @record
@@ -37,7 +37,7 @@ class SkillEval:
     def run(self) -> dict[str, Any]:
         """Evaluates the skill; prints a table, or returns the object for `--json`."""
 
-        from mqe_jax import robots
+        from mqe_jax.physics import robots
         from mqe_jax.walk import trainees
         from mqe_jax.walk.evaluation import evaluate_skill
 
@@ -79,7 +79,8 @@ class SkillConvert:
     def run(self) -> None:
         """Converts official checkpoints."""
 
-        from mqe_jax import robots, walk_policy
+        from mqe_jax import walk_policy
+        from mqe_jax.physics import robots
         from mqe_jax.walk.torchscript import convert
 
         if self.output.suffix != ".safetensors":

@@ -10,11 +10,12 @@ import jax
 import pydantic
 import tyro
 
-from mqe_jax import interrupts, robots
 from mqe_jax.cli.options import Impl, Robot
 from mqe_jax.cli.train import HINT, MARKERS
-from mqe_jax.literal import echo
-from mqe_jax.settings import fail, override, record
+from mqe_jax.core import interrupts
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import fail, override, record
+from mqe_jax.physics import robots
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.walk.network import HistorySettings
 from mqe_jax.walk.task import WalkTask

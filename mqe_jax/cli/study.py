@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from mqe_jax import interrupts
 from mqe_jax.cli.options import Impl, Json, Repeated, Seed, TaskOptions
-from mqe_jax.errors import InputError, NonFiniteError, nearest, one_line
-from mqe_jax.files import check_output
-from mqe_jax.limits import Candidates, Positive
-from mqe_jax.literal import echo, line
-from mqe_jax.settings import fail, record
+from mqe_jax.core import interrupts
+from mqe_jax.core.errors import InputError, NonFiniteError, nearest, one_line
+from mqe_jax.core.files import check_output
+from mqe_jax.core.limits import Candidates, Positive
+from mqe_jax.core.literal import echo, line
+from mqe_jax.core.settings import fail, record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
@@ -48,8 +48,8 @@ class Sweep:
 
     def run(self) -> dict[str, Any]:
         """Trains the remaining runs and writes the report, or prints their estimated time."""
-        from mqe_jax.build import base_config, check_start, environments, for_task
         from mqe_jax.envs import ALIASES, TASKS
+        from mqe_jax.runs.build import base_config, check_start, environments, for_task
         from mqe_jax.study import report as reports
         from mqe_jax.study import sweep as sweeps
 
@@ -144,9 +144,9 @@ class Tournament(TaskOptions):
         """Plays all pairs; prints a table, or returns the object for `--json`."""
         import jax
 
-        from mqe_jax.build import anchors, make_env
-        from mqe_jax.league import tournament
         from mqe_jax.policies import load_policy
+        from mqe_jax.runs.build import anchors, make_env
+        from mqe_jax.selfplay.league import tournament
 
         for name in (tournament.CSV, tournament.PICTURE):
             check_output(self.output / name)

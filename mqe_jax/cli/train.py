@@ -12,13 +12,13 @@ from typing import Annotated, Any
 import pydantic
 import tyro
 
-from mqe_jax import interrupts
 from mqe_jax.cli.options import DumpDiverged, TaskOptions
-from mqe_jax.errors import InputError
-from mqe_jax.limits import Seeds
-from mqe_jax.literal import echo
-from mqe_jax.presets import base_config
-from mqe_jax.settings import override, record
+from mqe_jax.core import interrupts
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Seeds
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import override, record
+from mqe_jax.runs.presets import base_config
 from mqe_jax.train.config import TrainConfig
 
 HINT = "resume with the same command and --resume; the run is in {}"

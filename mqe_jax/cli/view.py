@@ -12,10 +12,10 @@ from typing import Annotated
 from annotated_types import Ge, Le
 
 from mqe_jax.cli.options import PolicyOptions
-from mqe_jax.errors import InputError
-from mqe_jax.limits import Port
-from mqe_jax.literal import echo
-from mqe_jax.settings import fail, record
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Port
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import fail, record
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
@@ -36,8 +36,8 @@ class View(PolicyOptions):
         if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
             raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
         _check_address(self.host, self.port)
-        from mqe_jax.build import players
         from mqe_jax.envs import ALIASES
+        from mqe_jax.runs.build import players
         from mqe_jax.view.menu import DEFAULT, Choice, Menu, find_runs
         from mqe_jax.view.session import Session
         from mqe_jax.view.viewer import Viewer

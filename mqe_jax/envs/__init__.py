@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mqe_jax.core.limits import Environments
+from mqe_jax.core.settings import checked, override
 from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task, task_id
-from mqe_jax.limits import Environments
-from mqe_jax.settings import checked, override
 
 if TYPE_CHECKING:
     from mqe_jax.envs.autoreset import VectorEnv

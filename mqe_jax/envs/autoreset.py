@@ -11,15 +11,15 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core import devices
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Environments, PositiveInt
+from mqe_jax.core.memory import bytes_of, check_memory
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.types import RandomKey
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
-from mqe_jax.errors import InputError
-from mqe_jax.limits import Environments, PositiveInt
-from mqe_jax.memory import bytes_of, check_memory
-from mqe_jax.precision import single
-from mqe_jax.settings import check, checked, fail
-from mqe_jax.train import devices
-from mqe_jax.train.types import RandomKey
 
 SEEN = ("obs", "privileged_obs", "groups")
 """Fields that are observed once after the reset, and of which a batch may have those at the end of a step too."""

@@ -17,9 +17,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax import engines, robots, skills
-from mqe_jax.actuators import Actuators, NetworkActuators, load_actuator_network
-from mqe_jax.control import Controller, check_mode
+from mqe_jax import skills
+from mqe_jax.core.errors import InputError, warn
+from mqe_jax.core.limits import Environments
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked, differences, fail
+from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.observation import ObservationLayout, box
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
@@ -27,15 +30,13 @@ from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.returned import alike, results, shaped, weights_of
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
-from mqe_jax.errors import InputError, warn
-from mqe_jax.kinematics import poses
-from mqe_jax.limits import Environments
-from mqe_jax.precision import single
-from mqe_jax.robots.index import RobotState, placed, read_robots
-from mqe_jax.rotation import euler_to_quaternion
-from mqe_jax.scene import build_model, compile_scene
-from mqe_jax.settings import check, checked, differences, fail
-from mqe_jax.train.types import Level, Outcome, RandomKey
+from mqe_jax.physics import engines, robots
+from mqe_jax.physics.actuators import Actuators, NetworkActuators, load_actuator_network
+from mqe_jax.physics.kinematics import poses
+from mqe_jax.physics.robots.index import RobotState, placed, read_robots
+from mqe_jax.physics.rotation import euler_to_quaternion
+from mqe_jax.physics.scene import build_model, compile_scene
+from mqe_jax.skills.control import Controller, check_mode
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Coordinate, Length, TimeLimit
+from mqe_jax.core.settings import Coordinates, fail, record
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Coordinate, Length, TimeLimit
-from mqe_jax.objects import Platform
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import Coordinates, fail, record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Platform
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Coordinate, Distance, Length, TimeLimit
+from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Coordinate, Distance, Length, TimeLimit
-from mqe_jax.objects import Door
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import fail, record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Door
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 _WALL_LENGTH = 1.0  # m along x, of the block with the door at its centre

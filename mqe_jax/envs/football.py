@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Distance, Few, Fraction, Length, TimeLimit
+from mqe_jax.core.settings import record
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, S, State
-from mqe_jax.limits import Distance, Few, Fraction, Length, TimeLimit
-from mqe_jax.objects import Ball
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Ball
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.settings import record
 from mqe_jax.envs.football import BALL_BLOCKS, FAR, GOALS, Football, FootballParams, Play
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
-from mqe_jax.robots.index import RobotState
-from mqe_jax.settings import record
+from mqe_jax.physics.robots.index import RobotState
 
 
 @record

@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import Outcome
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
-from mqe_jax.robots.index import RobotState
-from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
-from mqe_jax.settings import fail
-from mqe_jax.train.types import Outcome
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 
 
 class Match(QuadrupedEnv[S, P]):

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.settings import fail
 from mqe_jax.envs.returned import named, shaped
-from mqe_jax.settings import fail
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box

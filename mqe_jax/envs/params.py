@@ -7,10 +7,9 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from mqe_jax import agile, robots, skills, walk_policy  # noqa: F401  (skills register themselves)
-from mqe_jax.envs.randomization import Randomization
-from mqe_jax.errors import InputError
-from mqe_jax.limits import (
+from mqe_jax import skills, walk_policy  # noqa: F401  (skills register themselves
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import (
     Buffer,
     Coordinate,
     Distance,
@@ -24,7 +23,10 @@ from mqe_jax.limits import (
     Time,
     TimeLimit,
 )
-from mqe_jax.settings import FileName, FrozenMapping, Range, fail, record
+from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, record
+from mqe_jax.envs.randomization import Randomization
+from mqe_jax.physics import robots
+from mqe_jax.skills import agile  # noqa: F401  (skills register themselves
 
 
 @record
@@ -34,7 +36,7 @@ class TaskParams:
     num_agents: Few = 2
     """Number of controlled robots."""
     robot: str = "go1"
-    """Name of the robot, such as go1 or go2 (`mqe_jax.robots`)."""
+    """Name of the robot, such as go1 or go2 (`mqe_jax.physics.robots`)."""
     episode_length: TimeLimit = 10.0
     """Time limit, s, rounded to environment steps (0.02 s)."""
     spawn_height: Length = 0.42

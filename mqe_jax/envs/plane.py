@@ -5,14 +5,14 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core.limits import Length
+from mqe_jax.core.settings import record
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Length
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import record
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -37,7 +37,7 @@ class PlaneParams(TaskParams):
 class Go1Plane(QuadrupedEnv[None, PlaneParams]):
     """Robots on flat ground.
 
-    - Action: see `mqe_jax.control`.
+    - Action: see `mqe_jax.skills.control`.
     - Observation: one-hot, own base info, the others' base info.
     - Reward: the robots' summed displacement along x.
     - End: a fall, or the time limit.

@@ -11,8 +11,8 @@ import numpy as np
 
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.state import State
-from mqe_jax.robots.index import RobotIndex, RobotState
-from mqe_jax.robots.robot import Robot
+from mqe_jax.physics.robots.index import RobotIndex, RobotState
+from mqe_jax.physics.robots.robot import Robot
 
 _ROBOT = (
     Block("position", 3, "m"),

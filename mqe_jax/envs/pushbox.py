@@ -11,16 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Buffer, Coordinate, Distance, Iterations, Length, NonNegative, TimeLimit
+from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Buffer, Coordinate, Distance, Iterations, Length, NonNegative, TimeLimit
-from mqe_jax.objects import Box
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import fail, record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Box
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
 
 _SPAWN_LENGTH, _GATE_LENGTH, _GATE_DEPTH = 2.0, 5.0, 0.1  # m, along x

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mqe_jax.limits import Lag, NonNegative, TimeLimit
-from mqe_jax.robots.index import RobotIndex
-from mqe_jax.settings import Range, fail, record
+from mqe_jax.core.limits import Lag, NonNegative, TimeLimit
+from mqe_jax.core.settings import Range, fail, record
+from mqe_jax.physics.robots.index import RobotIndex
 
 if TYPE_CHECKING:
     from mujoco import mjx

@@ -9,8 +9,8 @@ import importlib
 from collections.abc import Callable, Iterator, MutableMapping
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from mqe_jax.errors import InputError, nearest
-from mqe_jax.settings import checked
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import checked
 
 if TYPE_CHECKING:
     import jax
@@ -27,7 +27,7 @@ class Shipped(NamedTuple):
     task: str
     """MODULE:CLASS of mqe_jax.envs."""
     planner: str | None
-    """Scripted policy, MODULE:FUNCTION of mqe_jax.planners."""
+    """Scripted policy, MODULE:FUNCTION of mqe_jax.policies.scripted."""
     title: str
     """Its class's `title`."""
     teams: tuple[int, ...]
@@ -69,7 +69,7 @@ SHIPPED = {
 }
 """The package's tasks by id, with default parameters."""
 
-# Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.planners.
+# Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.policies.scripted.
 _NAMED: list[tuple[str, str, str]] = []
 
 # Alternative ids, from the released system.

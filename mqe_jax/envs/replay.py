@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import limits
-from mqe_jax.engines import STATE_FIELDS
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import archive, parse_json, write_atomically
+from mqe_jax.core.settings import Parameters, PathText, check, checked, fail, to_mapping
+from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
-from mqe_jax.errors import InputError
-from mqe_jax.files import archive, parse_json, write_atomically
-from mqe_jax.settings import Parameters, PathText, check, checked, fail, to_mapping
-from mqe_jax.train.types import AnySingle
+from mqe_jax.physics.engines import STATE_FIELDS
 
 # Fields on which a step depends; the others are recomputed by it.
 _FIELDS = tuple("step anchors control actuators randomized task assistance frozen_steps key active".split())

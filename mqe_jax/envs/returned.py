@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import shown
+from mqe_jax.core.errors import shown
 
 
 def weights_of(params: Any) -> Any:

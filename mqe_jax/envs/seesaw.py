@@ -5,17 +5,17 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Coordinate, Length, TimeLimit
+from mqe_jax.core.settings import fail, record
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Coordinate, Length, TimeLimit
-from mqe_jax.objects import Platform, Seesaw
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import fail, record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Platform, Seesaw
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Buffer, Coordinate, Distance, Few, Friction, Length, NonNegative, TimeLimit
+from mqe_jax.core.settings import record
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, entities, for_all, pair
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Buffer, Coordinate, Distance, Few, Friction, Length, NonNegative, TimeLimit
 from mqe_jax.npc import flock
-from mqe_jax.objects import Sheep
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Sheep
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import jax
 
-from mqe_jax.control import ControlState
+from mqe_jax.core.types import Outcome
 from mqe_jax.envs.randomization import RandomizedParams
-from mqe_jax.robots.index import RobotState
-from mqe_jax.train.types import Outcome
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.skills.control import ControlState
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -26,7 +26,7 @@ rules, which decides a match."""
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentState:
-    """Fields of every environment's state (`mqe_jax.train.types.VectorEnv`); a batch has leading axes."""
+    """Fields of every environment's state (`mqe_jax.core.types.VectorEnv`); a batch has leading axes."""
 
     obs: jax.Array
     """The agents' observations (A, O); after an auto-reset, those of the new episode."""

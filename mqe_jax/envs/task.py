@@ -14,9 +14,9 @@ from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.returned import weights_of
 from mqe_jax.envs.reward import faded, weigh
 from mqe_jax.envs.state import Moment, S, State
-from mqe_jax.robots.index import RobotIndex, RobotState
-from mqe_jax.robots.robot import Robot
-from mqe_jax.scene import CompiledScene, ObjectIndex, Scene
+from mqe_jax.physics.robots.index import RobotIndex, RobotState
+from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics.scene import CompiledScene, ObjectIndex, Scene
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -32,7 +32,7 @@ class Task(Generic[S, P]):
     name: ClassVar[str] = ""
     """Id of the task."""
     version: ClassVar[int] = 1
-    """Version of scene, observation and reward: policies of another one are outdated (`mqe_jax.zoo`)."""
+    """Version of scene, observation and reward: policies of another one are outdated (`mqe_jax.policies.zoo`)."""
     title: ClassVar[str] = ""
     """Display title: the paper's name if the task is in the paper."""
     aim: ClassVar[str] = ""

@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.appearance import grounds
+from mqe_jax.core.limits import Distance, Length, TimeLimit
+from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.limits import Distance, Length, TimeLimit
-from mqe_jax.objects import Cylinder
-from mqe_jax.robots.index import RobotState
-from mqe_jax.scene import Scene
-from mqe_jax.settings import fail, record
+from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.objects import Cylinder
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:

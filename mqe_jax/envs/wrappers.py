@@ -9,10 +9,10 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core import devices
+from mqe_jax.core.precision import single
 from mqe_jax.envs.autoreset import Batch
 from mqe_jax.envs.state import EnvironmentState
-from mqe_jax.precision import single
-from mqe_jax.train import devices
 
 
 @jax.tree_util.register_dataclass

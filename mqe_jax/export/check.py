@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
 from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
 from mqe_jax.train.policy import TrainedPolicy

@@ -10,8 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import user_cache, write_atomically
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import user_cache, write_atomically
 
 
 class Package(NamedTuple):

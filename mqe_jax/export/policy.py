@@ -27,13 +27,13 @@ import onnx
 
 import mqe_jax
 from mqe_jax import skills
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import checked
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
 from mqe_jax.export.translate import OPSET, translate
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import NUM_JOINTS
 from mqe_jax.policies import check_policy
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.robot import NUM_JOINTS
-from mqe_jax.settings import checked
 from mqe_jax.skills import Skill
 from mqe_jax.train.policy import TrainedPolicy
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import mujoco
 
-from mqe_jax.appearance import ROBOT_COLORS
+from mqe_jax.core.settings import checked
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.robots import motors
-from mqe_jax.scene import build_spec
-from mqe_jax.settings import checked
+from mqe_jax.physics.appearance import ROBOT_COLORS
+from mqe_jax.physics.robots import motors
+from mqe_jax.physics.scene import build_spec
 
 
 @checked(env=QuadrupedEnv)
@@ -35,7 +35,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     | `teams`, `commands` | agents of each team; names of the action's commands, in order |
     | `robots` | of each of the R robots, colour and addresses in qpos, qvel and ctrl as in `RobotIndex` |
     | `track` | `length` and `width` |
-    | `motors` | of all joints, constants and inputs of `mqe_jax.robots.motors`, which MJCF cannot hold |
+    | `motors` | of all joints, constants and inputs of `mqe_jax.physics.robots.motors`, which MJCF cannot hold |
     """
     index, scene = env.index, env.compiled.scene
     tables = ("base_qpos", "joint_qpos", "joint_qvel", "actuator")

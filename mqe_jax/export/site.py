@@ -19,19 +19,18 @@ import jax
 import numpy as np
 import onnx
 
-from mqe_jax import zoo
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.files import write_atomically
+from mqe_jax.core.settings import fail
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, make
 from mqe_jax.envs.randomization import Randomization
-from mqe_jax.errors import InputError, nearest
 from mqe_jax.export.check import checked
 from mqe_jax.export.libraries import add_libraries
 from mqe_jax.export.policy import shapes
 from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, state_arrays
 from mqe_jax.export.translate import Function
-from mqe_jax.files import write_atomically
-from mqe_jax.policies import check_policy, load_policy
-from mqe_jax.settings import fail
+from mqe_jax.policies import check_policy, load_policy, zoo
 from mqe_jax.train.policy import Policy, TrainedPolicy
 
 PAGE = Path(__file__).parent / "page"

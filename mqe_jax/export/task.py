@@ -27,12 +27,12 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.errors import InputError
 from mqe_jax.export.policy import SENSED, filled, named, skill_of
 from mqe_jax.export.translate import Function
-from mqe_jax.robots.index import Proprioception
+from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.train.policy import Policy
 
 PHYSICS = ("qpos", "qvel", "sensordata")

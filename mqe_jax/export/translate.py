@@ -15,7 +15,7 @@ import onnx
 from jax.extend.core import Jaxpr, Literal
 from onnx import TensorProto, helper, numpy_helper
 
-from mqe_jax.errors import InputError, one_line
+from mqe_jax.core.errors import InputError, one_line
 
 OPSET = 17
 BATCH = "N"

@@ -13,13 +13,13 @@ from typing import Any, Self
 import jax
 import numpy as np
 
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_folder
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import PathText, check, fail
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.envs.wrappers import Outer, WrappedState
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder
-from mqe_jax.literal import echo
-from mqe_jax.opponents import TeamState
-from mqe_jax.settings import PathText, check, fail
+from mqe_jax.selfplay.opponents import TeamState
 
 STEPS = 64
 """Maximum number of steps in a recording, the last of which diverges."""

@@ -11,20 +11,20 @@ import jax
 import numpy as np
 from annotated_types import MaxLen, MinLen
 
-from mqe_jax import interrupts, limits
-from mqe_jax.build import Config, Task, prepare
-from mqe_jax.files import check_folder
-from mqe_jax.limits import Seed, Seeds
-from mqe_jax.literal import echo
+from mqe_jax.core import interrupts, limits
+from mqe_jax.core.files import check_folder
+from mqe_jax.core.limits import Seed, Seeds
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import PathText, check, checked
+from mqe_jax.core.types import Cast
+from mqe_jax.runs.build import Config, Task, prepare
 from mqe_jax.runs.divergence import guard
-from mqe_jax.settings import PathText, check, checked
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_run, write_config
 from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
 from mqe_jax.train.monitor import read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
-from mqe_jax.train.types import Cast
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

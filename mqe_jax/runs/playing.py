@@ -13,13 +13,13 @@ from typing import Any, Literal
 
 import jax
 
-from mqe_jax import build
-from mqe_jax.build import Player
+from mqe_jax.core.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
+from mqe_jax.core.settings import PathText, checked, fail
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.league.sides import BothSides
-from mqe_jax.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
+from mqe_jax.runs import build
+from mqe_jax.runs.build import Player
 from mqe_jax.runs.divergence import guard
-from mqe_jax.settings import PathText, checked, fail
+from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train.evaluate import Result, evaluate_batch
 
 View = Literal["follow", "near", "scene", "side"]

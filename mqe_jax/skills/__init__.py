@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.errors import InputError, nearest
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.robot import Robot
-from mqe_jax.settings import checked
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import checked
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import Robot
 
 
 class Command(NamedTuple):

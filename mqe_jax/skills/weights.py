@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_locks, linear_layers, read_tensors, write_atomically
-from mqe_jax.robots.robot import Robot
-from mqe_jax.settings import PathText, check
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_locks, linear_layers, read_tensors, write_atomically
+from mqe_jax.core.settings import PathText, check
+from mqe_jax.physics.robots.robot import Robot
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
 Params = dict[str, dict[str, dict[str, jax.Array]]]

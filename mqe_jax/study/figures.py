@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mqe_jax.literal import to_label
+from mqe_jax.core.literal import to_label
 from mqe_jax.study.estimates import Array, Cells, band, estimate, evaluated, names, score_matrices
 from mqe_jax.study.runs import Cell, Reference, Run
 from mqe_jax.study.statistics import performance_profile

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mqe_jax.files import check_folder, write_atomically
-from mqe_jax.literal import to_markdown
+from mqe_jax.core.files import check_folder, write_atomically
+from mqe_jax.core.literal import to_markdown
 from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
 from mqe_jax.study.runs import PLAIN, REWARD, Reference, Run, read_runs, table

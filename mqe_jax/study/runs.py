@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mqe_jax.errors import InputError
-from mqe_jax.literal import line
-from mqe_jax.settings import FrozenMapping, build, load_yaml, record
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.literal import line
+from mqe_jax.core.settings import FrozenMapping, build, load_yaml, record
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
 from mqe_jax.train.logs import number, read_metrics

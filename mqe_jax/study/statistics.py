@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mqe_jax.errors import InputError
+from mqe_jax.core.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -20,16 +20,16 @@ import jax
 import yaml
 from annotated_types import MaxLen, MinLen
 
-from mqe_jax.errors import InputError, InUseError, NonFiniteError, nearest
-from mqe_jax.files import check_folder, locked, making, write_atomically
-from mqe_jax.limits import Seed, Seeds
-from mqe_jax.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.core.errors import InputError, InUseError, NonFiniteError, nearest
+from mqe_jax.core.files import check_folder, locked, making, write_atomically
+from mqe_jax.core.limits import Seed, Seeds
+from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.core.types import Cast
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_folders
 from mqe_jax.train.runner import OnUpdate, train_seeds
-from mqe_jax.train.types import Cast
 
 SWEEP_FILE = "sweep.yaml"
 

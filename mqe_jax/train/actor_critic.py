@@ -10,11 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.settings import fail
-from mqe_jax.train import devices, nn
+from mqe_jax.core import devices
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import Memory, NetworkMemory, Params
+from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import ActorCritic, EnvDims, Evaluation, Network
-from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}
 

@@ -14,10 +14,10 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save
 
-from mqe_jax import limits
-from mqe_jax.errors import InputError, brief
-from mqe_jax.files import check_file, make_folder, parse_json, parsing, write_atomically
-from mqe_jax.train.types import is_typed_key, raw_keys
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError, brief
+from mqe_jax.core.files import check_file, make_folder, parse_json, parsing, write_atomically
+from mqe_jax.core.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
 VERSION = 3

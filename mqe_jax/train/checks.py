@@ -6,13 +6,13 @@ from typing import Any
 
 import jax
 
-from mqe_jax.errors import InputError
-from mqe_jax.memory import check_memory
-from mqe_jax.precision import single
-from mqe_jax.settings import fail
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.memory import check_memory
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import VectorEnv, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import Network
-from mqe_jax.train.types import VectorEnv, teams_of
 
 
 @single

@@ -9,8 +9,8 @@ import pydantic
 import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
-from mqe_jax.errors import InputError
-from mqe_jax.limits import (
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import (
     Environments,
     Episodes,
     Epochs,
@@ -23,7 +23,7 @@ from mqe_jax.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.settings import FileName, FrozenMapping, Parameters, fail, joined, load_yaml, override, record
+from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, joined, load_yaml, override, record
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")

@@ -15,13 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.errors import InputError
-from mqe_jax.limits import Episodes, Horizon, PositiveInt
-from mqe_jax.literal import line, to_html
-from mqe_jax.precision import single
-from mqe_jax.settings import check, checked, fail
-from mqe_jax.train.rollout import active_of, mean_of_team
-from mqe_jax.train.types import (
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Episodes, Horizon, PositiveInt
+from mqe_jax.core.literal import line, to_html
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.types import (
     RESULTS,
     AnyBatch,
     Memory,
@@ -35,6 +34,7 @@ from mqe_jax.train.types import (
     teams_of,
     where_rows,
 )
+from mqe_jax.train.rollout import active_of, mean_of_team
 
 if TYPE_CHECKING:
     from mqe_jax.train.policy import Policy

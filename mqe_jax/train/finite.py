@@ -9,9 +9,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import NonFiniteError
+from mqe_jax.core.errors import NonFiniteError
+from mqe_jax.core.types import PyTree, raw_keys
 from mqe_jax.train.checkpoint import latest, nonfinite
-from mqe_jax.train.types import PyTree, raw_keys
 
 _METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import yaml
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_folder, locked, making, remove_temporaries, write_atomically
-from mqe_jax.settings import to_mapping
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_folder, locked, making, remove_temporaries, write_atomically
+from mqe_jax.core.settings import to_mapping
 from mqe_jax.train.checkpoint import checkpoint_step, latest, list_checkpoints
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.logs import CSV_FILE

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.precision import single
-from mqe_jax.settings import fail
-from mqe_jax.train import devices
+from mqe_jax.core import devices
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
 from mqe_jax.train.checks import check_divisible, check_environment, check_teacher
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
@@ -33,7 +34,6 @@ from mqe_jax.train.optim import AdamState, begun_anew
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, normalize_obs, rollout
 from mqe_jax.train.schedules import Scheduled, scheduled
 from mqe_jax.train.stages import Metrics, Stages
-from mqe_jax.train.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
 
 
 @jax.tree_util.register_dataclass
@@ -53,7 +53,7 @@ class TrainState:
     updates: jax.Array
     """Updates done () int32."""
     extra: PyTree = ()
-    """State of the league (`mqe_jax.train.types.Matchmaker`); empty without one."""
+    """State of the league (`mqe_jax.core.types.Matchmaker`); empty without one."""
 
 
 class Learner(NamedTuple):

@@ -25,9 +25,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.text import Text
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import append, make_folder, parsing, read_rows, write_atomically
-from mqe_jax.settings import PathText, check
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import append, make_folder, parsing, read_rows, write_atomically
+from mqe_jax.core.settings import PathText, check
 from mqe_jax.train.config import TrainConfig
 
 CSV_FILE = "metrics.csv"

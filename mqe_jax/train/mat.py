@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.settings import fail
-from mqe_jax.train import devices, nn
+from mqe_jax.core import devices
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import Memory, NetworkMemory, Params
+from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, Mat, Network
-from mqe_jax.train.types import Memory, NetworkMemory, Params
 
 # -- layers ----------------------------------------------------------------------------------------------------------
 

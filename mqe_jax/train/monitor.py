@@ -20,14 +20,14 @@ import pydantic
 from annotated_types import Ge
 from typing_extensions import TypedDict
 
-from mqe_jax.errors import InputError
-from mqe_jax.files import check_locks, read_json, write_atomically
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_locks, read_json, write_atomically
+from mqe_jax.core.types import Memory, Observations, VectorEnv
 from mqe_jax.train.checkpoint import files_by_step
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, Result
 from mqe_jax.train.learner import env_dims
 from mqe_jax.train.policy import TrainedPolicy, policy_act, read_policy, save_policy
-from mqe_jax.train.types import Memory, Observations, VectorEnv
 
 EVALUATIONS_FILE = "evaluations.json"
 ABSOLUTE_FACTOR = 10

@@ -22,14 +22,14 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 
-from mqe_jax.errors import nearest
-from mqe_jax.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
-from mqe_jax.settings import build, fail, record
+from mqe_jax.core.errors import nearest
+from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
+from mqe_jax.core.settings import build, fail, record
 
 if TYPE_CHECKING:
     import jax
 
-    from mqe_jax.train.types import Memory, NetworkMemory, Params
+    from mqe_jax.core.types import Memory, NetworkMemory, Params
 
 
 class EnvDims(NamedTuple):
@@ -132,7 +132,7 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings record (see `mqe_jax.settings.record`) and registers it.
+    """Makes a class a settings record (see `mqe_jax.core.settings.record`) and registers it.
 
     The functions of its network compute in single precision.
     """
@@ -142,7 +142,7 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
 
         @functools.wraps(build_own)
         def build_single(self: Any, dims: EnvDims) -> Network:
-            from mqe_jax.precision import single
+            from mqe_jax.core.precision import single
 
             return Network._make(single(part) if callable(part) else part for part in build_own(self, dims))
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train.types import Params
+from mqe_jax.core.types import Params
 
 PRECISION = "highest"
 """Precision of the learner's matrix products: full float32, so that results do not depend on the GPU model."""

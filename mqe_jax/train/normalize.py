@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train import devices
+from mqe_jax.core import devices
 
 _OBSERVATION_MIN_STD = 1e-2
 _VALUE_MIN_STD = 1e-3  # of the root mean square

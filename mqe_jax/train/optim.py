@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train.types import PyTree
+from mqe_jax.core.types import PyTree
 
 _B1, _B2 = 0.9, 0.999  # decays of the moments
 

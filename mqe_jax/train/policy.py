@@ -12,17 +12,17 @@ import jax
 import jax.numpy as jnp
 from annotated_types import Ge
 
-from mqe_jax.errors import InputError, NonFiniteError
-from mqe_jax.files import check_folder, check_locks
-from mqe_jax.limits import PositiveInt
-from mqe_jax.precision import single
-from mqe_jax.settings import PathText, build, check, checked, fail, to_mapping
+from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.files import check_folder, check_locks
+from mqe_jax.core.limits import PositiveInt
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import PathText, build, check, checked, fail, to_mapping
+from mqe_jax.core.types import Memory, Observations, Params, RandomKey
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims, NetworkSettings
 from mqe_jax.train.normalize import RunningStatistics, running_init, running_normalize
-from mqe_jax.train.types import Memory, Observations, Params, RandomKey
 
 POLICY_FILE = "policy.safetensors"
 
@@ -213,7 +213,7 @@ def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata:
 
 
 NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
-"""Reads the policies that have names, the shipped ones, which `mqe_jax.zoo` adds."""
+"""Reads the policies that have names, the shipped ones, which `mqe_jax.policies.zoo` adds."""
 
 
 @checked(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train import devices
+from mqe_jax.core import devices
+from mqe_jax.core.types import Batch, NetworkMemory, Params, Transition, VectorEnv, observations, reset_memory
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
-from mqe_jax.train.types import Batch, NetworkMemory, Params, Transition, VectorEnv, observations, reset_memory
 
 
 class RolloutState(NamedTuple):

@@ -12,12 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from mqe_jax import interrupts
-from mqe_jax.errors import InputError
-from mqe_jax.settings import PathText, check, fail, to_mapping
+from mqe_jax.core import interrupts
+from mqe_jax.core.devices import Processes, connected
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import PathText, check, fail, to_mapping
+from mqe_jax.core.types import AnyBatch, Matchmaker, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.devices import Processes, connected
 from mqe_jax.train.finite import all_finite, check_finite, nonfinite_metrics
 from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
 from mqe_jax.train.learner import Learner, TrainState, env_dims
@@ -26,7 +27,6 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
-from mqe_jax.train.types import AnyBatch, Matchmaker, VectorEnv, generator
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train.types import PyTree
+from mqe_jax.core.types import PyTree
 
 
 class Seeds:

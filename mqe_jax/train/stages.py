@@ -7,14 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.train import devices
+from mqe_jax.core import devices
+from mqe_jax.core.types import Batch, Params, Transition
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss
 from mqe_jax.train.networks import Network
 from mqe_jax.train.optim import AdamState, adam
 from mqe_jax.train.rollout import mean_of_team, minibatches, take
 from mqe_jax.train.schedules import Scheduled
-from mqe_jax.train.types import Batch, Params, Transition
 
 Metrics = dict[str, Any]
 Carry = tuple[Params, AdamState, jax.Array]

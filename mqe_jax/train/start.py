@@ -12,16 +12,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.errors import InputError
-from mqe_jax.settings import fail, is_record, override, to_mapping
+from mqe_jax.core.devices import Processes
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import fail, is_record, override, to_mapping
+from mqe_jax.core.types import Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.devices import Processes
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.types import Matchmaker, Params, PyTree, VectorEnv, generator
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 _MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
@@ -114,7 +114,9 @@ def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPo
     """
     start = str(config.start)
     if start not in NAMED and not Path(start).exists():
-        shipped = f"one of {', '.join(NAMED)}" if NAMED else "a shipped policy's task, after `import mqe_jax.zoo`"
+        shipped = (
+            f"one of {', '.join(NAMED)}" if NAMED else "a shipped policy's task, after `import mqe_jax.policies.zoo`"
+        )
         fail("start", start, f"a run folder, a policy file, or {shipped}")
     policy = NAMED[start]() if start in NAMED else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mqe_jax.literal import to_html
+from mqe_jax.core.literal import to_html
 
 _BOX = "padding:0 12px 10px;font-size:13px;overflow-wrap:anywhere"
 _CELL = "padding:2px 4px;text-align:left;border-bottom:1px solid #8884"

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mqe_jax import zoo
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import PLANNERS, TASKS
 from mqe_jax.envs.match import Match
-from mqe_jax.errors import InputError
+from mqe_jax.policies import zoo
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.policy import POLICY_FILE
 from mqe_jax.view.session import Session

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mqe_jax.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
+from mqe_jax.physics.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
 from mqe_jax.view.markup import bars, observation_table, paragraph, table
 from mqe_jax.view.menu import DEFAULT, Choice, Menu
 from mqe_jax.view.session import DRIVEN, Session

@@ -25,8 +25,8 @@ import websockets.asyncio.server as websockets_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from mqe_jax.errors import InputError
-from mqe_jax.literal import line
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.literal import line
 
 _LINES = 10  # logged per second at most
 _LENGTH = 200  # of a logged line, characters

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.types import RESULTS, VectorEnv, observations, where_rows
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.policy import Policy
-from mqe_jax.train.types import RESULTS, VectorEnv, observations, where_rows
 from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")

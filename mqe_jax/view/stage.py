@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
-from mqe_jax.appearance import GROUND_GROUP
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.physics.appearance import GROUND_GROUP
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
 

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import viser
 
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
 from mqe_jax.view.markup import paragraph
 from mqe_jax.view.menu import Menu
 from mqe_jax.view.overlay import Overlay

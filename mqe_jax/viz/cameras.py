@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from mqe_jax.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.viz.framing import Camera, fitted, goal_points, hidden, smoothed, targets
 from mqe_jax.viz.geometry import body_boxes, extent, pose, posed, robot_bases
 from mqe_jax.viz.recording import Episode

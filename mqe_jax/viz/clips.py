@@ -13,10 +13,10 @@ import numpy as np
 from annotated_types import Gt
 from PIL import Image
 
-from mqe_jax import files
-from mqe_jax.errors import InputError
-from mqe_jax.files import replacing
-from mqe_jax.settings import PathText, checked, fail
+from mqe_jax.core import files
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import replacing
+from mqe_jax.core.settings import PathText, checked, fail
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 

@@ -13,9 +13,9 @@ import numpy as np
 from annotated_types import MinLen
 from numpy.typing import ArrayLike
 
-from mqe_jax.files import replacing
-from mqe_jax.literal import to_label
-from mqe_jax.settings import checked
+from mqe_jax.core.files import replacing
+from mqe_jax.core.literal import to_label
+from mqe_jax.core.settings import checked
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mqe_jax.appearance import GOAL_SITE, HIDDEN_GROUP
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.physics.appearance import GOAL_SITE, HIDDEN_GROUP
 from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, posed, robot_bases, robot_color
 from mqe_jax.viz.recording import Episode
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from mqe_jax.appearance import GROUND_GROUP, HIDDEN_GROUP
+from mqe_jax.physics.appearance import GROUND_GROUP, HIDDEN_GROUP
 from mqe_jax.viz.recording import Episode
 
 COLLISION_GROUP = HIDDEN_GROUP

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import MinLen
 
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength, Positive
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
-from mqe_jax.limits import CLIP_BYTES, Candidates, ClipLength, Positive
-from mqe_jax.precision import single
-from mqe_jax.settings import check, checked, fail
 from mqe_jax.train.evaluate import Act, acting
 from mqe_jax.train.policy import Policy, groups_of
-from mqe_jax.train.types import AnySingle, PolicyOrAct, RandomKey, observations
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,13 +14,13 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from mqe_jax.appearance import GROUND_GROUP
-from mqe_jax.appearance.grounds import GROUND_MATERIAL
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
+from mqe_jax.core.settings import PathText, checked, fail
+from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.errors import InputError
-from mqe_jax.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
-from mqe_jax.settings import PathText, checked, fail
-from mqe_jax.train.types import AnySingle
+from mqe_jax.physics.appearance import GROUND_GROUP
+from mqe_jax.physics.appearance.grounds import GROUND_MATERIAL
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
 from mqe_jax.viz.curves import draw_top

@@ -22,10 +22,10 @@ from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.reward import weigh
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.robots.index import Proprioception, RobotState, foot_positions
-from mqe_jax.robots.robot import NUM_JOINTS, Robot
-from mqe_jax.rotation import quaternion_to_euler, rotate, rotate_inverse
-from mqe_jax.scene import Scene
+from mqe_jax.physics.robots.index import Proprioception, RobotState, foot_positions
+from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.physics.rotation import quaternion_to_euler, rotate, rotate_inverse
+from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, Track
 from mqe_jax.walk import trainees
 from mqe_jax.walk.rewards import POSITIVE_TERMS, reward_terms

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
-from mqe_jax.errors import InputError, nearest
-from mqe_jax.limits import Environments, Seed
-from mqe_jax.precision import single
-from mqe_jax.robots.index import Proprioception, foot_positions
-from mqe_jax.robots.robot import Robot
-from mqe_jax.rotation import rotate, rotate_inverse
-from mqe_jax.settings import checked
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.limits import Environments, Seed
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import checked
+from mqe_jax.physics.robots.index import Proprioception, foot_positions
+from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics.rotation import rotate, rotate_inverse
 from mqe_jax.skills.weights import Params
 from mqe_jax.walk import trainees
 from mqe_jax.walk.env import WalkEnv, heading_velocity

@@ -24,15 +24,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import agile, robots, walk_policy
-from mqe_jax.limits import Horizon, NonNegative
-from mqe_jax.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
-from mqe_jax.settings import FileName, fail, record
+from mqe_jax import walk_policy
+from mqe_jax.core import devices
+from mqe_jax.core.limits import Horizon, NonNegative
+from mqe_jax.core.settings import FileName, fail, record
+from mqe_jax.core.types import Memory, NetworkMemory, Params
+from mqe_jax.physics import robots
+from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
+from mqe_jax.skills import agile
 from mqe_jax.skills.weights import Networks
-from mqe_jax.train import devices, nn
+from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
-from mqe_jax.train.types import Memory, NetworkMemory, Params
 from mqe_jax.walk.task import LATENT_TARGET
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 

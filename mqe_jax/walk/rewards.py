@@ -11,10 +11,10 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.robots.index import RobotState, foot_positions, knee_positions
-from mqe_jax.robots.robot import Robot
-from mqe_jax.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
-from mqe_jax.settings import record
+from mqe_jax.core.settings import record
+from mqe_jax.physics.robots.index import RobotState, foot_positions, knee_positions
+from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 
 
 @record

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from annotated_types import Ge, Le
 
+from mqe_jax.core.limits import Buffer, Distance, Few, Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
+from mqe_jax.core.settings import Range, record
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.randomization import Randomization
-from mqe_jax.limits import Buffer, Distance, Few, Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
-from mqe_jax.settings import Range, record
 from mqe_jax.walk.rewards import WalkRewards
 from mqe_jax.walk.trainees import VELOCITY, Trainee
 

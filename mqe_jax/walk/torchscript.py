@@ -18,9 +18,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mqe_jax import limits
-from mqe_jax.files import archive
-from mqe_jax.settings import PathText, checked
+from mqe_jax.core import limits
+from mqe_jax.core.files import archive
+from mqe_jax.core.settings import PathText, checked
 from mqe_jax.walk_policy import NETWORKS, Params
 
 _DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import agile, walk_policy
-from mqe_jax.errors import InputError, nearest
-from mqe_jax.robots.index import Proprioception
-from mqe_jax.robots.robot import Robot
-from mqe_jax.skills import Skill
+from mqe_jax import walk_policy
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.skills import Skill, agile
 from mqe_jax.walk_policy import WalkMemory, WalkPolicy
 
 VELOCITY = ("vx", "vy", "yaw_rate")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import jax
 
+from mqe_jax.core.settings import fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
-from mqe_jax.robots.robot import Robot
-from mqe_jax.settings import fail, override, to_mapping
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.train.config import PPO, Checkpointing, Curriculum, Normalization, OptimizerSettings, TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.runner import train

@@ -37,7 +37,7 @@ export class Physics {
 
 const clip = (x, low, high) => Math.max(low, Math.min(high, x));
 
-/** The motors of all robots, as `mqe_jax/robots/motors.py` computes them. */
+/** The motors of all robots, as `mqe_jax/physics/robots/motors.py` computes them. */
 class Motors {
   constructor(settings) {
     Object.assign(this, settings.motors);

@@ -1,0 +1,1 @@
+"""What every other module builds on: errors, limits, settings, files, signals, devices, types."""

@@ -1,0 +1,258 @@
+"""One training in several processes of `jax.distributed`, each with one device and a share of the environments.
+
+The learner runs in each of them under `jax.shard_map` over the axis `AXIS`. The functions of this module then span all
+processes; anywhere else they are those of a single process: means are the identity, and rows are all rows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, PartitionSpec
+
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import PositiveInt
+from mqe_jax.core.settings import check
+from mqe_jax.core.types import PyTree
+
+AXIS = "processes"
+
+PEER = re.compile(
+    r"^(?!.*NCCL.*(unhandled cuda error|invalid (argument|usage)))"  # of this process
+    r".*([Gg]loo|NCCL|[Cc]onnection (reset|closed)|coordination|distributed service)",
+    re.DOTALL,
+)
+"""Matches what JAX says where another process has ended."""
+PEER_ENDED = "another process of the training, or its host, has ended"
+
+_WHOLE = PartitionSpec()
+_ALONE: ContextVar[bool] = ContextVar("alone", default=False)
+
+
+# -- inside of the learner ---------------------------------------------------------------------------------------------
+
+
+def size() -> int:
+    """Returns the number of processes among which the environments are split."""
+    if _ALONE.get():
+        return 1
+    try:
+        return jax.lax.axis_size(AXIS)
+    except NameError:  # outside of `Processes.compile`
+        return 1
+
+
+def total(tree: PyTree) -> PyTree:
+    """Returns the sums over processes of the leaves of a pytree of one dtype, by a single collective."""
+    if size() == 1:
+        return tree
+    flat, restore = ravel_pytree(tree)
+    return restore(jax.lax.psum(flat, AXIS))
+
+
+def mean(tree: PyTree) -> PyTree:
+    """Returns the means over processes of the leaves of a pytree of floating-point numbers."""
+    return tree if size() == 1 else jax.tree.map(lambda x: x / size(), total(tree))
+
+
+def mean_where(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
+    """Returns the mean of the elements where a mask of the same shape is true, over an axis and processes; else 0."""
+    count = jnp.maximum(total(jnp.sum(mask.astype(jnp.float32), axis)), 1.0)
+    return total(jnp.sum(jnp.where(mask, x, 0.0), axis)) / count
+
+
+def any_of(flag: jax.Array) -> jax.Array:
+    """Returns whether a flag () is true in any process."""
+    return total(flag.astype(jnp.int32)) > 0 if size() > 1 else flag
+
+
+def variance(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
+    """Returns the variance of the elements where a mask is true, over an axis and processes."""
+    return mean_where(jnp.square(x - mean_where(x, mask, axis)), mask, axis)
+
+
+def rows(draw: Callable[[int], jax.Array], count: int) -> jax.Array:
+    """Returns this process's `count` rows of `draw(n)`, which returns those of all processes (n, ...).
+
+    Random numbers drawn so belong to an environment, wherever it is.
+    """
+    if size() == 1:
+        return draw(count)
+    return jax.lax.dynamic_slice_in_dim(draw(count * size()), jax.lax.axis_index(AXIS) * count, count)
+
+
+def normal(key: jax.Array, shape: Sequence[int], dtype: Any) -> jax.Array:
+    """Returns normal random numbers of a shape whose leading axis has an environment in each row; see `rows`."""
+    return rows(lambda n: jax.random.normal(key, (n, *shape[1:]), dtype), shape[0])
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Computes as a single process meanwhile: the same in each of them."""
+    token = _ALONE.set(True)
+    try:
+        yield
+    finally:
+        _ALONE.reset(token)
+
+
+# -- around it ---------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def connected() -> Iterator[None]:
+    """Turns JAX's error of a collective, where another process has ended, into a ConnectionError of one line."""
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # either, by where the collective was called
+        if isinstance(error, InputError) or jax.process_count() == 1 or not PEER.search(str(error)):
+            raise
+        raise ConnectionError(f"{PEER_ENDED}; the same command with --resume goes on") from None
+
+
+def share(name: str, count: int, parts: int) -> int:
+    """Returns a process's share of `count` environments; raises an InputError, naming the setting, for a fraction."""
+    if count % check("parts", parts, PositiveInt):
+        raise InputError(f"{name}: {count} is not allowed; it must be a multiple of the number of processes, {parts}")
+    return count // parts
+
+
+class Processes:
+    """The processes of `jax.distributed` as those of a training; without it, this process alone.
+
+    The learner state is in arrays that span all processes. Each process has its part of it: rows of the arrays that are
+    split, and copies of all others. `own` and `together` convert; a conversion takes about 30 us per array.
+    """
+
+    count: int
+    """Number of processes."""
+    leads: bool
+    """Whether this process writes the files."""
+    whole: PyTree
+    """Shapes of the state of all environments."""
+
+    def __init__(self, own: PyTree, whole: PyTree) -> None:
+        """Takes the shapes of a process's part of the state and of the state of all environments.
+
+        Raises:
+            InputError: unless each of several processes has one device.
+        """
+        self.count, self.leads, self.whole = jax.process_count(), jax.process_index() == 0, whole
+        if self.count > 1 and jax.local_device_count() > 1:
+            raise InputError(f"processes: one has {jax.local_device_count()} devices; it must have one")
+        self._mesh = Mesh(np.array(jax.devices()[: self.count]), (AXIS,))
+        self._specs = jax.tree.map(self._spec, own, whole)
+
+    def stacked(self, shared: PyTree) -> Processes:
+        """Returns those of several states, with a leading axis on all leaves but the shared ones (`Seeds`)."""
+        other = object.__new__(Processes)
+        vars(other).update(vars(self))
+        stack = lambda once, spec: spec if once else PartitionSpec(None, *spec)  # noqa: E731
+        other._specs = jax.tree.map(stack, shared, self._specs)
+        return other
+
+    def compile(self, function: Callable[..., Any], *, start: bool = False, more: bool = False) -> jax.stages.Wrapped:
+        """Returns a compiled function of the state, to be called by all processes.
+
+        Args:
+            function: from the state, or with `start` from a random key, to a state.
+            start: whether it creates the state.
+            more: whether it returns, after the state, something of which each process has a copy.
+        """
+        if self.count == 1:
+            return jax.jit(function)
+        given, result = _WHOLE if start else self._specs, (self._specs, _WHOLE) if more else self._specs
+        inner = _own_empty(function)
+        return jax.jit(jax.shard_map(inner, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False))
+
+    def own(self, state: PyTree) -> PyTree:
+        """Returns this process's part of the state, in arrays of its own."""
+        return state if self.count == 1 else jax.tree.map(self._local, state, self._specs)
+
+    def together(self, own: PyTree) -> PyTree:
+        """Returns the state of which every process gives its part."""
+        return own if self.count == 1 else self._together(own, self._specs)
+
+    def join(self, own: PyTree) -> PyTree:
+        """Returns, on the host, the state of which every process gives its part."""
+
+        def whole(x: Any, spec: PartitionSpec) -> Any:
+            if self.count == 1 or _whole(x, spec):
+                return x
+            return multihost_utils.process_allgather(self._together(x, spec), tiled=True)
+
+        return jax.tree.map(whole, own, self._specs)
+
+    def part(self, state: PyTree) -> PyTree:
+        """Returns this process's part of the state of all environments."""
+        return jax.tree.map(self._rows, state, self._specs)
+
+    def gather(self, numbers: Sequence[int]) -> np.ndarray:
+        """Returns numbers of every process (P, n); called by all of them."""
+        own = np.array(numbers)
+        return own[None] if self.count == 1 else multihost_utils.process_allgather(own)
+
+    def check_equal(self, checked: object) -> None:
+        """Raises an InputError unless the text of an object is that of all processes; called by all of them."""
+        sums = self.gather([zlib.crc32(repr(checked).encode()) >> 1])  # 31 bits
+        if np.any(sums != sums[0]):
+            raise InputError(
+                "run_dir: processes have different settings or see different checkpoints; start the same command on "
+                "all hosts, with a run folder that all of them see"
+            )
+
+    def _spec(self, own: Any, whole: Any) -> PartitionSpec:
+        """Returns how a leaf is split: along the axis that is longer with all environments."""
+        for axis, (few, all_) in enumerate(zip(own.shape, whole.shape, strict=True)):
+            if few * self.count == all_ != few:
+                return PartitionSpec(*[None] * axis, AXIS)
+        return _WHOLE
+
+    def _together(self, state: PyTree, specs: PyTree) -> PyTree:
+        return multihost_utils.host_local_array_to_global_array(state, self._mesh, specs)
+
+    def _local(self, x: jax.Array, spec: PartitionSpec) -> jax.Array:
+        """Returns this process's part of an array of all processes; programs give the whole of an empty one to each."""
+        own = x.addressable_data(0)
+        return self._rows(own, spec) if not x.size and own.shape == x.shape else own
+
+    def _rows(self, x: Any, spec: PartitionSpec) -> Any:
+        if _whole(x, spec):
+            return x
+        axis = spec.index(AXIS)
+        length = x.shape[axis] // self.count
+        return jax.lax.slice_in_dim(x, jax.process_index() * length, (jax.process_index() + 1) * length, axis=axis)
+
+
+def _own_empty(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Returns a function that makes the empty arrays of its argument and of what it closes over.
+
+    There are some for whatever a model does not have; in a program of several processes they crash the compiler of
+    jaxlib 0.11.2.
+    """
+
+    def own(x: Any) -> Any:
+        return x if np.size(x) else jnp.zeros(np.shape(x), x.dtype)
+
+    def call(argument: Any) -> Any:
+        closed, result = jax.make_jaxpr(function, return_shape=True)(argument)
+        evaluate = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, list(map(own, closed.consts))))
+        return jax.tree.unflatten(jax.tree.structure(result), evaluate(*map(own, jax.tree.leaves(argument))))
+
+    return call
+
+
+def _whole(x: Any, spec: PartitionSpec) -> bool:
+    """Returns whether a leaf is not split, or left out (`without_shared`)."""
+    return AXIS not in spec or x.shape == (0,)

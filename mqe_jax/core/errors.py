@@ -1,0 +1,70 @@
+"""Errors that the command line prints as one line, and suggestions of the nearest allowed name."""
+
+from __future__ import annotations
+
+import os
+import reprlib
+import sys
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+
+from mqe_jax.core.limits import SHOWN
+from mqe_jax.core.literal import line
+
+_REPR = reprlib.Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, SHOWN, SHOWN
+_REPR.maxtuple = _REPR.maxlist = _REPR.maxdict = 8
+
+
+class InputError(ValueError):
+    """Invalid user input: arguments, settings or files. The command line prints it as one line, exit code 2.
+
+    Any other exception is a defect of the program and keeps its traceback.
+    """
+
+
+class InUseError(InputError):
+    """A folder that another process has locked."""
+
+
+class NonFiniteError(ArithmeticError):
+    """Training produced NaN or infinite numbers. The command line prints it as one line, exit code 1."""
+
+
+def warn(message: str) -> None:
+    """Warns at the line outside of the package that led to the call."""
+    package, frame, level = f"{Path(__file__).parent}{os.sep}", sys._getframe(), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
+
+
+def one_line(error: BaseException) -> str:
+    """Returns an error's message as one line; that of an OSError is its file and the reason."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return line(f"{error.filename}: {error.strerror}")
+    return line(error)
+
+
+def shown(value: object) -> str:
+    """Returns a value as it is shown in a message: its `repr`, shortened, on one line."""
+    try:
+        text = _REPR.repr(value)
+    except Exception:  # a `repr` of whoever made the value, or an integer of thousands of digits
+        text = f"<{type(value).__name__}>"
+    return brief(" ".join(text.split()))
+
+
+def brief(text: str) -> str:
+    """Returns a text of at most `SHOWN` characters."""
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
+def nearest(word: object, known: Iterable[object]) -> str:
+    """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
+    import difflib  # 10 ms, which a program needs for a message only
+
+    text = word[:SHOWN] if isinstance(word, str) else shown(word)
+    match = difflib.get_close_matches(text, [str(name) for name in known], 1, 0.5)
+    return f" (did you mean {match[0]!r}?)" if match else ""

@@ -1,0 +1,43 @@
+"""Memory that a batch of environments or a rollout would need, compared with what is free before it is allocated."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError
+
+_GIGABYTE = 2**30
+
+
+def bytes_of(tree: Any) -> int:
+    """Returns the bytes of a pytree's arrays, or of their shapes."""
+    return sum(leaf.dtype.itemsize * math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+
+
+def free_memory() -> float:
+    """Returns the free bytes of the device that JAX uses; infinity where that is unknown."""
+    device = jax.local_devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        return stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
+    free = math.inf
+    meminfo, group = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
+    if meminfo.is_file():
+        lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
+        free = 1024.0 * int(lines["MemAvailable"].split()[0])
+    if (group / "memory.max").is_file() and (text := (group / "memory.max").read_text().strip()).isdecimal():
+        free = min(free, int(text) - int((group / "memory.current").read_text()))
+    return free
+
+
+def check_memory(name: str, value: object, needed: float) -> None:
+    """Raises an InputError where a setting needs more bytes than `limits.MEMORY_SHARE` of the free memory."""
+    allowed = limits.MEMORY_SHARE * free_memory()
+    if needed > allowed:
+        limit = f"at most {allowed / _GIGABYTE:.1f} GB may be used"
+        raise InputError(f"{name}: {value} needs {needed / _GIGABYTE:.1f} GB or more; {limit}")

@@ -1,0 +1,432 @@
+"""Typed, validated records of settings, built from keyword arguments, mappings, dotted names or YAML.
+
+A record is a frozen dataclass whose fields carry their types and bounds once, as annotations:
+
+    @record
+    class Ppo:
+        clip: Positive = 0.2
+        \"\"\"Half width of the clipping interval of the ratio.\"\"\"
+
+Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and raises a one-line
+`InputError`: `ppo.clip: -1 is not allowed; it must be greater than 0`.
+
+Every number has bounds: those of its kind (`mqe_jax.core.limits`), or of `Number` and `Integer` for a plain `float` or
+`int`. Booleans are rejected as numbers; numpy scalars and strings such as "7e-4" (which YAML does not read
+as a number) are accepted, bytes are not; "none" means None for an optional field.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import dataclasses
+import functools
+import inspect
+import itertools
+import math
+import os
+import re
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar, dataclass_transform
+
+import pydantic
+import pydantic_core
+from annotated_types import Ge, Le
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError, nearest, shown
+from mqe_jax.core.files import read_yaml
+from mqe_jax.core.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for those who declare records)
+
+T = TypeVar("T")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class FrozenMapping(Mapping[str, Any]):
+    """A mapping in a record, which can be hashed like the record; equal to any mapping with its entries."""
+
+    def __init__(self, values: Mapping[str, Any] = {}) -> None:
+        self._values = dict(values)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self))  # the names: values may be lists
+
+    def __repr__(self) -> str:
+        return repr(self._values)
+
+
+_CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+
+
+def _two(value: Any) -> Any:
+    try:
+        _, _ = value
+    except (TypeError, ValueError):
+        raise ValueError("two numbers (lowest, highest)") from None
+    return value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError("two numbers (lowest, highest), in this order")
+    return value
+
+
+Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered), pydantic.BeforeValidator(_two)]
+Coordinates = Annotated[
+    tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered), pydantic.BeforeValidator(_two)
+]
+
+
+def _parameters(value: Mapping[str, Any]) -> Mapping[str, Any]:
+    for name in ("task", "impl", "num_envs"):
+        if name in value:
+            raise InputError(f"{name}: is not a task parameter, but an argument of its own")
+    return value
+
+
+Parameters = Annotated[Mapping[str, Any], pydantic.AfterValidator(_parameters)]
+"""A task's parameters by name; the control mode may be among them."""
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
+def record(cls: type[T]) -> type[T]:
+    """Makes a class a frozen, keyword-only dataclass that validates its fields.
+
+    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
+    of nested records are prefixed with their path. A subclass of a record must be decorated too.
+    """
+    if cls.__doc__ is None:  # `python -OO`; tyro reads the fields' docstrings from the source too
+        with contextlib.suppress(OSError):  # no source
+            cls.__doc__ = ast.get_docstring(ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0])  # type: ignore
+    hints = typing.get_type_hints(cls, include_extras=True)
+    cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
+    made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
+
+    @functools.wraps(made.__init__)
+    def checked_init(self: Any, /, **values: Any) -> None:
+        try:  # as pydantic's own `__init__`, which has no value named as its argument
+            self.__pydantic_validator__.validate_python(pydantic_core.ArgsKwargs((), values), self_instance=self)
+        except pydantic.ValidationError as error:
+            raise _one_line(made, error) from None
+
+    made.__init__ = checked_init  # pyright: ignore[reportAttributeAccessIssue]
+    return typing.cast(type[T], made)
+
+
+def _path(value: Any) -> Any:
+    if not isinstance(value, str | Path) or not str(value) or not is_text(str(value)):
+        raise ValueError(f"a path, or a text that is not empty, {TEXT}")
+    if any(len(os.fsencode(part)) > limits.FILE_NAME for part in Path(value).parts):
+        raise ValueError(f"a path whose parts have at most {limits.FILE_NAME} bytes")
+    return _expanded(value)
+
+
+def _expanded(value: Any) -> Any:
+    """Returns a text or path with the home folder in place of a `~` at its beginning."""
+    if not isinstance(value, str | Path) or not str(value).startswith("~"):
+        return value
+    expanded = os.path.expanduser(str(value))
+    if str(value).split("/")[0] == "~" and expanded == str(value):
+        raise ValueError("a path without ~, for there is no home folder")
+    return type(value)(expanded)
+
+
+PathText = Annotated[Any, pydantic.AfterValidator(_path)]
+"""A path, or a text that is one."""
+FileName = Annotated[str, pydantic.AfterValidator(_path)]
+"""A text that is a path."""
+
+
+TEXT = f"at most {limits.TEXT} characters, none of which is a control character"
+"""What `is_text` allows."""
+
+
+def is_text(value: str) -> bool:
+    """Returns whether a text can be a name or a path, and be printed."""
+    return len(value) <= limits.TEXT and not any(ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value)
+
+
+def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Makes a function check some of its arguments, as a record checks its fields, each against a type.
+
+    Raises, when the function is called:
+        InputError: naming the argument, its value and what is allowed.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def call(*given: P.args, **named: P.kwargs) -> R:
+            bound = signature.bind(*given, **named)
+            for name, kind in kinds.items():
+                if name in bound.arguments:
+                    bound.arguments[name] = check(name, bound.arguments[name], kind)
+            return function(*bound.args, **bound.kwargs)
+
+        return call
+
+    return decorate
+
+
+def check(name: str, value: Any, kind: Any) -> Any:
+    """Returns a value as a type has it; raises the InputError of `fail` where it is none of the type."""
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
+    try:
+        return _adapter(kind).validate_python(value)
+    except pydantic.ValidationError as error:
+        text = str(_one_line(None, error))
+        raise InputError(f"{name}{text if text.startswith(':') else f'.{text}'}") from None
+
+
+@functools.cache
+def _adapter(kind: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(_lenient(kind), config=_CONFIG)
+
+
+def is_record(kind: object) -> bool:
+    """Returns whether a type (or an instance's type) was made by `record`."""
+    return dataclasses.is_dataclass(kind) and pydantic.dataclasses.is_pydantic_dataclass(
+        kind if isinstance(kind, type) else type(kind)
+    )
+
+
+def fail(name: str, value: object, allowed: str) -> NoReturn:
+    """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must be ...`."""
+    raise InputError(f"{name}: {shown(value)} is not allowed; it must be {allowed}")
+
+
+def build(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Builds a record from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
+
+    Raises:
+        InputError: for a value that is not allowed or an unknown name, with the nearest known one.
+    """
+    if not (isinstance(kind, type) and is_record(kind)):
+        fail("kind", kind, "a class of settings, such as TrainConfig")
+    return kind(**_nested(kind, values))
+
+
+def override(settings: T, changes: Mapping[str, Any]) -> T:
+    """Returns a record with fields replaced, given as in `build`.
+
+    A nested record with a `name` field (a choice among several records) is replaced as a whole where the changes
+    name another one; mappings that are not records are `joined`.
+
+    Raises:
+        InputError: as `build`.
+    """
+    if not is_record(settings):
+        fail("settings", settings, "a record, such as TrainConfig()")
+    return type(settings)(**_merged(settings, _nested(type(settings), changes)))
+
+
+def differences(settings: Any, default: Any) -> dict[str, Any]:
+    """Returns the fields of a record that differ from another of its type, by dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in _fields(settings).items():
+        other = getattr(default, name)
+        if is_record(value) and type(value) is type(other):
+            found |= {f"{name}.{inner}": each for inner, each in differences(value, other).items()}
+        elif value != other:
+            found[name] = value
+    return found
+
+
+def joined(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
+    """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
+
+    InputError where one is nested more than `depth` deep.
+    """
+    both: dict[str, Any] = {}
+    for key, value in (*first.items(), *second.items()):
+        name, dot, rest = str(key).partition(".")
+        value = {rest: value} if dot else value
+        if isinstance(value, Mapping) and not depth:
+            fail(name, value, f"nested at most {limits.DEPTH} deep")
+        both[name] = joined(_fields(both.get(name)), value, depth - 1) if isinstance(value, Mapping) else value
+    return both
+
+
+def to_mapping(settings: Any) -> dict[str, Any]:
+    """Returns a record as nested mappings, lists and scalars that YAML and JSON can represent.
+
+    Raises:
+        InputError: for a value in a mapping that is none of these.
+    """
+
+    def plain(value: Any) -> Any:
+        if hasattr(value, "tolist"):
+            return value.tolist()
+        if isinstance(value, FrozenMapping):
+            return dict(value)
+        fail(type(settings).__name__, value, "a number, a string, true, false, none, or lists and mappings of these")
+
+    return pydantic_core.to_jsonable_python(settings, fallback=plain)
+
+
+def load_yaml(path: str | Path) -> dict[str, Any]:
+    """Reads names and values from a YAML file; an empty file gives an empty mapping.
+
+    Raises:
+        InputError: naming the file, if it cannot be read or is not a mapping.
+    """
+    values = read_yaml(Path(check("path", path, PathText)))
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: holds {type(values).__name__}; it must be a mapping of settings to values")
+    return {str(name): value for name, value in values.items()}
+
+
+def hints_of(kind: Any) -> dict[str, Any]:
+    """Returns the annotated types of a record's fields by name."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+# -- conversion before pydantic's own validation ---------------------------------------------------------------------
+
+
+def _lenient(hint: Any) -> Any:
+    """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as numbers."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated and parts[0] in (int, float):
+        return _bounded(hint)
+    if origin is Annotated:  # pydantic applies the last validators of an annotation first
+        kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
+        return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
+    if origin in (typing.Union, types.UnionType):
+        union = typing.Union[tuple(_lenient(part) for part in parts)]  # noqa: UP007
+        return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
+    if origin is tuple:
+        return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
+    if origin in (Mapping, Sequence, list):
+        made = origin[tuple(map(_lenient, parts))]  # type: ignore[index]
+        return Annotated[made, pydantic.AfterValidator(FrozenMapping)] if origin is Mapping else made
+    if hint in (int, float):
+        return _bounded(Annotated[hint, None])
+    before = {bool: _boolean, str: _text, Path: _text}.get(hint)
+    return hint if before is None else Annotated[hint, pydantic.BeforeValidator(before)]
+
+
+def _bounded(hint: Any) -> Any:
+    """Returns an annotated number with the default bound on a side where it has none."""
+    kind, *parts = typing.get_args(hint)
+    low, high = limits.bounds(hint)
+    default = limits.bounds(limits.Integer if kind is int else limits.Number)
+    parts += [Ge(default[0])] * (low == -math.inf) + [Le(default[1])] * (high == math.inf)
+    return Annotated[(kind, *parts, pydantic.BeforeValidator(functools.partial(_number, kind)))]  # type: ignore
+
+
+def _none(value: Any) -> Any:
+    return None if isinstance(value, str) and value.lower() == "none" else value
+
+
+def _number(kind: type, value: Any) -> Any:
+    if type(value).__name__.startswith(("bool", "byte")):
+        raise ValueError("a number")
+    try:
+        return float(value) if isinstance(value, str) and kind is int else value
+    except ValueError:
+        return value
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, bytes | bytearray) or (isinstance(value, str | Path) and not is_text(str(value))):
+        raise ValueError(f"a text, {TEXT}")
+    return _expanded(value)
+
+
+def _boolean(value: Any) -> bool:
+    if not type(value).__name__.startswith("bool"):  # of Python or numpy
+        raise ValueError("true or false")
+    return bool(value)
+
+
+# -- names and messages ----------------------------------------------------------------------------------------------
+
+
+def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values with dotted names resolved into mappings."""
+    if not isinstance(values, Mapping):
+        fail(kind.__name__, values, "a mapping of names to values")
+    made = joined({}, values)  # which refuses what is nested too deep
+    for name, following in itertools.pairwise(sorted(_names(values))):
+        if name == following:
+            raise InputError(f"{name}: is given twice")
+    return made
+
+
+def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the dotted names of all values that are no mappings."""
+    for key, value in values.items():
+        yield from _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
+
+
+def _fields(value: Any) -> Mapping[str, Any]:
+    """Returns a mapping, or a record as one; empty for another value."""
+    if is_record(value):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return value if isinstance(value, Mapping) else {}
+
+
+def _record_in(hint: Any) -> Any:
+    """Returns the record type within an annotated or optional type, or None."""
+    if is_record(hint):
+        return hint
+    return next((found for part in typing.get_args(hint) if (found := _record_in(part)) is not None), None)
+
+
+def _merged(settings: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a record's fields as keyword arguments, with the changes merged in."""
+    values = dict(_fields(settings))
+    for name, change in changes.items():
+        now = values.get(name)
+        if isinstance(change, Mapping) and is_record(now):
+            renamed = "name" in change and change["name"] != getattr(now, "name", None)
+            change = dict(change) if renamed else _merged(now, change)
+        elif isinstance(change, Mapping) and isinstance(now, Mapping):
+            change = joined(now, change)
+        values[name] = change
+    return values
+
+
+def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
+    """Returns the first error of a validation: path, value, and what is allowed."""
+    first = error.errors(include_url=False)[0]
+    places = [str(part) for part in first["loc"]]
+    value, context = first["input"], first.get("ctx", {})
+    if isinstance(raised := context.get("error"), InputError):
+        return InputError(".".join([*places, str(raised)]))
+    if first["type"] == "unexpected_keyword_argument":
+        for part in places[:-1]:
+            kind = _record_in(hints_of(kind)[part])
+        known = list(hints_of(kind))
+        hint = f"{nearest(places[-1], known)}; allowed: {', '.join(known)}"
+        return InputError(f"{'.'.join(places)}: unknown name (value {shown(value)}){hint}")
+    if first["type"] == "missing":
+        return InputError(f"{'.'.join(places)}: is missing")
+    allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
+    allowed = allowed.replace("a valid tuple", "a list").replace("a valid dictionary", "a mapping of names to values")
+    if first["type"].startswith("dataclass"):
+        allowed = "it must be a mapping of names to values"
+    choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]
+    return InputError(f"{'.'.join(places)}: {shown(value)} is not allowed; {allowed}{nearest(value, choices)}")

@@ -1,0 +1,367 @@
+"""Environment protocol and learner data types."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pydantic
+from jax.core import Tracer
+
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import fail
+
+PyTree = Any
+Params = dict[str, Any]
+"""Nested dict of parameter arrays."""
+Memory = Any
+"""Recurrent state: a pytree of arrays with leading axis N, empty for feed-forward networks."""
+
+
+def _key(value: Any) -> Any:
+    raw = _raw_key(generator())
+    given = (value.shape, value.dtype) if isinstance(value, jax.Array | np.ndarray) else ()
+    if given != (raw.shape, raw.dtype) and not (given[:1] == ((),) and is_typed_key(value)):
+        raise ValueError(
+            f"a random key, such as jax.random.PRNGKey(0); a raw one of {generator()} is {raw.shape} uint32"
+        )
+    return value
+
+
+def generator() -> str:
+    """Returns the name of JAX's generator of random numbers, `jax_default_prng_impl`."""
+    return jax.config.jax_default_prng_impl  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@functools.cache
+def _raw_key(implementation: str) -> Any:
+    """Returns shape and dtype of the raw keys of one of JAX's generators."""
+    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0, impl=implementation)))
+
+
+def _level(value: Any) -> Any:
+    traced, dtype = isinstance(value, Tracer), getattr(value, "dtype", None)
+    number = isinstance(value, int | float) if dtype is None else jnp.issubdtype(dtype, jnp.number)
+    if isinstance(value, bool) or not number or np.shape(value) or not (traced or 0 <= value <= 1):
+        raise ValueError("a number in [0, 1]")
+    return value
+
+
+def _environment(value: Any) -> Any:
+    names = ("name", "num_agents", "action_size", "reset", "step")
+    if isinstance(value, type) or not all(hasattr(value, name) for name in names):
+        raise ValueError("an environment, such as that of mqe_jax.make")
+    return value
+
+
+def _single(value: Any) -> Any:
+    if hasattr(_environment(value), "num_envs"):
+        raise ValueError("one environment, such as that of mqe_jax.make, not a batch")
+    return value
+
+
+def _batch(value: Any) -> Any:
+    if not hasattr(_environment(value), "num_envs"):
+        raise ValueError("a batch of environments, such as VectorEnv(mqe_jax.make(task), 64)")
+    return value
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, type) or not all(hasattr(value, x) for x in ("task", "agents", "act", "initial_memory")):
+        raise ValueError("a policy, such as that of mqe_jax.load_policy")
+    return value
+
+
+def _policy(value: Any) -> Any:
+    whole = all(hasattr(value, name) for name in ("act", "initial_memory"))
+    if isinstance(value, type) or not (whole or callable(value)):
+        raise ValueError("a policy, such as that of mqe_jax.load_policy, or a function act(obs, memory, key)")
+    return value
+
+
+RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
+"""Kind of an argument that is a random key (see `mqe_jax.core.settings.checked`)."""
+Level = Annotated[Any, pydantic.AfterValidator(_level)]
+"""Kind of an argument that is a curriculum level, a number or an array () in [0, 1]."""
+AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]
+"""Kind of an argument that is one environment or a batch."""
+AnySingle = Annotated[Any, pydantic.AfterValidator(_single)]
+"""Kind of an argument that is one environment."""
+AnyBatch = Annotated[Any, pydantic.AfterValidator(_batch)]
+"""Kind of an argument that is a batch of environments."""
+AnyPolicy = Annotated[Any, pydantic.AfterValidator(_whole)]
+"""Kind of an argument that is a policy of a team."""
+PolicyOrAct = Annotated[Any, pydantic.AfterValidator(_policy)]
+"""Kind of an argument that is a policy or its function `act`."""
+
+Teams = tuple[tuple[int, ...], ...]
+"""Agents of each team; every agent belongs to exactly one."""
+
+
+class VectorEnv(Protocol):
+    """N environments of A agents with automatic reset; `reset` and `step` are pure and may be jitted.
+
+    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the environment clips actions, unbounded
+    samples of the policy, to its range. The state is any pytree with these fields: obs (N, A, O) is the input of the
+    next action; privileged_obs (N, P); final_obs (N, A, O) and final_privileged_obs (N, P) belong to the state reached
+    by the step, before any reset, and may be None if the critic does not read them (`NetworkSettings.critic_reads`);
+    reward (N, A); terminated, truncated (N,) bool; outcome, an `Outcome`, counts at the end of an episode; metrics maps
+    names to (N,), which are averaged over steps, except for the counts `diverged` and `overflow`. All names are present
+    from the reset on.
+
+    Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
+    `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
+    which `curriculum.assistance` sets (see `replace_fields`); `state.active` (N, A) bool, the agents that take part: no
+    others enter statistics, losses and results; `state.groups` and `state.final_groups`, further observations by
+    name (N, A, O_g), with `group_sizes`, their lengths. In several processes, `share(parts)` returns the batch of
+    one, whose states are consecutive rows of those of all (`devices.rows`).
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def num_envs(self) -> int: ...
+    @property
+    def num_agents(self) -> int: ...
+    @property
+    def observation_size(self) -> int: ...
+    @property
+    def privileged_observation_size(self) -> int: ...
+    @property
+    def action_size(self) -> int: ...
+    def reset(self, key: jax.Array) -> Any: ...
+    def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
+class Matchmaker(Protocol):
+    """Gives the environments their opponents between updates of the learner state, a `TrainState`; pure.
+
+    `begin(state)` returns the first value of `TrainState.extra`; `seat(state)` gives new environments the opponents
+    that it names; `after(state) -> (state, metrics)` follows an update.
+    """
+
+    def begin(self, state: Any) -> PyTree: ...
+    def seat(self, state: Any) -> Any: ...
+    def after(self, state: Any) -> tuple[Any, dict[str, jax.Array]]: ...
+
+
+def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
+    """Selects rows of two pytrees: condition (N,) bool, leaves (N, ...)."""
+    return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no)
+
+
+def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
+    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
+    return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
+
+
+def replace_fields(state: Any, **fields: jax.Array) -> Any:
+    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or a class with a `replace` method.
+
+    Raises:
+        InputError: for another kind of state.
+    """
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        return dataclasses.replace(state, **fields)
+    for method in ("_replace", "replace"):
+        if hasattr(state, method):
+            return getattr(state, method)(**fields)
+    kind = type(state).__name__
+    raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
+
+
+def check_act(name: str, returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
+    """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its `memory`.
+
+    Raises:
+        InputError: naming the argument that the policy is, for anything else.
+    """
+
+    def shapes(tree: Any) -> Any:
+        return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
+
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        found, expected = f"returns {type(returned).__name__}", "returns (action, memory)"
+    elif shapes(returned[0]) != shapes(jax.ShapeDtypeStruct(shape, jnp.float32)) or is_typed_key(returned[0]):
+        given = getattr(returned[0], "shape", type(returned[0]).__name__)
+        found, expected = f"returns actions {given}", f"returns {shape}"
+    elif shapes(returned[1]) != shapes(memory):
+        found, expected = "changes the structure of its memory", "keeps it"
+    else:
+        return returned[0], returned[1]
+    fail(name, f"a function that {found}", f"one that {expected}")
+
+
+def raw_keys(tree: PyTree) -> PyTree:
+    """Returns a pytree with its typed random keys as numbers, which can be saved."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if is_typed_key(x) else x, tree)
+
+
+def is_typed_key(x: Any) -> bool:
+    """Returns whether an array is a typed random key."""
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def teams_of(env: VectorEnv) -> Teams:
+    """Returns the environment's teams; by default a single team of all agents."""
+    return tuple(map(tuple, getattr(env, "teams", (range(env.num_agents),))))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How an episode ended, for K teams; before its last step, as if it ended there. Any leading axes."""
+
+    success: Any = None
+    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None where there is no such measure."""
+    win: Any = None
+    """Whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss."""
+    draw: Any = None
+    """Whether it was a draw (K,)."""
+    loss: Any = None
+    """Whether each team lost (K,)."""
+    further: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """Further results of each team by name (K,), such as a distance, m."""
+    ending: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """1 for the cause that ended the episode, by name ()."""
+
+    @property
+    def result(self) -> jax.Array:
+        """Win, draw and loss of each team, in the order of `RESULTS` (K, 3)."""
+        return jnp.stack([getattr(self, name) for name in RESULTS], axis=-1)
+
+    def by_team(self, change: Callable[[jax.Array], jax.Array]) -> Outcome:
+        """Returns the outcome with all arrays (..., K) changed."""
+        teams = {name: getattr(self, name) for name in ("success", *RESULTS)}
+        teams = {name: change(x) for name, x in teams.items() if x is not None}
+        return dataclasses.replace(self, **teams, further={name: change(x) for name, x in self.further.items()})
+
+    def named(self) -> dict[str, jax.Array]:
+        """Returns the values by the names under which they are logged: `success`, `team0/win`, `ending/fall`, ..."""
+        values = {} if self.success is None else {"success": self.success[..., 0]}
+        if self.win is None:
+            values |= {f"success/{name}": x[..., 0] for name, x in self.further.items()}
+        else:
+            results = {**{name: getattr(self, name) for name in RESULTS}, **self.further}
+            teams = range(self.win.shape[-1])
+            values |= {f"team{team}/{name}": x[..., team] for team in teams for name, x in results.items()}
+        return values | {f"ending/{name}": x for name, x in self.ending.items()}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """What agents see: the input of a policy. Leading axis N, or none for a single environment."""
+
+    obs: jax.Array
+    """Observations of the group `policy` (N, A, O)."""
+    active: jax.Array | None = None
+    """Which agents take part (N, A) bool; None: all."""
+    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """Observations of further groups by name (N, A, O_g)."""
+
+    def of(self, agents: slice) -> Observations:
+        """Returns what some of the agents see."""
+        cut = lambda x: x[..., agents, :]  # noqa: E731
+        active = None if self.active is None else self.active[..., agents]
+        return Observations(cut(self.obs), active, jax.tree.map(cut, self.groups))
+
+    def group(self, name: str) -> jax.Array:
+        """Returns the observations of a group (N, A, O_g); InputError if they are missing."""
+        if name != "policy" and name not in self.groups:
+            allowed = ", ".join(["policy", *self.groups])
+            raise InputError(f"group: {name!r} is missing in the state; `VectorEnv.with_groups` adds it to {allowed}")
+        return self.obs if name == "policy" else self.groups[name]
+
+    def to(self, policy: Any) -> Any:
+        """Returns the argument of a policy's `act`: these, or an array for a policy that declares no `groups`."""
+        return self if hasattr(policy, "groups") else self.obs
+
+    @classmethod
+    def at(cls, seen: Any) -> Observations:
+        """Returns the observations of an environment's state; an array is that of the group `policy`."""
+        return seen if isinstance(seen, Observations) else cls(seen)
+
+
+def observations(state: Any) -> Observations:
+    """Returns what all agents see in an environment's state."""
+    return Observations(state.obs, getattr(state, "active", None), getattr(state, "groups", {}))
+
+
+RESULTS = ("win", "draw", "loss")
+"""Results of a match for a team."""
+
+
+class Cast(NamedTuple):
+    """The environments of a training, and who else plays in them."""
+
+    env: Any
+    """Environments in which the policy learns."""
+    eval_env: Any = None
+    """Environments of evaluations during training; None without."""
+    league: Matchmaker | None = None
+    """Gives the environments their opponents between updates."""
+    teacher: Any = None
+    """The policy that imitation imitates."""
+
+
+class NetworkMemory(NamedTuple):
+    """Recurrent states of actor and critic; leading axis N."""
+
+    actor: Memory
+    critic: Memory
+
+
+class Transition(NamedTuple):
+    """One step of a rollout; stacked by the scan to a leading axis T."""
+
+    memory: NetworkMemory
+    """Recurrent state before this step, zeroed at an episode's first step."""
+    is_first: jax.Array
+    """Whether the step is the first of its episode (N,) bool."""
+    obs: jax.Array
+    """Observations (N, A, O)."""
+    privileged_obs: jax.Array
+    """Privileged observations (N, P)."""
+    final_obs: jax.Array | None
+    """Observations of the state reached (N, A, O), or None if the critic does not read them."""
+    final_privileged_obs: jax.Array | None
+    """Privileged observations of the state reached (N, P), or None."""
+    action: jax.Array
+    """Actions as sampled: unscaled and unclipped (N, A, D)."""
+    log_prob: jax.Array
+    """Log-probabilities of the actions (N, A, D)."""
+    reward: jax.Array
+    """Rewards (N, A)."""
+    active: jax.Array
+    """Which agents took part (N, A) bool."""
+    terminated: jax.Array
+    """Whether the episode terminated (N,) bool."""
+    done: jax.Array
+    """Whether it was terminated or truncated (N,) bool."""
+
+
+class Batch(NamedTuple):
+    """Chunks of L steps (L, C, ...), with the recurrent state at each chunk's first step (C, ...)."""
+
+    memory: NetworkMemory
+    is_first: jax.Array
+    obs: jax.Array
+    privileged_obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    advantage: jax.Array
+    """Advantages (L, C, V)."""
+    target: jax.Array
+    """Value targets, normalised (L, C, V)."""
+    old_value: jax.Array
+    """Normalised values at collection (L, C, V)."""
+    active: jax.Array
+    """Which agents took part (L, C, A) bool."""
+    teacher_action: Any = ()
+    """Actions of the teacher, unscaled (L, C, A, D); empty without one."""

@@ -1,0 +1,1 @@
+"""Robots, objects, scenes and the engines that simulate them."""

@@ -1,0 +1,132 @@
+"""Visual geoms of the objects, in the frame of their bodies."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD, YELLOW, Color, mixed
+from mqe_jax.physics.appearance.shapes import Kind, add_box, add_rod, add_visual
+
+_PROUD = 0.004  # distance by which details stand out from the collision shape, m
+
+
+def crate(body: Any, half: np.ndarray) -> None:
+    """Adds the beams of a wooden crate about a box of half extents (3,), m."""
+    thick = 0.09 * half.min()
+    for axis in range(3):
+        other, third = (i for i in range(3) if i != axis)
+        for a in (-1, 1):
+            for b in (-1, 1):
+                size, place = np.full(3, thick), np.zeros(3)
+                size[axis] = half[axis] + _PROUD
+                place[[other, third]] = a * (half[other] - thick + _PROUD), b * (half[third] - thick + _PROUD)
+                add_box(body, DARK_WOOD, size, place)
+    brace = float(np.hypot(half[1], half[2])) - 2 * thick
+    for axis in (0, 1):
+        flat = np.array([brace, 0.8 * thick, half[axis] + _PROUD / 2])
+        angle = float(np.arctan2(half[2], half[1 - axis]))
+        # The brace lies in the side's plane: its length turned about the side's normal.
+        quat = _turned(axis, angle)
+        add_box(body, mixed(WOOD, DARK_WOOD, 0.55), flat, (0, 0, 0), quat=quat)
+
+
+def _turned(axis: int, angle: float) -> np.ndarray:
+    """Returns the quaternion of a beam whose length is in the plane normal to `axis` and whose depth is along it."""
+    normal = np.eye(3)[axis]
+    along = np.cos(angle) * np.eye(3)[1 - axis] + np.sin(angle) * np.eye(3)[2]
+    matrix = np.stack([along, np.cross(normal, along), normal], axis=1)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, matrix.ravel())
+    return quat
+
+
+def football(body: Any, radius: float) -> None:
+    """Adds the twelve dark patches of a football."""
+    golden = (1 + np.sqrt(5)) / 2
+    for i in range(3):
+        for a in (-1.0, 1.0):
+            for b in (-golden, golden):
+                point = np.roll([0.0, a, b], i)
+                place = 0.66 * radius * point / np.linalg.norm(point)
+                add_visual(body, Kind.mjGEOM_SPHERE, INK, size=(0.38 * radius, 0, 0), pos=place)
+
+
+def drum(body: Any, radius: float, height: float) -> None:
+    """Adds an upright cylinder like a barrel: staves, two hoops and a lid."""
+    half = height / 2
+    add_visual(body, Kind.mjGEOM_CYLINDER, WOOD, size=(radius, half, 0), pos=(0, 0, half))
+    for z in (0.16 * height, 0.84 * height):
+        add_visual(body, Kind.mjGEOM_CYLINDER, STEEL, size=(radius + 0.006, 0.035, 0), pos=(0, 0, z))
+    lid = mixed(WOOD, WHITE, 0.35)
+    add_visual(body, Kind.mjGEOM_CYLINDER, lid, size=(0.93 * radius, 0.003, 0), pos=(0, 0, height))
+    for y in np.linspace(-0.7, 0.7, 5) * radius:
+        reach = float(np.sqrt((0.93 * radius) ** 2 - y**2))
+        add_box(body, mixed(WOOD, DARK_WOOD, 0.35), (reach, 0.008, 0.004), (0, y, height))
+
+
+def door(body: Any, half: np.ndarray) -> None:
+    """Adds a revolving door of half extents (3,), m: glass in a frame about a post."""
+    x, y, z = half
+    bar = 0.045
+    add_rod(body, STEEL, 0.055, (0, 0, -z), (0, 0, z + 0.03))
+    for side in (-1, 1):
+        add_box(body, GLASS, (0.25 * x, y / 2 - bar, z - bar), (0, side * y / 2, 0))
+        add_box(body, YELLOW, (x, bar, z), (0, side * (y - bar), 0))
+        add_box(body, INK, (1.03 * x, bar, 0.12 * z), (0, side * (y - bar), 0.45 * z))
+        for height in (-1, 1):
+            add_box(body, STEEL, (0.8 * x, y / 2, bar / 1.5), (0, side * y / 2, height * (z - bar / 1.5)))
+
+
+def plank(body: Any, half: np.ndarray, center: float) -> None:
+    """Adds the slats and the edges of a wooden plank of half extents (3,) whose centre is at x `center`, m."""
+    x, y, z = half
+    edges = np.linspace(-x, x, 15)
+    for i, (a, b) in enumerate(itertools.pairwise(edges)):
+        tone = (mixed(WOOD, WHITE, 0.12), WOOD)[i % 2]
+        add_box(body, tone, ((b - a) / 2, y, z + 0.002), (center + (a + b) / 2, 0, 0))
+    for side in (-1, 1):
+        add_box(body, DARK_WOOD, (x, 0.025, z + _PROUD), (center, side * (y - 0.025), 0))
+
+
+def trestle(world: Any, hinge: tuple[float, float, float], half_width: float) -> None:
+    """Adds the posts of a seesaw and its axle to the world; `hinge` is the axle's middle, m."""
+    x, y, z = hinge
+    end = half_width + 0.09
+    add_rod(world, STEEL, 0.04, (x, y - end, z), (x, y + end, z))
+    for side in (-1, 1):
+        for lean in (-0.3, 0.3):
+            add_rod(world, DARK_WOOD, 0.035, (x + lean, y + side * (end - 0.03), 0), (x, y + side * (end - 0.03), z))
+
+
+def column(world: Any, radius: float, top: tuple[float, float, float]) -> None:
+    """Adds a column with a foot and a head from the ground up to the middle of its `top` (3,), m, to the world."""
+    x, y, z = top
+    add_rod(world, STEEL, radius, (x, y, 0), (x, y, z))
+    add_rod(world, INK, 1.6 * radius, (x, y, 0), (x, y, 0.05))
+    add_rod(world, INK, 1.4 * radius, (x, y, z - 0.06), (x, y, z - 0.001))
+
+
+def sheep(body: Any, radius: float, height: float) -> None:
+    """Adds an upright sheep: curls of wool, a dark face with ears, four legs."""
+    wool: Color = (0.97, 0.95, 0.89, 1.0)
+    face: Color = (0.22, 0.19, 0.18, 1.0)
+    middle = 0.62 * height
+    add_visual(body, Kind.mjGEOM_ELLIPSOID, wool, size=(radius, 0.72 * radius, 0.30 * height), pos=(0, 0, middle))
+    for x, count, wide in ((-0.75, 5, 0.52), (-0.25, 7, 0.72), (0.3, 7, 0.70), (0.75, 5, 0.50)):
+        for angle in np.linspace(-0.35, np.pi + 0.35, count):
+            place = (x * radius, wide * radius * np.cos(angle), middle + 0.25 * height * np.sin(angle))
+            add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.31 * radius, 0, 0), pos=place)
+    head = (1.25 * radius, 0, 0.80 * height)
+    add_visual(body, Kind.mjGEOM_ELLIPSOID, face, size=(0.40 * radius, 0.26 * radius, 0.30 * radius), pos=head)
+    add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.27 * radius, 0, 0), pos=(1.08 * radius, 0, 0.92 * height))
+    add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.2 * radius, 0, 0), pos=(-1.2 * radius, 0, 0.7 * height))
+    for side in (-1, 1):
+        place, ear = (1.08 * radius, side * 0.34 * radius, 0.84 * height), np.array([0.1, 0.22, 0.08]) * radius
+        add_visual(body, Kind.mjGEOM_ELLIPSOID, face, size=ear, pos=place)
+        for x in (-0.5 * radius, 0.5 * radius):
+            y = side * 0.35 * radius
+            add_rod(body, face, 0.11 * radius, (x, y, 0.0), (x, y, 0.45 * height))

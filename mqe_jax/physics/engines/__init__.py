@@ -1,0 +1,55 @@
+"""Physics engines behind one protocol, `Engine`, by name; the state is always an `mjx.Data`.
+
+| name (`impl`) | engine | hardware |
+|---|---|---|
+| `warp` | MJX, Warp implementation | NVIDIA GPU (CPU for tests) |
+| `c` | MuJoCo's own C engine on all cores, called through XLA's foreign function interface | CPU |
+| `jax` | MJX, JAX implementation | CPU, GPU, TPU |
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import mujoco
+
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.physics.engines.engine import STATE_FIELDS, Engine
+
+__all__ = ["ENGINES", "STATE_FIELDS", "Engine", "make", "resolve"]
+
+ENGINES: dict[str, str] = {
+    "warp": "mqe_jax.physics.engines.mjx:WarpEngine",
+    "c": "mqe_jax.physics.engines.c:CEngine",
+    "jax": "mqe_jax.physics.engines.mjx:JaxEngine",
+}
+"""Engines by name as MODULE:CLASS, imported on demand: a new one is one line. `auto` is the first that is preferred
+on this machine."""
+
+
+def resolve(impl: str = "auto") -> str:
+    """Returns the name of an engine that this machine can run; `auto` is warp on an NVIDIA GPU, c on a CPU, else jax.
+
+    Raises:
+        InputError: for an unknown engine, or one that this machine cannot run; names what is missing.
+    """
+    allowed = ("auto", *ENGINES)
+    if impl not in allowed:
+        raise InputError(f"impl: unknown engine {impl!r}{nearest(impl, allowed)}; allowed: {', '.join(allowed)}")
+    if impl == "auto":
+        return next(name for name in ENGINES if _load(name).preferred())
+    obstacle = _load(impl).obstacle()
+    if obstacle is not None:
+        raise InputError(f"impl {impl!r} {obstacle}")
+    return impl
+
+
+def make(model: mujoco.MjModel, *, impl: str = "auto", **options: Any) -> Engine:
+    """Creates an engine by name for a compiled model; the options are those of `Engine`; InputError as `resolve`."""
+    return _load(resolve(impl))(model, **options)
+
+
+def _load(name: str) -> type[Engine]:
+    module, _, attribute = ENGINES[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)

@@ -1,0 +1,204 @@
+"""MJX's two implementations: physics steps in a scan, with the motors in each of them."""
+
+from __future__ import annotations
+
+import abc
+import copy
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mqe_jax.physics.engines import private
+from mqe_jax.physics.engines.engine import Engine
+from mqe_jax.physics.robots.index import placed
+from mqe_jax.physics.robots.motors import Motors
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+_BIT, _JACOBIAN = mujoco.mjtDisableBit, mujoco.mjtJacobian
+_FRICTION, _PASSIVE = _BIT.mjDSBL_FRICTIONLOSS, _BIT.mjDSBL_SPRING | _BIT.mjDSBL_DAMPER
+_MAX_DENSE = 50  # degrees of freedom up to which Warp's line search needs no kernels of its own for dense Jacobians
+
+# The model fields of each term of the dynamics; where all are zero, so is the term. Without springs and dampers Warp
+# and MuJoCo compute no passive force at all, so theirs include gravity compensation and adhesion.
+_TERMS: dict[int, tuple[str, ...]] = {
+    _FRICTION: ("dof_frictionloss", "tendon_frictionloss"),
+    _PASSIVE: (
+        *("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
+        *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+        *("actuator_damping", "actuator_dampingpoly", "body_gravcomp", "geom_adhesion", "pair_adhesion"),
+    ),
+}
+
+
+class MjxEngine(Engine):
+    """Base of the engines that are implementations of MJX."""
+
+    mjx_model: mjx.Model
+    """The model on the device."""
+    unroll = 1
+    """Physics steps in one iteration of the loop over them; more compile longer."""
+    last_apart = False
+    """Whether the last physics step is not in the loop, and the others compute no sensors, which nothing reads."""
+
+    @abc.abstractmethod
+    def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+        """Advances by one physics step of `mjx_model`, possibly with other field values.
+
+        Returns:
+            Data, and whether contacts may have been dropped () bool.
+        """
+
+    def unused_terms(self, fields: Collection[str]) -> int:
+        """Returns the disable flags of terms that need no computation where environments override some fields."""
+        return 0
+
+    def advance(
+        self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
+    ) -> tuple[mjx.Data, jax.Array]:
+        ctrl = data.ctrl
+        model = self.mjx_model.replace(**fields) if fields else self.mjx_model
+        model = _disabled(model, self.unused_terms(fields))
+        loop = _disabled(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
+
+        def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
+            data, overflow = self.physics_step(*self._driven(model, carry[0], ctrl))
+            return data, carry[1] | overflow
+
+        carry, length = (data, jnp.zeros((), bool)), num_substeps - self.last_apart
+        carry, _ = jax.lax.scan(lambda carry, _: (substep(loop, carry), None), carry, None, length, unroll=self.unroll)
+        data, overflow = substep(model, carry) if self.last_apart else carry
+        return self._clamped(data.replace(ctrl=ctrl)), overflow
+
+    def _driven(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
+        """Returns model and data for one physics step: the motors' armature and control, and the clamped joints."""
+        motors = self.motors
+        if motors is None:
+            return model, data
+        gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+        ctrl, added = motors.limit(jnp, ctrl, *self._joints(data, motors), gain, bias)
+        armature = model.dof_armature + placed(np.zeros(self.model.nv), motors.joint_qvel, added)
+        return model.replace(dof_armature=armature), self._clamped(data).replace(ctrl=ctrl)
+
+    def _clamped(self, data: mjx.Data) -> mjx.Data:
+        """Returns data with the joint speeds that motors and contacts allow."""
+        motors = self.motors
+        if motors is None:
+            return data
+        position, velocity = self._joints(data, motors)
+        qpos, qvel = placed(data.qpos, motors.joint_qpos, position), placed(data.qvel, motors.joint_qvel, velocity)
+        return data.replace(qpos=qpos, qvel=qvel)
+
+    def _joints(self, data: mjx.Data, motors: Motors) -> tuple[jax.Array, jax.Array]:
+        """Returns clamped joint angles and velocities (J,)."""
+        return motors.clamp(data.qpos[motors.joint_qpos], data.qvel[motors.joint_qvel])
+
+
+class JaxEngine(MjxEngine):
+    """MJX-JAX on CPU, GPU or TPU, with the contacts of the C engine (`mjx_step.py`)."""
+
+    impl = "jax"
+
+    def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
+        super().__init__(model, **options)
+        private.load_mjx()
+        from mqe_jax.physics.engines.mjx_step import MarginStep
+
+        self._step = MarginStep(model)
+        self.mjx_model = self._step.model
+
+    @classmethod
+    def preferred(cls) -> bool:
+        return True
+
+    def blank(self) -> mjx.Data:
+        return private.load_mjx().make_data(self.model, jax.local_devices()[0], impl="jax")
+
+    def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+        """Advances by one physics step; contacts may have been dropped if the capped contact list is full."""
+        data = self._step(model, data)
+        contact = private.contact(data)
+        if len(contact.dist) == self._step.max_contacts:
+            return data, jnp.all(contact.dist < contact.includemargin)
+        return data, jnp.zeros((), bool)
+
+
+class WarpEngine(MjxEngine):
+    """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size.
+
+    It launches each kernel also where it adds zero, so terms that are zero for the whole model are disabled.
+    """
+
+    impl = "warp"
+    unroll = 3
+    last_apart = True
+
+    def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
+        super().__init__(model, **options)
+        self._mjx = private.load_mjx()
+        private.keep_streams()
+        self._model = _with_jacobian(model)
+        device = jax.local_devices()[0]
+        self.mjx_model = private.without_warnings(self._mjx.put_model(self._model, device, impl="warp"))
+
+    @classmethod
+    def preferred(cls) -> bool:
+        kinds = [device.device_kind.lower() for device in jax.devices()]
+        nvidia = any("cuda" in kind or "nvidia" in kind for kind in kinds)
+        return jax.default_backend() == "gpu" and nvidia and private.warp_is_installed()
+
+    @classmethod
+    def obstacle(cls) -> str | None:
+        if private.warp_is_installed():
+            return None
+        return "needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'"
+
+    def holds(self, num_envs: int) -> bool:
+        return num_envs <= self.num_envs
+
+    def blank(self) -> mjx.Data:
+        naconmax = self.num_envs * self.contacts_per_env
+        sizes = {"naconmax": naconmax, "njmax": self.max_constraints_per_env}
+        return self._mjx.make_data(self._model, jax.local_devices()[0], impl="warp", **sizes)
+
+    def unused_terms(self, fields: Collection[str]) -> int:
+        """Returns the disable flags of terms that are zero for the model, and that no field of environments changes."""
+        model, flags = self.model, 0
+        for flag, names in _TERMS.items():
+            if not any(name in fields or np.any(getattr(model, name)) for name in names):
+                flags |= flag
+        # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the actuators' derivatives.
+        fluid = (model.opt.density, model.opt.viscosity, *model.opt.wind)
+        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER or model.nflex or any(fluid):
+            flags &= ~_PASSIVE
+        return flags
+
+    def advance(
+        self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
+    ) -> tuple[mjx.Data, jax.Array]:
+        """Advances by physics steps; the overflow flag is Warp's own, which it sets but never clears."""
+        data, _ = super().advance(private.without_overflow(data), fields, forced, num_substeps)
+        return data, private.overflow(data)
+
+    def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+        return self._mjx.step(model, data), jnp.zeros((), bool)
+
+
+def _with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns the model, or a copy with dense Jacobians where it leaves the choice and they take fewer kernels."""
+    if model.opt.jacobian != _JACOBIAN.mjJAC_AUTO or model.nv > _MAX_DENSE:
+        return model
+    model = copy.copy(model)
+    model.opt.jacobian = _JACOBIAN.mjJAC_DENSE
+    return model
+
+
+def _disabled(model: mjx.Model, disable: int) -> mjx.Model:
+    """Returns the model with further disable flags."""
+    flags = model.opt.disableflags
+    return model.replace(opt=model.opt.replace(disableflags=type(flags)(flags | disable)))

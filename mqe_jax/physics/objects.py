@@ -1,0 +1,311 @@
+"""Scene objects: boxes, balls, sheep, doors, planks, platforms.
+
+An object is a record (`mqe_jax.core.settings`), which a task's parameters may nest, that adds one body to a scene. The
+control laws of scripted NPCs are in `npc`.
+
+Frame: the environment's; metre, kilogram, second, radian, newton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mqe_jax.core.limits import Coordinate, Damping, Distance, Friction, Length, Mass
+from mqe_jax.core.settings import record
+from mqe_jax.physics.appearance import HIDDEN_GROUP, STONE, WOOD, Color, bodies
+from mqe_jax.physics.appearance.shapes import circle
+from mqe_jax.physics.collision import GROUND_BIT, OBJECT_BIT, WALL_BIT
+
+GRAVITY = 9.81  # m/s^2
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Size = tuple[Length, Length, Length]
+_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+# Collides with ground, walls, other objects and robots.
+_FREE = {"contype": OBJECT_BIT, "conaffinity": GROUND_BIT | WALL_BIT | OBJECT_BIT}
+# The same without the ground: bodies whose joints fix their height.
+_HELD = {"contype": OBJECT_BIT, "conaffinity": WALL_BIT | OBJECT_BIT}
+# Supporting surfaces for robots and free objects.
+_FLOOR = {"contype": GROUND_BIT, "conaffinity": 0}
+
+
+class Object:
+    """Base of all objects."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the body `name` to a scene, with its purely visual geoms if `visual`; no actuator, no mocap body."""
+        raise NotImplementedError(f"object {type(self).__name__}: add() is not defined")
+
+
+def add_body(spec: mujoco.MjSpec, name: str, position: Sequence[float], mass: float, inertia: Any) -> Any:
+    """Adds a body at a position (3,), m, of a mass, kg, and principal moments of inertia (3,), kg m^2."""
+    body = spec.worldbody.add_body(name=name, pos=position)
+    body.explicitinertial, body.mass, body.inertia = True, mass, inertia
+    body.ipos = (0, 0, 0)  # if unset, MuJoCo offsets the centre of mass by `position`
+    return body
+
+
+def add_slides(body: Any, axes: str, damping: float = 0.0) -> None:
+    """Adds a slide for each axis, with a damping, N s/m."""
+    for axis in axes:
+        _add_joint(body, axis, _JOINT.mjJNT_SLIDE, damping, axis=_AXES[axis])
+
+
+def add_solid(body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **options: Any) -> None:
+    """Adds the collision geom of a body."""
+    sliding = (friction, 0.005, 0.0001)
+    solid = {"name": body.name, "type": kind, "rgba": color, "friction": sliding, "group": group}
+    body.add_geom(condim=3, priority=1, mass=0.0, **solid, **options)
+
+
+def _add_joint(body: Any, suffix: str, kind: Any, damping: float = 0.0, **options: Any) -> None:
+    body.add_joint(name=f"{body.name}/{suffix}", type=kind, damping=(damping, 0, 0), **options)
+
+
+@record
+class Box(Object):
+    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body)."""
+
+    size: Size = (1.0, 1.0, 1.0)
+    """Full extents, m."""
+    mass: Mass = 6.0
+    """Mass, kg."""
+    friction: Friction = 1.0
+    """Sliding friction; takes precedence over the ground's."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the box."""
+        x, y, z = np.square(self.size)
+        body = add_body(spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
+        _add_joint(body, "free", _JOINT.mjJNT_FREE)
+        half = np.array(self.size) / 2
+        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, self.friction, size=half, **_FREE)
+        if visual:
+            bodies.crate(body, half)
+
+
+@record
+class Ball(Object):
+    """A football with rolling resistance. Coordinates and velocity as in `Box`."""
+
+    radius: Length = 0.1
+    """Radius, m."""
+    mass: Mass = 0.318
+    """Mass, kg."""
+    damping: Damping = 0.1
+    """Linear damping, N s/m."""
+    angular_damping: Damping = 0.0003
+    """Angular damping, N m s/rad."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the ball, a thin shell, on three slides and a ball joint.
+
+        A free joint is unsuitable, because it has a single damping coefficient for all six degrees of freedom.
+        """
+        body = add_body(spec, name, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
+        add_slides(body, "xyz", self.damping)
+        _add_joint(body, "turn", _JOINT.mjJNT_BALL, self.angular_damping)
+        add_solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
+        if visual:
+            bodies.football(body, self.radius)
+
+
+@record
+class Cylinder(Object):
+    """An upright cylinder that slides along y only. Coordinate: y, m; velocity likewise.
+
+    Its collision geom is a capsule whose cylindrical part has the cylinder's height; ground friction is modelled as
+    friction loss of the slide, which needs no contacts.
+    """
+
+    x: Coordinate = 1.6
+    """X of the axis, m."""
+    radius: Length = 1.2
+    """Radius, m."""
+    height: Length = 0.5
+    """Height, m."""
+    mass: Mass = 3.0
+    """Mass, kg."""
+    friction: Friction = 1.0
+    """Sliding friction between cylinder and ground."""
+    reach: Length = 1.8
+    """Maximum |y|, m."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the cylinder."""
+        body = add_body(spec, name, (self.x, 0.0, 0.0), self.mass, (1.0, 1.0, 1.0))
+        _add_joint(
+            body,
+            "y",
+            _JOINT.mjJNT_SLIDE,
+            axis=_AXES["y"],
+            limited=True,
+            range=(-self.reach, self.reach),
+            frictionloss=self.friction * self.mass * GRAVITY,
+        )
+        add_solid(
+            body,
+            _GEOM.mjGEOM_CAPSULE,
+            WOOD,
+            group=HIDDEN_GROUP,
+            size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height),
+            **_HELD,
+        )
+        if visual:
+            bodies.drum(body, self.radius, self.height)
+
+
+@record
+class Door(Object):
+    """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y."""
+
+    position: tuple[Coordinate, Coordinate] = (2.6, 0.0)
+    """Position of the hinge (x, y), m."""
+    size: Size = (0.08, 1.95, 0.8)
+    """Thickness, width and height, m."""
+    mass: Mass = 4.0
+    """Mass, kg."""
+    inertia: Mass = 1.232
+    """Inertia about the hinge, kg m^2."""
+    damping: Damping = 0.5
+    """Damping of the hinge, N m s/rad."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the door."""
+        body = add_body(spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
+        _add_joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
+        half, group = np.array(self.size) / 2, HIDDEN_GROUP if visual else 1
+        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, group=group, size=half, **_HELD)
+        if visual:
+            bodies.door(body, half)
+
+
+@record
+class Seesaw(Object):
+    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative with the near end down."""
+
+    hinge: Vector = (5.6, 0.0, 0.545)
+    """Position of the hinge (x, y, z), m."""
+    size: Size = (4.123, 1.0, 0.03)
+    """Length, width and thickness of the plank, m."""
+    behind: Coordinate = 0.103
+    """Distance of the plank's centre from the hinge, towards the near end, m."""
+    mass: Mass = 100.0
+    """Mass, kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every angle."""
+    inertia: Mass = 100.0
+    """Inertia about the hinge, kg m^2."""
+    limit: Length = 0.254
+    """Maximum |angle|, rad; at the lower limit the near end is on the ground."""
+    damping: Damping = 1000.0
+    """Damping of the hinge, N m s/rad; limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge, turns it
+    at 0.21 rad/s.
+    """
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the plank, and its posts as visual geoms."""
+        body = add_body(spec, name, self.hinge, self.mass, (self.inertia,) * 3)
+        _add_joint(
+            body,
+            "pitch",
+            _JOINT.mjJNT_HINGE,
+            self.damping,
+            axis=_AXES["y"],
+            limited=True,
+            range=(-self.limit, self.limit),
+        )
+        half = np.array(self.size) / 2
+        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
+        if visual:
+            bodies.plank(body, half, -self.behind)
+            bodies.trestle(spec.worldbody, self.hinge, half[1])
+
+
+@record
+class Platform(Object):
+    """A fixed block that supports robots. No coordinates."""
+
+    center: Vector = (0.0, 0.0, 1.0)
+    """Centre of the top face (x, y, z), m."""
+    size: Size = (1.0, 1.0, 1.0)
+    """Full extents, m."""
+    column: Distance = 0.0
+    """Radius of the supporting column, m; none if 0."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the block."""
+        x, y, top = self.center
+        body = spec.worldbody.add_body(name=name, pos=(x, y, top - self.size[2] / 2))
+        add_solid(body, _GEOM.mjGEOM_BOX, STONE, size=np.array(self.size) / 2, **_FLOOR)
+        if not self.column:
+            return
+        foot = top - self.size[2]
+        body.add_geom(
+            name=f"{name}/column",
+            type=_GEOM.mjGEOM_CAPSULE,
+            group=HIDDEN_GROUP,
+            mass=0.0,
+            condim=3,
+            priority=1,
+            contype=WALL_BIT,
+            conaffinity=0,
+            size=(self.column, 0, 0),
+            fromto=(0, 0, -top + self.size[2] / 2, 0, 0, -self.size[2] / 2 - self.column),
+        )
+        if visual:
+            bodies.column(spec.worldbody, self.column, (x, y, foot))
+
+
+@record
+class Ring(Object):
+    """A circle marked on the ground, without collision geoms. No coordinates."""
+
+    center: Vector = (0.0, 0.0, 0.0)
+    """Centre (x, y, z), m."""
+    radius: Length = 1.7
+    """Radius, m."""
+    width: Length = 0.04
+    """Width of the line, m."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the line."""
+        body = spec.worldbody.add_body(name=name, pos=self.center)
+        if not visual:
+            return
+        for part in circle((0.0, 0.0), self.radius, width=self.width):
+            part.add(body)
+
+
+@record
+class Sheep(Object):
+    """An upright sheep that slides over the ground without rotating. Coordinates: x, y; velocity likewise.
+
+    Ground friction is part of `flock`, which needs no contacts.
+    """
+
+    radius: Length = 0.2
+    """Radius, m."""
+    height: Length = 0.5
+    """Height, m."""
+    mass: Mass = 5.0
+    """Mass, kg."""
+
+    def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
+        """Adds the sheep: a capsule whose lower end is below the ground, so that it is cylindrical at ground level."""
+        body = add_body(spec, name, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
+        add_slides(body, "xy")
+        add_solid(
+            body,
+            _GEOM.mjGEOM_CAPSULE,
+            STONE,
+            group=HIDDEN_GROUP if visual else 1,
+            size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height - self.radius),
+            **_HELD,
+        )
+        if visual:
+            bodies.sheep(body, self.radius, self.height)

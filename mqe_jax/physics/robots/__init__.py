@@ -1,0 +1,31 @@
+"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of robots by name."""
+
+from __future__ import annotations
+
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import checked
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.go2 import GO2
+from mqe_jax.physics.robots.robot import Robot
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
+
+
+@checked(name=str)
+def get(name: str) -> Robot:
+    """Returns a robot by name; InputError for an unknown name, with the nearest known one."""
+    if name not in ROBOTS:
+        raise InputError(f"robot: unknown name {name!r}{nearest(name, ROBOTS)}; allowed: {', '.join(ROBOTS)}")
+    return ROBOTS[name]
+
+
+@checked(robot=Robot)
+def register(robot: Robot) -> Robot:
+    """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it.
+
+    Raises:
+        InputError: if another robot has that name.
+    """
+    if ROBOTS.setdefault(robot.name, robot) is not robot:
+        raise InputError(f"robot: the name {robot.name!r} is already registered")
+    return robot

@@ -1,0 +1,225 @@
+"""Index tables of the robots of a compiled scene, their state after a step, and closed-form kinematics of the legs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mqe_jax.physics.robots.robot import JOINT_NAMES, NUM_LEGS, Robot
+from mqe_jax.physics.rotation import quaternion_to_euler, rotate_inverse
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotIndex:
+    """Index tables of the R robots of a compiled model, as host integers."""
+
+    base_qpos: np.ndarray
+    """Addresses of (position 3, quaternion wxyz 4) in qpos (R, 7)."""
+    base_qvel: np.ndarray
+    """Addresses of (linear 3 world, angular 3 body) in qvel (R, 6)."""
+    joint_qpos: np.ndarray
+    """Joint angles in qpos (R, 12)."""
+    joint_qvel: np.ndarray
+    """Joint velocities in qvel (R, 12)."""
+    actuator: np.ndarray
+    """Rows of ctrl (R, 12)."""
+    trunk_body: np.ndarray
+    """Trunk body ids (R,)."""
+    bodies: np.ndarray
+    """All body ids of each robot (R, 13)."""
+    geoms: np.ndarray
+    """Collision geom ids of each robot (R, G)."""
+    trunk_force: np.ndarray
+    """Addresses in sensordata of the strongest contact force on each of the trunk's T collision geoms (R, T, 3),
+    contact frame, N.
+    """
+    foot_force: np.ndarray
+    """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless the scene has foot
+    sensors.
+    """
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots R."""
+        return len(self.trunk_body)
+
+
+def placed(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
+    """Returns the array `base` (n,) with values at addresses, which are host integers of the same shape.
+
+    A GPU computes this together with what precedes and follows it; a scatter takes kernels of its own.
+    """
+    source = np.full(len(base), -1)
+    source[addresses] = np.arange(addresses.size).reshape(addresses.shape)
+    return jnp.where(source < 0, jnp.asarray(base, values.dtype), jnp.ravel(values)[np.maximum(source, 0)])
+
+
+def prefix(number: int) -> str:
+    """Returns the name prefix of robot `number` in a scene."""
+    return f"robot{number}/"
+
+
+def _geom_names(robot: Robot, part: str) -> list[str]:
+    return [name for shape in robot.shapes() if shape.part == part for name in shape.geom_names]
+
+
+def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: bool = False) -> None:
+    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines support."""
+    force_bits, strongest = 1 << 1, 2
+    names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
+    for number in range(num_robots):
+        for name in names:
+            spec.add_sensor(
+                name=f"{prefix(number)}{name}_force",
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                objname=prefix(number) + name,
+                intprm=(force_bits, strongest, 1),
+            )
+
+
+def index_robots(
+    model: mujoco.MjModel, robot: Robot, num_robots: int, *, contacts: str = "full", feet: bool = False
+) -> RobotIndex:
+    """Builds the index tables of a compiled model's robots by looking up names."""
+    numbers = range(num_robots)
+    body_names = ["trunk", *JOINT_NAMES]
+    geom_names = [name for shape in robot.shapes(contacts) for name in shape.geom_names]
+    foot_names = _geom_names(robot, "foot")
+    bases = [model.joint(prefix(i) + "base") for i in numbers]
+
+    def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
+        return np.array([[lookup(prefix(i) + name) for name in names] for i in numbers], np.int32)
+
+    def force(names: Sequence[str]) -> np.ndarray:
+        return table(lambda name: model.sensor(name + "_force").adr[0] + np.arange(3), names)
+
+    return RobotIndex(
+        base_qpos=np.array([base.qposadr[0] + np.arange(7) for base in bases], np.int32),
+        base_qvel=np.array([base.dofadr[0] + np.arange(6) for base in bases], np.int32),
+        joint_qpos=table(lambda name: model.joint(name).qposadr[0], JOINT_NAMES),
+        joint_qvel=table(lambda name: model.joint(name).dofadr[0], JOINT_NAMES),
+        actuator=table(lambda name: model.actuator(name).id, JOINT_NAMES),
+        trunk_body=table(lambda name: model.body(name).id, ["trunk"])[:, 0],
+        bodies=table(lambda name: model.body(name).id, body_names),
+        geoms=table(lambda name: model.geom(name).id, geom_names),
+        trunk_force=force(_geom_names(robot, "trunk")),
+        foot_force=force(foot_names) if feet else np.zeros((0, NUM_LEGS, 3), np.int32),
+    )
+
+
+class Proprioception(NamedTuple):
+    """What a skill senses of one robot."""
+
+    gravity_b: jax.Array
+    """Unit gravity vector in the trunk frame (3,)."""
+    joint_position: jax.Array
+    """Joint angles (12,), rad."""
+    joint_velocity: jax.Array
+    """Joint velocities (12,), rad/s."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RobotState:
+    """Backend-independent robot state after a step (R robots, NPC robots included)."""
+
+    position_w: jax.Array
+    """Trunk origin in the environment frame (R, 3), m."""
+    quaternion: jax.Array
+    """Trunk orientation, wxyz (R, 4)."""
+    linear_velocity_w: jax.Array
+    """Velocity of the trunk origin in the environment frame (R, 3), m/s."""
+    angular_velocity_b: jax.Array
+    """Angular velocity of the trunk in its own frame (R, 3), rad/s."""
+    joint_position: jax.Array
+    """Joint angles (R, 12), rad."""
+    joint_velocity: jax.Array
+    """Joint velocities (R, 12), rad/s."""
+    trunk_force: jax.Array
+    """Strongest contact force on the trunk (R,), N."""
+    active: jax.Array
+    """Robots that take part (R,) bool; the others count nowhere."""
+
+    def count(self, values: jax.Array) -> jax.Array:
+        """Returns values (R',) of the first R' robots, 0 for those that take no part."""
+        return jnp.where(self.active[: len(values)], values, jnp.zeros_like(values))
+
+    @property
+    def euler(self) -> jax.Array:
+        """Roll, pitch, yaw of the trunk (R, 3), rad."""
+        return quaternion_to_euler(self.quaternion)
+
+    @property
+    def base_info(self) -> jax.Array:
+        """Position and roll, pitch, yaw (R, 6): the base information of the paper's observations."""
+        return jnp.concatenate([self.position_w, self.euler], axis=-1)
+
+    @property
+    def projected_gravity(self) -> jax.Array:
+        """Unit gravity vector in the trunk frame (R, 3)."""
+        return rotate_inverse(self.quaternion, jnp.array([0.0, 0.0, -1.0]))
+
+    @property
+    def proprioception(self) -> Proprioception:
+        """What the robots' skills sense, leading axis R."""
+        return Proprioception(self.projected_gravity, self.joint_position, self.joint_velocity)
+
+
+def read_robots(
+    index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array, active: jax.Array | None = None
+) -> RobotState:
+    """Reads all robots from the state vectors of one environment (nq,), (nv,), (nsensordata,).
+
+    `active` (A,) says which of the first robots take part; by default all.
+    """
+    every = jnp.ones(index.num_robots, bool)
+    base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
+    return RobotState(
+        position_w=base[:, :3],
+        quaternion=base[:, 3:],
+        linear_velocity_w=base_velocity[:, :3],
+        angular_velocity_b=base_velocity[:, 3:],
+        joint_position=qpos[index.joint_qpos],
+        joint_velocity=qvel[index.joint_qvel],
+        trunk_force=jnp.max(jnp.linalg.norm(sensordata[index.trunk_force], axis=-1), axis=-1),
+        active=every if active is None else jnp.concatenate([active, every[len(active) :]]),
+    )
+
+
+def foot_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
+    """Computes the feet's centres in the trunk frame (..., 4, 3), m, from joint angles (..., 12), rad."""
+    return _leg_points(robot, joint_position, robot.foot_position)
+
+
+def knee_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
+    """Computes the knees (calf joints) in the trunk frame (..., 4, 3), m, from joint angles (..., 12), rad."""
+    return _leg_points(robot, joint_position, (0.0, 0.0))
+
+
+def _leg_points(robot: Robot, joint_position: jax.Array, point: tuple[float, float]) -> jax.Array:
+    """Computes a point (x, z) of each calf frame, m, in the trunk frame (..., 4, 3), m."""
+    angles = joint_position.reshape(*joint_position.shape[:-1], NUM_LEGS, 3)
+    hip, thigh, calf = jnp.moveaxis(angles, -1, 0)
+    front = jnp.array([1.0, 1.0, -1.0, -1.0])
+    left = jnp.array([1.0, -1.0, 1.0, -1.0])
+    x = -robot.thigh_length * jnp.sin(thigh) + point[1] * jnp.sin(thigh + calf)
+    z = -robot.thigh_length * jnp.cos(thigh) + point[1] * jnp.cos(thigh + calf)
+    if point[0]:
+        x += point[0] * jnp.cos(thigh + calf)
+        z -= point[0] * jnp.sin(thigh + calf)
+    y = left * robot.hip_length
+    return jnp.stack(
+        [
+            front * robot.leg_root[0] + x,
+            left * robot.leg_root[1] + y * jnp.cos(hip) - z * jnp.sin(hip),
+            y * jnp.sin(hip) + z * jnp.cos(hip),
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,229 @@
+"""Motors: the torque and the speed that a robot's joint motors can give.
+
+A motor gives at most its controller's limit L and at most the torque of a DC motor, S (1 - v / V), in the direction of
+its speed v: S is its stall torque, V its speed limit. Above V it brakes, with L at (1 + `BAND`) V. These bounds are
+evaluated at the start of every physics step.
+
+Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So some joints get an
+armature (rotor inertia) for this physics step. In a leg that is fast, or whose torques can carry it far beyond V within
+the step, it is the implicit form of the braking above V. In a joint whose torque line is too steep for the step (the
+calf of the Go2), it is the implicit form of that line, in proportion to the torque; a free joint then moves as by
+backward Euler. What torques, joint limits and contacts still accelerate beyond `CLAMP` V is set to `CLAMP` V, as PhysX
+does with a joint's velocity limit.
+
+The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.index import RobotIndex
+from mqe_jax.physics.robots.robot import Robot
+
+BAND = 0.15  # share of the speed limit above it at which the motor brakes with its full torque
+SLOW, FAST = 0.85, 1.0  # shares of a leg's lowest speed limit at which its armature begins and is complete
+REACH = 1.25  # share of its speed limit that a joint's torques may carry it to within a physics step without armature
+GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
+STEEP = 2.0  # timestep x slope of the torque line / inertia, above which explicit integration of the line is unstable
+CLAMP = 1.09  # greatest share of the speed limit after a physics step
+ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
+
+
+@functools.cache
+def leg_response(robot: Robot) -> np.ndarray:
+    """Returns how strongly torques accelerate a leg's joints in the default pose (3, 3), 1/(kg m^2), as magnitudes."""
+    model = build_robot(robot, 0, visual=False).compile()
+    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data.qpos[7:] = robot.default_joints
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, matrix)
+    return np.abs(np.linalg.inv(matrix)[6:9, 6:9])
+
+
+@dataclasses.dataclass(frozen=True)
+class Motors:
+    """The motors of R robots of one type in a compiled scene, J = 12 R joints."""
+
+    joint_qpos: np.ndarray
+    """Joint angles in qpos (J,)."""
+    joint_qvel: np.ndarray
+    """Joint velocities in qvel (J,)."""
+    speed: np.ndarray
+    """Speed limits V (J,), rad/s."""
+    torque: np.ndarray
+    """Torque limits of the controller L (J,), N m."""
+    stall: np.ndarray
+    """Stall torques S (J,), N m."""
+    response: np.ndarray
+    """Accelerations of a leg's joints per torque (3, 3), 1/(kg m^2)."""
+    timestep: float
+    """Physics step, s."""
+
+    @classmethod
+    def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> Motors:
+        """Returns the motors of all robots of a scene, whose actuators are in the order of the robots' joints."""
+        assert np.array_equal(index.actuator.ravel(), np.arange(index.actuator.size))
+        per_joint = lambda values: np.tile(values, index.num_robots).astype(np.float32)  # noqa: E731
+        return cls(
+            joint_qpos=index.joint_qpos.ravel(),
+            joint_qvel=index.joint_qvel.ravel(),
+            speed=per_joint(robot.joint_speed_limit),
+            torque=per_joint(robot.torque_limit),
+            stall=per_joint(robot.stall_torque),
+            response=leg_response(robot).astype(np.float32),
+            timestep=timestep,
+        )
+
+    def limit(self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> tuple[Any, Any]:
+        """Returns the control and the armature of one physics step.
+
+        Args:
+            xp: numpy or jax.numpy.
+            ctrl: control (..., J), rad or N m.
+            position: joint angles (..., J), rad.
+            velocity: joint velocities (..., J), rad/s.
+            gain: of the actuators (..., J): force = gain x ctrl + bias.
+            bias: constant, position and velocity coefficients (..., J, 3).
+
+        Returns:
+            control under which the actuators' forces are the motors' torques (..., J), equal to `ctrl` where the motors
+            can give what is asked, and armature (..., J), kg m^2.
+        """
+        pace = xp.abs(velocity)
+        below = self.speed - pace
+        most = xp.minimum(xp.minimum(self._line * below, self._brake * below), self.torque)  # in the direction of v
+        most = xp.maximum(most, -self.torque)
+        sign = xp.where(velocity < 0, np.float32(-1.0), np.float32(1.0))
+        force = _force(ctrl, position, velocity, gain, bias)
+        given = sign * xp.minimum(xp.maximum(sign * force, -self.torque), most)
+        ctrl = ctrl + (given - force) / xp.where(gain == 0, 1, gain)
+        return ctrl, self._armature(xp, pace, xp.abs(given), given * sign < 0)
+
+    def idle(self, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> np.ndarray:
+        """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no armature (...,) bool.
+
+        This takes less time than `limit`. The torques' magnitudes must be at most L and S (1 - |v| / V), which the
+        bounds of `limit` allow in either direction, and speeds below those at which armature begins, by a margin for
+        rounding. Braking with more than S (1 - |v| / V) has no effect in `limit` either, but fails here. So do numbers
+        that are not finite.
+        """
+        pace = np.abs(velocity)
+        effort = np.abs(_force(ctrl, position, velocity, gain, bias))
+        idle = effort <= np.minimum(self._light * (self.speed - pace), self.torque)
+        idle &= pace <= self._slow
+        pace += self._kick(np, effort)
+        idle &= pace <= self._near
+        return idle.all(axis=-1)
+
+    def _kick(self, xp: Any, effort: Any) -> Any:
+        """Returns the speeds (..., J), rad/s, that torques of magnitude `effort` can add in a physics step."""
+        size = len(self.response)
+        legs, added = effort.reshape(-1, size), self.timestep * self.response
+        if xp is np:
+            return (legs @ added).reshape(effort.shape)
+        # A GPU computes sums of products together with what precedes and follows them, a matrix product on its own.
+        total = legs[:, :1] * added[0]
+        for i in range(1, size):
+            total += legs[:, i : i + 1] * added[i]
+        return total.reshape(effort.shape)
+
+    def _armature(self, xp: Any, pace: Any, effort: Any, against: Any) -> Any:
+        """Returns the armature (..., J), kg m^2.
+
+        Args:
+            xp: numpy or jax.numpy.
+            pace: magnitudes of the speeds (..., J), rad/s.
+            effort: magnitudes of the torques (..., J), N m.
+            against: whether a torque is against its speed (..., J).
+        """
+        size = len(self.response)
+        fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
+        near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
+        reach = (pace + self._kick(xp, effort)) / self.speed
+        if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
+            return np.zeros_like(pace)
+        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH).astype(np.float32)
+        if self._steep.any():
+            line = self._line * (self.speed + xp.where(against, pace, -pace))
+            share = xp.minimum(effort / xp.maximum(line, ROUNDING), 1.0)  # of the line's torque
+            implicit = share * (self._inertia + self.timestep * self._line) - self._inertia
+            needed = xp.where(self._steep, xp.maximum(implicit, 0.0), needed)
+        return xp.maximum(xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1) * self._full, needed)
+
+    @functools.cached_property
+    def fastest(self) -> np.ndarray:
+        """Greatest speeds after a physics step (..., J), rad/s."""
+        return np.float32(CLAMP) * self.speed
+
+    @functools.cached_property
+    def _line(self) -> np.ndarray:
+        """Slope of the torque line (..., J), N m s; smaller than `_brake`."""
+        return self.stall / self.speed
+
+    @functools.cached_property
+    def _inertia(self) -> np.ndarray:
+        """Inertia of each joint in a free leg (..., J), kg m^2."""
+        return np.tile(1.0 / np.diag(self.response), self._leg_speed.shape)
+
+    @functools.cached_property
+    def _steep(self) -> np.ndarray:
+        """Joints whose torque line is too steep for explicit integration (..., J) bool."""
+        return self.timestep * self._line > STEEP * self._inertia
+
+    @functools.cached_property
+    def _light(self) -> np.ndarray:
+        """Slope of the torques without armature (..., J), N m s; less than `_line` where that is steep."""
+        share = self._inertia / (self._inertia + self.timestep * self._line)
+        return np.where(self._steep, np.float32(1.0 - ROUNDING) * share, np.float32(1.0)) * self._line
+
+    @functools.cached_property
+    def _brake(self) -> np.ndarray:
+        """Slope of the braking torque (..., J), N m s."""
+        return self.torque / (BAND * self.speed)
+
+    @functools.cached_property
+    def _full(self) -> np.ndarray:
+        """Complete armature (..., J), kg m^2."""
+        return self.timestep * self._brake
+
+    @functools.cached_property
+    def _needed(self) -> np.ndarray:
+        """Armature per share of the speed limit beyond it (..., J), kg m^2."""
+        return np.float32(GAIN) * self._inertia
+
+    @functools.cached_property
+    def _leg_speed(self) -> np.ndarray:
+        """Lowest speed limit of each leg (..., J / 3), rad/s."""
+        return self.speed.reshape(*self.speed.shape[:-1], -1, len(self.response)).min(axis=-1)
+
+    @functools.cached_property
+    def _slow(self) -> np.ndarray:
+        """Speeds (..., J), rad/s, below which a leg has no armature for its speed."""
+        return np.float32((1.0 - ROUNDING) * SLOW) * np.repeat(self._leg_speed, len(self.response), axis=-1)
+
+    @functools.cached_property
+    def _near(self) -> np.ndarray:
+        """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry it further."""
+        return np.float32((1.0 - ROUNDING) * REACH) * np.where(self._steep, np.float32(np.inf), self.speed)
+
+    def repeated(self, count: int) -> Motors:
+        """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""
+        rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
+        return dataclasses.replace(self, **rows)
+
+    def clamp(self, position: Any, velocity: Any) -> tuple[Any, Any]:
+        """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `fastest`."""
+        clamped = velocity.clip(-self.fastest, self.fastest)
+        return position - self.timestep * (velocity - clamped), clamped
+
+
+def _force(ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> Any:
+    """Returns the forces (..., J), N m, that actuators give without limits; the arguments are those of `limit`."""
+    return gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity

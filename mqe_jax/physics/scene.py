@@ -1,0 +1,216 @@
+"""A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index tables."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mqe_jax.core.errors import InputError, one_line
+from mqe_jax.physics import robots
+from mqe_jax.physics.appearance.grounds import add_light
+from mqe_jax.physics.collision import MAX_ROBOTS
+from mqe_jax.physics.objects import Object
+from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.index import RobotIndex, add_sensors, index_robots, prefix
+from mqe_jax.physics.robots.motors import Motors
+from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.terrain import Layout, Track, build_terrain
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A scene to compile."""
+
+    track: Track
+    """Ground, walls and spawn poses."""
+    num_robots: int = 2
+    """Number of robots R."""
+    robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
+    """Robot type shared by all R robots."""
+    contacts: str = "full"
+    """Set of the robots' collision geoms, one of `mqe_jax.physics.robots.robot.CONTACTS`."""
+    objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
+    """Movable and fixed objects by name, added after the robots as bodies `object/<name>`."""
+    colors: tuple[int, ...] = ()
+    """Colours of the robots, as indices of `mqe_jax.physics.appearance.ROBOT_COLORS`; in order if empty."""
+    friction: float = 1.0
+    """Sliding friction of the robots' collision geoms and the ground."""
+    torque_robots: int = 0
+    """Number of robots, the first ones, whose actuators take torques (N m), not PD joint targets (rad)."""
+    joint_mechanics: bool = False
+    """Whether the robots' joints have rotor inertia, damping and dry friction."""
+    foot_sensors: bool = False
+    """Whether to add contact force sensors to the feet."""
+    timestep: float = 0.005
+    """Physics step, s."""
+    solver_iterations: int = 4
+    """Maximum Newton iterations per physics step."""
+    line_search_iterations: int = 8
+    """Maximum line search steps per iteration."""
+    max_contacts: int = 32
+    """Maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX allocates constraints for
+    every candidate geom pair, which halves CPU throughput. The other engines keep all.
+    """
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.num_robots <= MAX_ROBOTS:
+            raise InputError(f"Scene.num_robots: {self.num_robots} must be between 1 and {MAX_ROBOTS}")
+        if self.colors and len(self.colors) != self.num_robots:
+            raise InputError(
+                f"Scene.colors: {self.colors} must have one colour for each of the {self.num_robots} robots"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectIndex:
+    """Addresses of one object in a compiled model; host integers."""
+
+    qpos: np.ndarray
+    """Addresses of its coordinates in qpos (C,)."""
+    qvel: np.ndarray
+    """Addresses of its velocities in qvel (V,)."""
+    body: int
+    """Body id."""
+    geom: int
+    """Id of its collision geom, -1 if it has none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CompiledScene:
+    """A compiled scene."""
+
+    scene: Scene
+    """Source scene."""
+    model: mujoco.MjModel
+    """Model for the physics, without visual geoms."""
+    index: RobotIndex
+    """Index tables of the robots."""
+    objects: Mapping[str, ObjectIndex]
+    """Index tables of the objects, by name."""
+    layout: Layout
+    """The track's walls, anchors and spawn poses."""
+    motors: Motors
+    """Motors of the robots."""
+    mocap_offset: np.ndarray
+    """Offset of each moving wall from its anchor (W, 3), m; the anchor's z is 0."""
+    mocap_anchor: np.ndarray
+    """Anchor of each moving wall (W,)."""
+
+    @property
+    def anchor_mean(self) -> np.ndarray:
+        """Mean anchor positions (G, 2), m."""
+        return np.array([anchor.position for anchor in self.layout.anchors]).reshape(-1, 2)
+
+    @property
+    def anchor_spread(self) -> np.ndarray:
+        """Half-widths of the anchors' ranges (G, 2), m."""
+        return np.array([anchor.spread for anchor in self.layout.anchors]).reshape(-1, 2)
+
+    def sample_anchors(self, key: jax.Array) -> jax.Array:
+        """Samples the anchors' positions (G, 2), m."""
+        mean, spread = self.anchor_mean, self.anchor_spread
+        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
+
+    def wall_positions(self, anchors: jax.Array) -> jax.Array:
+        """Places the moving walls (W, 3) around anchors (G, 2), m: values for `mocap_pos`."""
+        if not len(self.mocap_anchor):
+            return jnp.zeros((0, 3))
+        return jnp.pad(anchors, ((0, 0), (0, 1)))[self.mocap_anchor] + self.mocap_offset
+
+
+def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
+    """Compiles a scene, with or without visual geoms; InputError where MuJoCo rejects it."""
+    spec, layout = build_spec(scene, visual=visual)
+    try:
+        return spec.compile(), layout
+    except ValueError as error:
+        raise InputError(f"scene: MuJoCo rejects it ({one_line(error)})") from None
+
+
+def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
+    """Builds a scene's specification, with or without visual geoms."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = scene.timestep
+    spec.option.iterations = scene.solver_iterations
+    spec.option.ls_iterations = scene.line_search_iterations
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # Without islands the C engine's solver iterates over the whole scene, as MJX does, and the engines agree.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_ISLAND
+    spec.add_numeric(name="max_contact_points", size=1, data=[scene.max_contacts])
+    layout = build_terrain(spec, scene.track, visual=visual)
+    for number in range(scene.num_robots):
+        body = build_robot(
+            scene.robot,
+            number,
+            contacts=scene.contacts,
+            visual=visual,
+            friction=scene.friction,
+            torque_control=number < scene.torque_robots,
+            joint_mechanics=scene.joint_mechanics,
+            color=scene.colors[number] if scene.colors else number,
+        )
+        spec.attach(body, prefix=prefix(number), frame=spec.worldbody.add_frame())
+    for name, item in scene.objects.items():
+        _add_object(spec, name, item, visual)
+    add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
+    if visual:
+        add_light(spec, (scene.track.length / 2, 0, 8))
+    return spec, layout
+
+
+def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> None:
+    """Adds an object, which may bring bodies, geoms, joints, sensors, tendons and equality constraints."""
+
+    def fixed() -> dict[str, float]:
+        mocap = sum(body.mocap for body in spec.bodies)
+        return {"actuators": len(spec.actuators), "mocap bodies": mocap, "timestep": spec.option.timestep}
+
+    what, before = f"objects: {name}: {type(item).__name__}.add()", fixed()
+    item.add(spec, f"object/{name}", visual)
+    for key, value in fixed().items():
+        if value != before[key]:
+            raise InputError(f"{what} changes the scene's {key} from {before[key]:g} to {value:g}; it must not")
+    if spec.body(f"object/{name}") is None:
+        raise InputError(f"{what} adds no body 'object/{name}'; it must")
+
+
+def compile_scene(scene: Scene) -> CompiledScene:
+    """Compiles a scene for the physics and indexes it by name."""
+    model, layout = build_model(scene, visual=False)
+    moving = [wall for wall in layout.walls if wall.anchor is not None]
+    index = index_robots(model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors)
+    return CompiledScene(
+        scene=scene,
+        model=model,
+        index=index,
+        motors=Motors.of(scene.robot, index, scene.timestep),
+        objects=_index_objects(model, scene.objects),
+        layout=layout,
+        mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),
+        mocap_anchor=np.array([wall.anchor for wall in moving], np.int32),
+    )
+
+
+def _index_objects(model: mujoco.MjModel, names: Iterable[str]) -> Mapping[str, ObjectIndex]:
+    """Looks up the addresses of all objects of a compiled model by name."""
+    found = {}
+    for name in names:
+        body = model.body(f"object/{name}")
+        joints = range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]) if body.jntnum[0] else ()
+        widths = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+        qpos, qvel = [], []
+        for joint in joints:
+            coordinates, speeds = widths.get(mujoco.mjtJoint(model.jnt_type[joint]), (1, 1))
+            qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
+            qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
+        as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"object/{name}")
+        found[name] = ObjectIndex(as_int(qpos), as_int(qvel), int(body.id), geom)
+    return found

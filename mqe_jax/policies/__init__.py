@@ -1,0 +1,247 @@
+"""Policies by name: `load_policy` turns a name, a run folder or a policy file into a policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, overload
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.core import devices
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import PathText, check, checked, override
+from mqe_jax.core.types import AnyEnvironment, AnyPolicy, Memory, Observations, PolicyOrAct, RandomKey
+from mqe_jax.envs import QuadrupedEnv, TaskParams
+from mqe_jax.envs.registry import NAMED_PLANNERS
+from mqe_jax.policies import zoo
+from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, groups_of, read_policy
+
+NAMES = ("scripted", "random", "idle", "forward")
+"""Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
+
+_FORWARD = 0.25
+"""The first action of `forward`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SimplePolicy:
+    """A policy without parameters and recurrent state."""
+
+    task: str
+    """Id of the task."""
+    agents: int
+    """Number of agents of the team."""
+    plan: Callable[[jax.Array, jax.Array], jax.Array] = dataclasses.field(repr=False)
+    """Observations (N, A, O) and a key to actions (N, A, D)."""
+    name: str = ""
+    """The name by which `load_policy` knows it; empty for another one."""
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns an empty recurrent state."""
+        return ()
+
+    @single
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions; see `Policy`."""
+        obs = check_obs(Observations.at(obs).obs, self.agents)
+        return self.plan(obs, check("key", key, RandomKey)), memory
+
+
+@dataclasses.dataclass(frozen=True)
+class BothTeams:
+    """The policies of a match's two teams, as one policy for the agents of both."""
+
+    first: Policy
+    """Policy of team 0."""
+    second: Policy
+    """Policy of team 1."""
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self.first.task
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of both teams."""
+        return self.first.agents + self.second.agents
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of observations that both see."""
+        return tuple(groups_of(self.first, self.second))
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns the initial recurrent states of both."""
+        return self.first.initial_memory(num_envs), self.second.initial_memory(num_envs)
+
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions of all agents; see `Policy`."""
+        keys, size, seen = jax.random.split(key), self.first.agents, Observations.at(obs)
+        first, first_memory = self.first.act(seen.of(slice(size)).to(self.first), memory[0], keys[0])
+        others = seen.of(slice(size, None)).to(self.second)
+        second, second_memory = self.second.act(others, memory[1], keys[1])
+        return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
+
+
+@overload
+def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
+@overload
+def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy: ...
+@checked(source=PathText, env=AnyEnvironment | None, deterministic=bool)
+def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False) -> Policy:
+    """Returns the policy of a name, a run folder or a policy file.
+
+    Args:
+        source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy
+            (`mqe_jax.policies.zoo`), or a path; a folder with one of these names is given as ./NAME.
+        env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
+        deterministic: whether a trained policy acts with its mean actions; it does so too where its file or the card
+            of a shipped one declares it.
+
+    Returns:
+        A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.
+
+    Raises:
+        InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
+            scripted policy.
+    """
+    env = getattr(env, "env", env)  # of a batch
+    further = () if env is None else tuple(NAMED_PLANNERS.get(env.name, ()))
+    if str(source) in (*NAMES, *further):
+        if env is None:
+            raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
+        return SimplePolicy(env.name, len(env.teams[0]), _plan(str(source), env), str(source))
+    if str(source) in zoo.names():
+        policy = zoo.load(str(source))
+    elif not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
+        hint = nearest(str(source), (*NAMES, *further, *zoo.names()))
+        allowed = f"{', '.join((*NAMES, *further, *zoo.names()))}, a run folder, or a policy file"
+        raise InputError(f"policy: unknown {str(source)!r}{hint}; allowed: {allowed}")
+    else:
+        policy = read_policy(source)
+    policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
+    if env is not None:
+        check_policy(policy, env, str(source))
+    return policy
+
+
+def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
+    """Returns the policy of a setting or argument, which errors name: a policy, its `act`, or what `load_policy` takes.
+
+    A function has no recurrent state, and acts for one team.
+    """
+    try:
+        if isinstance(source, str | Path):
+            policy: Any = load_policy(source, env, deterministic=deterministic)
+        else:
+            policy = check("policy", source, PolicyOrAct)
+            if hasattr(policy, "task"):
+                check_policy(policy, env, repr(policy))
+            if isinstance(policy, TrainedPolicy):
+                policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
+    except InputError as error:
+        optional = ", or none" if "." in field else ""
+        raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
+    act: Any = policy
+    if not hasattr(act, "act"):
+        return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: act(obs, (), key)[0])
+    return policy
+
+
+def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
+    """Checks that a policy is of one team of this task; a trained one, that its sizes and `actions_of` are the task's.
+
+    `env` is the task, or a batch of it. Settings without a task do not tell what the actions of a policy mean.
+
+    Raises:
+        InputError: naming both tasks, numbers of agents, parameters, or sizes.
+    """
+    check("policy", policy, AnyPolicy)
+    if policy.task != env.name:
+        raise InputError(f"policy: {name} was trained on {policy.task or 'no named task'}, not on {env.name}")
+    if policy.agents != len(env.teams[0]):
+        raise InputError(
+            f"policy: {name} acts for {policy.agents} agents; a team of {env.name} has {len(env.teams[0])}"
+        )
+    if not isinstance(policy, TrainedPolicy):
+        return
+    task = getattr(env, "env", env)
+    if policy.config.task is not None and isinstance(task, QuadrupedEnv):
+        given, ours = policy.config.training_env, actions_of(task.control, task.params)
+        read = {field.name: given[field.name] for field in dataclasses.fields(TaskParams) if field.name in given}
+        theirs = actions_of(given.get("control", "command"), override(task.Params(), read))
+        for field, value in theirs.items():
+            if value != ours[field]:
+                here = f"{env.name} has {ours[field]!r} here"
+                raise InputError(f"policy: {name} was trained with {field} {value!r}; {here}")
+    group, layouts = policy.config.group, {"policy": None, **getattr(task, "groups", {})}
+    if group not in layouts:
+        raise InputError(f"policy: {name} sees the group {group!r}; {env.name} has {', '.join(layouts)}")
+    seen = env.observation_size if group == "policy" else layouts[group].size
+    sizes = (len(env.teams[0]), seen, env.action_size)
+    trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
+    if sizes != trained:
+        raise InputError(
+            f"policy: {name} was trained with (agents, observation, action) {trained}, but {env.name} has {sizes} here"
+        )
+
+
+def actions_of(control: str, params: TaskParams) -> dict[str, Any]:
+    """Returns what an agent's actions mean in a control mode: the mode, the robot, and the task parameters it reads."""
+    read = {"command": ("skill", "commands", "command_ranges"), "position": ("position_scale",)}.get(control, ())
+    return {"control": control, **{name: getattr(params, name) for name in ("robot", *read)}}
+
+
+def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:
+    """Returns the policy of all agents of a task: of a match, that of both teams; without opponent, team 1 is idle.
+
+    Raises:
+        InputError: for an opponent in a task that is not a match.
+    """
+    if len(env.teams) < 2:
+        if opponent is not None:
+            raise InputError(f"opponent: {env.name} is not a competitive task; omit the opponent")
+        return policy
+    return BothTeams(policy, opponent or load_policy("idle", env))
+
+
+def _plan(name: str, env: QuadrupedEnv) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Returns the function of observations (N, A, O) and a key that is the policy of a name; it can be pickled."""
+    if name not in NAMES or name == "scripted":
+        return _scripted(env, name)
+    shape = (len(env.teams[0]), env.action_size)
+    if name == "random":
+        return functools.partial(_uniform, shape)
+    return functools.partial(_constant, shape, _FORWARD if name == "forward" else 0.0)
+
+
+def _uniform(shape: tuple[int, ...], obs: jax.Array, key: jax.Array) -> jax.Array:
+    return devices.rows(lambda n: jax.random.uniform(key, (n, *shape), minval=-1.0, maxval=1.0), len(obs))
+
+
+def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Array) -> jax.Array:
+    return jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
+
+
+def _planned(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
+    return env.controller.rescaled(jax.vmap(scripted_policy(env, name))(obs))
+
+
+def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Returns a scripted policy of the task for a batch: observations (N, A, O) and a key to actions (N, A, 3)."""
+    scripted_policy(env, name)  # which raises where there is none
+    if env.control != "command":
+        raise InputError(
+            f"policy: {name!r} outputs walk commands; control is {env.control!r}, use another, such as random"
+        )
+    if tuple(env.params.commands) != TaskParams.commands:
+        raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")
+    return functools.partial(_planned, env, name)

@@ -1,0 +1,63 @@
+"""Scripted policies (`--policy scripted`), one per task, acting like learned ones, and their steering."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import checked
+from mqe_jax.core.types import AnySingle
+from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.envs.registry import NAMED_PLANNERS, PLANNERS, Planner, load
+
+# The blocks (A, width) of one environment's observations by name.
+Observation = Mapping[str, jax.Array]
+
+GAIN = 1.5  # 1/s, commanded speed per distance from the goal
+
+
+def planner_of(task: str, name: str = "scripted") -> Planner:
+    """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its actions (A, 3).
+
+    Raises:
+        InputError: if the task has none of this name.
+    """
+    planner = PLANNERS.get(task) if name == "scripted" else NAMED_PLANNERS.get(task, {}).get(name)
+    if planner is None:
+        raise InputError(f"policy: {task} has no {name} policy; allowed for: {', '.join(PLANNERS)}")
+    return load("mqe_jax.policies.scripted", planner) if isinstance(planner, str) else planner
+
+
+@checked(env=AnySingle, name=str)
+def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
+    """Returns the scripted policy of a task, from the observations (A, O) of one team to its actions (A, 3).
+
+    Raises:
+        InputError: if the task has none of this name.
+    """
+    plan, layout = planner_of(env.name, name), env.observation_layout
+    return lambda obs: plan(layout.split(obs))
+
+
+def pose(base: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns x, y (A, 2), m, and yaw (A,), rad, from base information (A, 6)."""
+    return base[:, :2], base[:, 5]
+
+
+def go_to(position: jax.Array, yaw: jax.Array, goal: jax.Array, heading: jax.Array | float = 0.0) -> jax.Array:
+    """Returns the actions (A, 3) that steer robots to goal positions and a heading.
+
+    Args:
+        position: of the robots (A, 2), m.
+        yaw: of the robots (A,), rad.
+        goal: (A, 2), m.
+        heading: goal yaw, rad, environment frame.
+    """
+    apart = GAIN * (goal - position)
+    along = jnp.cos(yaw) * apart[:, 0] + jnp.sin(yaw) * apart[:, 1]
+    left = -jnp.sin(yaw) * apart[:, 0] + jnp.cos(yaw) * apart[:, 1]
+    turn = jnp.arctan2(jnp.sin(heading - yaw), jnp.cos(heading - yaw))
+    return jnp.clip(jnp.stack([along / 2.0, left / 0.5, turn / 0.5], axis=-1), -1.0, 1.0)

@@ -1,0 +1,119 @@
+"""Scripted policies of the cooperative tasks but football: Narrow Gate, Climb on Seesaw, Sheep Dog, Push Box."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.policies.scripted import Observation, go_to, pose
+
+
+# Narrow Gate: the first robot passes the gate while the second waits until the gate is clear.
+def plan_gate(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3)."""
+    (position, yaw), gate = pose(obs["base"]), obs["gate"]
+    before = gate - jnp.array([0.65, 0.0])
+    behind = gate + jnp.array([0.75, 0.0])
+    side = jnp.array([1.0, -1.0])
+    wait = gate + jnp.stack([jnp.array([-0.65, -1.3]), -0.7 * side], axis=-1)  # each on its spawn side
+    rest = jnp.stack([jnp.full(2, 5.3), 0.75 * side], axis=-1)
+    x = position[:, 0] - gate[:, 0]
+    lined_up = (jnp.abs(position[:, 1] - gate[:, 1]) < 0.1) & (x > -1.0)
+    goal = jnp.where((lined_up | (x > -0.3))[:, None], behind, before)
+    goal = jnp.where((x > 0.6)[:, None], rest, goal)
+    free = jnp.array([True, False]) | (x[::-1] > 0.9)
+    return go_to(position, yaw, jnp.where(free[:, None] | (x > 0.0)[:, None], goal, wait))
+
+
+# Climb on Seesaw: one robot walks up to the platform, the other stands on the plank's near end.
+_TOP = 8.1  # m, x of the climber's goal on the platform
+_NEAR_END = 3.87  # m, x at which the partner has all four feet on the plank
+_BEHIND = 0.9  # m, distance of the partner behind the climber
+# The climber steps onto the centre of the 1 m wide plank; with the feet of one side off the plank it would tip over.
+_FOOT = 2.6  # m, x of the climber's goal while it is off-centre
+_ENTRY = 2.9  # m, x up to which the climber stops if it is more than _CENTRED off-centre
+_CENTRED = 0.15  # m
+_LOW = 4.4  # m, x up to which the climber goes back if it is more than _EDGE off-centre
+_EDGE = 0.3  # m, distance from the centre line at which the outer feet are near the plank's edge
+
+
+def plan_seesaw(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3)."""
+    position, yaw = pose(obs["base"])
+    x, offset = position[0, 0], jnp.abs(position[0, 1])
+    off = ((x < _ENTRY) & (offset > _CENTRED)) | ((x < _LOW) & (offset > _EDGE))
+    climb = jnp.where(off, _FOOT, _TOP)
+    follow = jnp.minimum(x - _BEHIND, _NEAR_END)
+    goal = jnp.zeros((2, 2)).at[:, 0].set(jnp.stack([climb, follow]))
+    return go_to(position, yaw, goal)
+
+
+# Sheep Dog: drive one sheep from behind, or gather a flock towards the gate.
+_SIDE = np.array([-1.0, 1.0], np.float32)  # side of the sheep's path on which each robot walks
+
+
+def plan_sheep_easy(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3).
+
+    They walk behind the sheep, on either side of the line from the gate through it, and stop when it is through.
+    """
+    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0]
+    way = gate + jnp.array([0.6, 0.0]) - sheep
+    way = way / jnp.maximum(jnp.linalg.norm(way), 1e-3)
+    across = jnp.array([-way[1], way[0]])
+    goal = sheep - 0.8 * way + (0.35 * _SIDE)[:, None] * across
+    return jnp.where(sheep[0] > gate[0] + 0.4, 0.0, go_to(position, yaw, goal))
+
+
+def plan_sheep_hard(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3).
+
+    Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, on
+    the robot's side and close to it. Stragglers are thus driven back to the flock, whose cohesion keeps it together.
+    """
+    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
+    through = sheep[:, 0] > gate[0]
+    way = sheep - gate - jnp.array([0.8, 0.0])
+    apart = position[:, None] - sheep[None]
+    near = jnp.linalg.norm(apart, axis=-1)
+    own_side = _SIDE[:, None] * (sheep[:, 1] - gate[1])
+    score = 5.0 * jnp.linalg.norm(way, axis=-1) + 3.5 * own_side - 1.5 * near
+    weight = jax.nn.softmax(jnp.where(through, -1e3, score), axis=-1)
+    back = weight @ way
+    back /= jnp.maximum(jnp.linalg.norm(back, axis=-1, keepdims=True), 1e-3)
+    goal = weight @ sheep + 0.8 * back + _SIDE[:, None] * jnp.array([0.0, 0.2])
+    goal = jnp.clip(goal, jnp.array([0.0, -2.6]), jnp.stack([gate[0] - 0.45, 2.6]))
+    # Repulsion from close sheep.
+    goal += jnp.sum(0.8 * jnp.maximum(0.75 / near - 1.0, 0.0)[..., None] * apart, axis=1)
+    return jnp.where(jnp.all(through), 0.0, go_to(position, yaw, goal))
+
+
+# Push Box: both robots push the box side by side and correct its heading.
+_PUSH_FROM = 0.95  # m, from the box's centre to a robot before it pushes
+_APART = 0.3  # m, lateral distance of each robot from the line of motion through the box
+_LOOKAHEAD = 0.4  # m, of travel along the box's heading over which its lateral error is predicted; damps the steering
+
+
+def plan_pushbox(obs: Observation) -> jax.Array:
+    """Returns both robots' actions (2, 3)."""
+    (position, yaw), gate, box = pose(obs["base"]), obs["gate"][0], obs["box"][0]
+    w, x, y, z = obs["box_quaternion"][0]
+    turned = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    turned = (turned + jnp.pi / 4) % (jnp.pi / 2) - jnp.pi / 4  # the box is symmetric under quarter turns
+    side = jnp.array([-1.0, 1.0])
+    # Predicted lateral offset of the gate's centre from the box.
+    offset = jnp.clip(gate[1] - box[1] - _LOOKAHEAD * jnp.sin(turned), -0.5, 0.5)
+    along = jnp.array([jnp.cos(turned), jnp.sin(turned)])
+    across = jnp.array([-jnp.sin(turned), jnp.cos(turned)])
+    place = box - _PUSH_FROM * along + (side * _APART)[:, None] * across
+    apart = position - box
+    behind = apart @ along < -0.55
+    lined_up = behind & (jnp.abs(apart @ across - side * _APART) < 0.15)
+    both = jnp.all(lined_up)
+    # The robot on the side to which the box should turn pushes less.
+    heading = jnp.clip(1.2 * offset, -0.35, 0.35)
+    lead = jnp.clip(4.0 * (heading - turned), -0.7, 0.7) * -side
+    walk = go_to(position, yaw, place, turned)
+    push = walk.at[:, 0].set(jnp.clip(0.4 + 0.5 * lead, 0.1, 0.5))
+    return jnp.where(both, push, walk)

@@ -1,0 +1,99 @@
+"""Shipped policies: one file per task, with a card of how it was trained and what it does."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge
+
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import NonNegative, PositiveInt
+from mqe_jax.core.settings import PathText, build, checked, override, record, to_mapping
+from mqe_jax.envs import TASKS, TaskParams
+from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
+
+FOLDER = Path(__file__).parent
+
+
+@record
+class Card:
+    """How a shipped policy was trained, and its results."""
+
+    version: PositiveInt
+    """Version of the task (`QuadrupedEnv.version`)."""
+    mode: Literal["deterministic", "sampled"]
+    """How it is meant to act."""
+    command: str
+    """Command that trained it."""
+    date: str
+    """Of the training, year-month-day."""
+    note: str
+    """Hardware, what shared it, how the policy was chosen."""
+    gpu_minutes: NonNegative | None
+    """Time on one GPU, min; none where it was not recorded."""
+    episodes: Annotated[int, Ge(1)]
+    """Episodes behind each result."""
+    results: Mapping[str, float]
+    """Rates in fresh episodes, such as success, or win/scripted and loss/scripted."""
+    endings: Mapping[str, float]
+    """Shares of episodes by how they end (`mqe_jax.envs.state.ENDINGS`); in a match against the scripted team."""
+
+
+def names() -> list[str]:
+    """Returns the tasks that have a shipped policy."""
+    return sorted(file.stem for file in FOLDER.glob("*.safetensors"))
+
+
+def file_of(task: str) -> Path:
+    """Returns the file of a task's shipped policy, whether or not there is one."""
+    return FOLDER / f"{task}.safetensors"
+
+
+@checked(task=str)
+def card(task: str) -> Card:
+    """Returns the card of a task's shipped policy.
+
+    Raises:
+        InputError: where there is none, or it was trained on another version of the task.
+    """
+    if task not in names():
+        raise InputError(f"policy: none is shipped for {task!r}; shipped: {', '.join(names())}")
+    about = build(Card, read_metadata(file_of(task), kind="policy")["card"])
+    if about.version != TASKS[task].version:
+        raise InputError(
+            f"policy: the shipped one of {task} was trained on version {about.version} of the task, which has version "
+            f"{TASKS[task].version} now; train one: mqe train {task}"
+        )
+    return about
+
+
+def params(task: str) -> TaskParams:
+    """Returns the parameters with which a task's shipped policy was trained; errors as `card`."""
+    card(task)
+    config = build(TrainConfig, read_metadata(file_of(task), kind="policy")["config"])
+    return override(TASKS[task].Params(), {k: v for k, v in config.training_env.items() if k != "control"})
+
+
+def load(task: str) -> TrainedPolicy:
+    """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
+    about = card(task)
+    policy = read_policy(file_of(task))
+    return dataclasses.replace(policy, deterministic=about.mode == "deterministic")
+
+
+@checked(policy=TrainedPolicy, about=Card, folder=PathText)
+def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
+    """Writes a policy with its card, its parameters as float16; returns the file."""
+    metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
+    deterministic = about.mode == "deterministic"
+    shipped = dataclasses.replace(policy, metadata=metadata, deterministic=deterministic)
+    return save_policy(folder, shipped, file_of(policy.task).name, half=True)
+
+
+NAMED.update({name: functools.partial(load, name) for name in names()})

@@ -1,0 +1,335 @@
+"""Settings to environments and learners: what users name becomes a training, or the players of an episode."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import Seeds
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import Parameters, PathText, check, checked, differences, fail, joined, override
+from mqe_jax.core.types import Cast
+from mqe_jax.core.types import VectorEnv as AnyVectorEnv
+from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
+from mqe_jax.envs.registry import task_id
+from mqe_jax.envs.wrappers import Deadline
+from mqe_jax.policies import actions_of, all_agents, load_as, load_policy, zoo
+from mqe_jax.runs.presets import base_config
+from mqe_jax.selfplay.demonstrations import Demonstrated
+from mqe_jax.selfplay.league.league import League, Roster
+from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.selfplay.opponents import Mirror, versus
+from mqe_jax.train import learner
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import Act
+from mqe_jax.train.folder import CONFIG_FILE, load_run_config
+from mqe_jax.train.learner import Learner, env_dims
+from mqe_jax.train.logs import check_loggers
+from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
+from mqe_jax.train.stages import Stages
+from mqe_jax.train.start import initial_key, policy_to_start
+
+Task = str | QuadrupedEnv | AnyVectorEnv
+"""A task's id, its environment, or a batch of environments."""
+Config = str | Path | TrainConfig | Mapping[str, Any] | None
+"""Settings of a training: a shipped name, a file, settings, or changes of the task's default ones."""
+Player = str | Path | Policy | Act | None
+"""A policy, its function `act` without recurrent state, or what `load_policy` accepts."""
+
+
+@checked(env=Mapping[str, Any] | None, impl=str)
+def prepare(
+    task: Task,
+    config: Config = None,
+    env: Mapping[str, Any] | None = None,
+    *,
+    impl: str = "auto",
+    seeds: Sequence[int] | None = None,
+) -> tuple[list[TrainConfig], Cast]:
+    """Returns the settings of each seed and the environments of a training; arguments and errors as `mqe_jax.learn`.
+
+    `seeds` are trained in one program; by default the one of the settings.
+    """
+    if len(set(seeds or ())) < len(seeds or ()):
+        fail("seeds", seeds, "a list without repetitions")
+    if isinstance(task, str | QuadrupedEnv):
+        settings = for_task(settings_of(task, config), task, env)
+    elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
+        settings = settings_of("", config)
+        theirs = {"env": env, "opponents": settings.opponents, "demonstrator": settings.curriculum.demonstrator}
+        for name, value in theirs.items():
+            if value:
+                fail(name, value, "left out for a batch of environments, which has its own")
+        if isinstance(inner := getattr(task, "env", None), QuadrupedEnv):
+            settings = for_task(settings, inner)
+        settings = override(settings, {"num_envs": task.num_envs, "evaluation.every": None})
+    else:
+        fail("task", task, "a task's id, an environment such as that of mqe_jax.make, or a batch of environments")
+    configs = [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
+    if isinstance(task, str | QuadrupedEnv):
+        return configs, environments(impl, settings, len(configs), task)
+    return configs, Cast(task)
+
+
+@checked(seeds=Seeds)
+def make_learner(
+    task: Task,
+    config: Config = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    seeds: int = 1,
+    stages: type[Stages] = Stages,
+) -> Learner:
+    """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure functions, not compiled.
+
+    Example:
+        ```python
+        init, update = mqe_jax.make_learner("go1gate", "demo")
+        state = jax.jit(init)(jax.random.PRNGKey(0))
+        state, metrics = jax.jit(update)(state)
+        ```
+
+    Args:
+        task: as `mqe_jax.learn`, and so are config, env and impl.
+        config: settings; the evaluation during training is left to the caller.
+        env: task parameters.
+        impl: physics engine.
+        seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
+        stages: the algorithm; a subclass has other advantages, another loss or another update (examples/happo.py).
+
+    Raises:
+        InputError: as `mqe_jax.learn`.
+    """
+    (settings, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
+    return learner.make_learner(cast.env, settings, league=cast.league, teacher=cast.teacher, stages=stages)
+
+
+def make_env(
+    task: str | QuadrupedEnv,
+    impl: str,
+    overrides: Mapping[str, Any],
+    num_envs: int,
+    copies: int = 1,
+    final: Sequence[str] = (),
+) -> tuple[Any, VectorEnv]:
+    """Returns a task and its vectorised environment with automatic reset; `copies` and `final` as in `VectorEnv`.
+
+    The task is an id, or an environment whose class and engine count; `parameters_of` returns its parameters.
+    """
+    check("set", overrides, Parameters)
+    device = platform()
+    if impl == "warp" and device != "gpu":
+        raise InputError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax")
+    if isinstance(task, QuadrupedEnv):
+        control, params = overrides.get("control", "command"), {k: v for k, v in overrides.items() if k != "control"}
+        env = type(task)(override(task.Params(), params), impl=task.impl, control=control, num_envs=num_envs * copies)
+    else:
+        env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
+    return env, VectorEnv(env, num_envs, copies, final=final)
+
+
+def parameters_of(task: str | QuadrupedEnv) -> dict[str, Any]:
+    """Returns the parameters and the control mode in which an environment differs from its task's; none of an id."""
+    if not isinstance(task, QuadrupedEnv):
+        return {}
+    control = {} if task.control == "command" else {"control": task.control}
+    return {**control, **differences(task.params, task.Params())}
+
+
+def environments(impl: str, config: TrainConfig, seeds: int, task: str | QuadrupedEnv | None = None) -> Cast:
+    """Returns the environments of seeds trained together, and who else plays in them.
+
+    The task is that of the settings, or `task` as in `make_env`.
+
+    In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
+    environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
+    InputError for a task, an opponent or a demonstrator that is not allowed.
+    """
+    task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
+    final = ["groups" if name == "obs" and config.group != "policy" else name for name in config.network.critic_reads]
+    both, started = make_env(task, impl, config.training_env, config.num_envs, seeds, final)
+    others = [load_as("opponent", name, both) for name in Roster(opponents).fixed] if len(both.teams) > 1 else []
+    groups = {config.group, *groups_of(*others)}
+    demonstrator = config.curriculum.demonstrator
+
+    def batch(num_envs: int) -> Any:
+        if demonstrator is None:
+            made = started if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds, final=final)
+        else:
+            policy = load_as("curriculum.demonstrator", demonstrator, both)
+            everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
+            made = Demonstrated(both, num_envs, everyone, seeds, final=final)
+        made = made.with_groups(groups)
+        return Deadline(made) if config.time_limit_ends else made
+
+    eval_env = None
+    if config.evaluation.every is not None:
+        _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
+        eval_env = eval_env.with_groups(groups)
+    if config.train_env:
+        _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env)
+    _check_teams(both, config)
+    league = teacher = None
+    if len(both.teams) < 2:
+        env = batch(config.num_envs)
+    elif opponents:
+        matches = batch(config.num_envs)
+        league = League(BothSides(matches) if config.both_sides else matches, opponents, config)
+        env = league.env
+    else:
+        env = Mirror(batch(config.num_envs // 2))
+    if config.imitation.teacher is not None:
+        teacher = load_as("imitation.teacher", config.imitation.teacher, both)
+    if len(both.teams) > 1 and eval_env is not None:
+        fixed = Roster(opponents).fixed or anchors(eval_env.env)[:1]
+        if episodes % len(fixed):
+            fail("evaluation.episodes", episodes, f"a multiple of the number of opponents in evaluations, {len(fixed)}")
+        eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed)
+    return Cast(env, eval_env, league, teacher)
+
+
+def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
+    """Raises an InputError where a training of seeds could not start."""
+    check_loggers(config.loggers)
+    cast = environments(impl, config, seeds)
+    learner.make_learner(cast.env, config, league=cast.league, teacher=cast.teacher)
+    if config.start is not None:
+        network = config.network.build(env_dims(cast.env, config))
+        policy_to_start(cast.env.name, jax.eval_shape(network.init, initial_key(config)), config)
+
+
+def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv) -> None:
+    """Raises an InputError where a policy that is trained in a task could not act in it as it is evaluated."""
+    own, other = (
+        {**actions_of(each.control, each.params), "size of the observation": each.observation_size}
+        for each in (training, env)
+    )
+    for name, value in own.items():
+        if value != other[name]:
+            fail(f"train_env.{name}", value, f"that of env, {other[name]!r}, in which the policy is evaluated")
+
+
+def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
+    if len(env.teams) < 2 and config.opponents:
+        fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+    if config.both_sides and not config.opponents:
+        fail("both_sides", True, "false where there are no opponents")
+    if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
+        fail("num_envs", config.num_envs, "even: both teams of a match are environments")
+
+
+def anchors(env: QuadrupedEnv) -> list[str]:
+    """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
+    walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
+    return [*(["scripted"] if env.name in PLANNERS and walking else []), "idle", "random"]
+
+
+def platform() -> str:
+    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable one."""
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        requested = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error) or "no such device"
+        raise InputError(f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu") from None
+
+
+class Players(NamedTuple):
+    """An environment, and who acts in it."""
+
+    env: Any
+    """The task."""
+    batch: VectorEnv
+    """Environments with automatic reset."""
+    policy: Policy
+    """The policy of all agents."""
+    about: dict[str, Any]
+    """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
+
+
+@checked(env=Mapping[str, Any] | None, impl=str, deterministic=bool)
+def players(
+    task: str | Path | QuadrupedEnv,
+    policy: Player = None,
+    opponent: Player = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    num_envs: int = 1,
+    deterministic: bool = False,
+) -> Players:
+    """Returns what is evaluated, rendered and viewed; arguments and errors as `mqe_jax.evaluate`.
+
+    A run has its own task, parameters and policy. Without a policy, a task has its shipped one if its parameters are
+    the default ones, on both sides of a match; else its scripted one, or `forward`; where actions are not commands,
+    `random`.
+    """
+    made, name, params = task, "", dict(env or {})
+    if isinstance(made, QuadrupedEnv):
+        name, params = made.name, joined(parameters_of(made), params)
+    else:
+        given = str(check("task", made, PathText))
+        made = name = ALIASES.get(given, given)
+        if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
+            config = run_config(name)
+            made, params, policy = config.task or "", joined(config.env, params), policy or name
+    shipped = name in zoo.names() and not params and policy is None
+    walking = "scripted" if name in PLANNERS else "forward"
+    default = walking if params.get("control", "command") == "command" else "random"
+    task_env, batch = make_env(made, impl, params, num_envs)
+    chosen = (name if shipped else default) if policy is None else policy
+    own = load_as("policy", chosen, task_env, deterministic=deterministic)
+    match = len(task_env.teams) > 1
+    other, against = (own, chosen) if shipped and match else (None, "idle")
+    if opponent is not None:
+        other, against = load_as("opponent", opponent, task_env, deterministic=deterministic), opponent
+    about: dict[str, Any] = {"policy": str(chosen)}
+    if isinstance(own, TrainedPolicy):
+        about["actions"] = "mean" if own.deterministic else "sampled"
+    if match:
+        about["opponent"] = str(against)
+    everyone = all_agents(task_env, own, other)
+    return Players(task_env, batch.with_groups(groups_of(everyone)), everyone, about)
+
+
+def run_config(target: str) -> Any:
+    """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
+    if target.endswith(".safetensors"):
+        return load_policy(target).config
+    if not Path(target).is_dir():
+        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
+        raise InputError(f"run: {target!r} is {'not a' if Path(target).exists() else 'no'} folder; allowed: {allowed}")
+    if not (Path(target) / CONFIG_FILE).is_file():
+        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{CONFIG_FILE}"))
+        hint = f"; did you mean {runs[0]}?" if runs else ""
+        raise InputError(f"run: {target!r} has no {CONFIG_FILE}; it is not a run folder{hint}")
+    config = load_run_config(target)
+    if config.task is None:
+        raise InputError(f"{target}: {CONFIG_FILE} has no 'task' entry")
+    return config
+
+
+def settings_of(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
+    """Returns the settings that `mqe_jax.learn` is given, without a task's parameters."""
+    if isinstance(config, TrainConfig):
+        return config
+    changes = dict(config) if isinstance(config, Mapping) else {"config": config}
+    name, algorithm = changes.pop("config", None), changes.pop("algorithm", None)
+    if not isinstance(name, str | Path | None) or not isinstance(algorithm, str | None):
+        fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
+    task = task.name if isinstance(task, QuadrupedEnv) else task
+    return override(base_config(task, None if name is None else str(name), algorithm), changes)
+
+
+def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
+    """Returns the settings with a task and its parameters; says so where they are those of another task."""
+    name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
+    if config.task not in (None, name):
+        echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
+    return override(config, {"task": name, "env": joined(parameters_of(task), env or {})})

@@ -1,0 +1,72 @@
+"""Shipped settings of trainings, by name; it imports no JAX."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import PathText, check, fail, load_yaml, override
+from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
+from mqe_jax.train.config import TrainConfig, load_config
+
+CONFIG_FOLDER = Path(__file__).parents[1] / "configs"
+
+
+@functools.cache
+def _parts(file: str) -> dict[str, Any]:
+    """Returns the parts of a shipped file of settings: those `common` to all, and changes of them by name."""
+    return load_yaml(CONFIG_FOLDER / f"{file}.yaml")
+
+
+def preset(algorithm: str) -> dict[str, Any]:
+    """Returns the settings that define an algorithm, those of configs/paper.yaml, for `mqe_jax.core.settings.override`.
+
+    Raises:
+        InputError: for an unknown name, with the nearest known one.
+    """
+    algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
+    if algorithm not in algorithms:
+        fail("algorithm", algorithm, f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}")
+    return algorithms[algorithm]
+
+
+def named_config(name: str, task: str) -> TrainConfig:
+    """Returns the settings of a file, or of a shipped name; `league` has changes of some tasks."""
+    shipped = ["demo", "league"]
+    shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
+    path, allowed = Path(check("config", name, PathText)), f"a YAML file, or one of {', '.join(shipped)}"
+    if name == "demo":
+        path = CONFIG_FOLDER / "demo.yaml"
+    elif name in shipped:
+        file, _, part = name.partition("/")
+        common = override(TrainConfig(), _parts(file)["common"])
+        return override(common, _parts(file).get(part or task, {}))
+    elif path.suffix not in (".yaml", ".yml") and path.parent == Path("."):
+        raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
+    if not path.is_file():
+        raise InputError(f"config: no file {name!r}; allowed: {allowed}")
+    return load_config(path)
+
+
+def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
+    """Returns the settings of a file or a shipped name, with the algorithm's preset.
+
+    The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
+    paper/mappo for other tasks. InputError for a file or an algorithm that is not allowed.
+    """
+    task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
+    if name is None and algorithm is not None:
+        name = f"paper/{algorithm}"
+    elif name is None:
+        name = f"tuned/{task}" if task in _parts("tuned") else "league" if _is_match(task) else "paper/mappo"
+    return override(named_config(name, task), changes)
+
+
+def _is_match(task: str) -> bool:
+    if task in SHIPPED:
+        return len(SHIPPED[task].teams) > 1
+    from mqe_jax.envs.match import Match
+
+    return task in TASKS and issubclass(TASKS[task], Match)

@@ -1,0 +1,1 @@
+"""Matches against other policies: opponents, leagues, demonstrations."""

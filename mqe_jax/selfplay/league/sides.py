@@ -1,0 +1,62 @@
+"""Matches whose teams change sides, so that the learner, always team 0, is trained from both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.core import devices
+from mqe_jax.core.types import where_rows
+from mqe_jax.envs.wrappers import Wrapper
+
+
+class BothSides(Wrapper):
+    """Matches, in the second half of which team 0 is the task's team 1.
+
+    The privileged observation has one more number: 1 where the teams have changed places, else 0. Outcomes, rewards and
+    their terms among the metrics are those of the new teams.
+
+    It makes a difference where a match is symmetric under a reflection: robots walk not quite as their mirror images.
+    """
+
+    def __init__(self, inner: Any) -> None:
+        super().__init__(inner)
+        self.privileged_observation_size += 1
+
+    def passed(self, action: jax.Array) -> jax.Array:
+        return self._exchanged(action)
+
+    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+        changed = self._changed()
+        metrics = dict(inner.metrics)
+        for theirs in [name for name in metrics if name.startswith("team1/")]:
+            own = theirs.removeprefix("team1/")
+            for name, other in ((own, theirs), (theirs, own)):
+                metrics[name] = jnp.where(changed, inner.metrics[other], inner.metrics[name])
+
+        def told(privileged: jax.Array) -> jax.Array:
+            return jnp.concatenate([privileged, changed[:, None].astype(privileged.dtype)], axis=1)
+
+        return {
+            "obs": self._exchanged(inner.obs),
+            "final_obs": jax.tree.map(self._exchanged, inner.final_obs),
+            "privileged_obs": told(inner.privileged_obs),
+            "final_privileged_obs": jax.tree.map(told, inner.final_privileged_obs),
+            "reward": self._exchanged(inner.reward),
+            "active": jax.tree.map(self._exchanged, inner.active),
+            "groups": jax.tree.map(self._exchanged, inner.groups),
+            "final_groups": jax.tree.map(self._exchanged, inner.final_groups),
+            "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
+            "metrics": metrics,
+        }
+
+    def _changed(self) -> jax.Array:
+        """Returns where the teams have changed places (N,) bool."""
+        return devices.rows(lambda n: jnp.arange(n) >= n // 2, self.num_envs)
+
+    def _exchanged(self, x: jax.Array) -> jax.Array:
+        """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A, ...)."""
+        other = jnp.roll(x, self.num_agents // 2, axis=1)
+        return where_rows(self._changed(), other, x)

@@ -1,0 +1,168 @@
+"""Round robins of policies of a match, and ratings from their results."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pydantic
+from annotated_types import MinLen
+from numpy.typing import NDArray
+
+from mqe_jax.core.files import replacing, write_atomically
+from mqe_jax.core.limits import NonNegativeInt
+from mqe_jax.core.literal import to_label
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import PathText, checked, fail
+from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
+from mqe_jax.envs import VectorEnv
+from mqe_jax.policies import check_policy
+from mqe_jax.selfplay.opponents import Versus
+from mqe_jax.train.policy import Policy
+
+Array = NDArray[np.float64]
+CSV, PICTURE = "tournament.csv", "tournament.png"
+
+_POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
+_ITERATIONS = 500
+_SAMPLES = 200  # of the bootstrap
+_LONG = 28  # characters of a name in the picture, at most
+
+
+def _results(value: Any) -> Any:
+    shape = np.shape(value)
+    if shape != (*shape[:1] * 2, 3) or not np.all(np.isfinite(value)) or np.min(value) < 0:
+        raise ValueError("outcomes of policies against policies, as of round_robin")
+    return value
+
+
+Results = Annotated[Any, pydantic.AfterValidator(_results)]
+"""Kind of an argument that is a result of `round_robin`."""
+
+
+class Ratings(NamedTuple):
+    """Ratings of P policies in Elo points, with the bounds of their 95% intervals (P,)."""
+
+    value: Array
+    low: Array
+    high: Array
+
+
+@single
+@checked(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
+def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
+    """Returns the outcomes of a policy as team 0, in the first episode of every environment: (K, 3) in `RESULTS`.
+
+    Every Kth environment has the same one of the K opponents as team 1 (`Versus`).
+    """
+    check_policy(policy, matches)
+    env = Versus(matches, opponents)
+
+    def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
+        state, memory, finished, outcome = carry
+        action, memory = policy.act(observations(state).to(policy), memory, key)
+        state = env.step(state, action)
+        done = state.terminated | state.truncated
+        now = state.outcome.result[:, 0] > 0
+        outcome = jnp.where((done & ~finished)[:, None], now, outcome)
+        return (state, memory, finished | done, outcome), None
+
+    @jax.jit
+    def run(key: jax.Array) -> jax.Array:
+        key, reset_key = jax.random.split(key)
+        count = matches.num_envs
+        nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
+        start = env.reset(reset_key), policy.initial_memory(count), *nothing
+        (_, _, _, outcome), _ = jax.lax.scan(advance, start, jax.random.split(key, matches.max_episode_steps))
+        return outcome
+
+    return np.asarray(run(key)).reshape(-1, len(opponents), 3).sum(axis=0)
+
+
+@single
+@checked(matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey)
+def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
+    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `RESULTS`."""
+    keys = jax.random.split(key, len(policies))
+    teams = list(policies.values())
+    return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
+
+
+@checked(results=Results)
+def scores(results: NDArray[Any]) -> Array:
+    """Returns the points of each policy against each, as both teams together, in games; a draw counts half (P, P)."""
+    points = results[..., 0] + 0.5 * results[..., 1]
+    return points + (results.sum(axis=-1) - points).T
+
+
+@checked(results=Results, anchor=NonNegativeInt)
+def rate(results: NDArray[np.int64], anchor: int) -> Ratings:
+    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0, and their intervals.
+
+    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
+    of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
+    """
+    if anchor >= len(results):
+        fail("anchor", anchor, f"the index of one of the {len(results)} policies")
+    games = results + np.array([0.0, 0.5, 0.0])
+    weights = np.random.default_rng(0).standard_gamma(games, (_SAMPLES, *games.shape))
+    weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
+    resampled = np.stack([_strengths(scores(again), anchor) for again in weights])
+    low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
+    return Ratings(_strengths(scores(games), anchor), low, high)
+
+
+def _strengths(points: Array, anchor: int) -> Array:
+    """Returns the maximum-likelihood ratings (P,) of points (P, P), by minorisation and maximisation."""
+    points = points * (1 - np.eye(len(points)))
+    games, strength = points + points.T, np.ones(len(points))
+    for _ in range(_ITERATIONS):
+        strength = points.sum(axis=1) / (games / (strength[:, None] + strength)).sum(axis=1)
+        strength /= strength[anchor]
+    return _POINTS * np.log(strength)
+
+
+@checked(folder=PathText, names=Sequence[str], results=Results)
+def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings: Ratings) -> None:
+    """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
+    if not isinstance(ratings, Ratings):
+        fail("ratings", ratings, "those of rate")
+    if [np.shape(values) for values in ratings] != [(len(results),)] * 3:
+        fail("ratings", ratings, f"those of the {len(results)} policies")
+    if len(names) != len(results):
+        fail("names", names, f"one for each of the {len(results)} policies")
+    folder, text = Path(folder), io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("team0", "team1", *RESULTS, "rating_of_team0", "low", "high"))
+    for i, j in itertools.product(range(len(names)), repeat=2):
+        writer.writerow((names[i], names[j], *results[i, j], *(f"{x[i]:.1f}" for x in ratings)))
+    write_atomically(folder / CSV, text.getvalue().encode())
+    _draw(names, results, folder / PICTURE)
+
+
+def _draw(names: Sequence[str], results: NDArray[np.int64], path: Path) -> None:
+    """Draws each policy's points per game against each, rows against columns."""
+    from matplotlib.figure import Figure
+
+    share = scores(results) / np.maximum(results.sum(axis=-1) + results.sum(axis=-1).T, 1)
+    size = 2.6 + 0.6 * len(names)
+    figure = Figure((size + 0.8, size), dpi=120, layout="constrained")
+    axes = figure.add_subplot()
+    axes.imshow(share, cmap="RdYlGn", vmin=0, vmax=1)
+    for (row, column), value in np.ndenumerate(share):
+        if row != column:
+            axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=9)
+    ends = (name if len(name) <= _LONG else f"...{name[3 - _LONG :]}" for name in names)  # the end names a run
+    shown = list(map(to_label, ends))
+    axes.set_xticks(range(len(names)), shown, rotation=45, ha="right")
+    axes.set_yticks(range(len(names)), shown)
+    figure.suptitle("points of 100 games, row against column", fontsize=10)
+    with replacing(path) as temporary:
+        figure.savefig(temporary)

@@ -1,0 +1,345 @@
+"""A match as an environment of one team: against given opponents (`versus`), or with both teams learning (`Mirror`)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.core import devices
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import NonNegativeInt, Number
+from mqe_jax.core.precision import single
+from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.types import (
+    AnyBatch,
+    AnyPolicy,
+    Memory,
+    Observations,
+    PyTree,
+    RandomKey,
+    check_act,
+    observations,
+    where_rows,
+)
+from mqe_jax.envs import VectorEnv
+from mqe_jax.envs.state import EnvironmentState
+from mqe_jax.envs.wrappers import Outer, Wrapper
+from mqe_jax.policies import check_policy, load_as
+from mqe_jax.train.policy import Policy, TrainedPolicy
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Opponent:
+    """The opponent of a block of B environments."""
+
+    arrays: PyTree
+    """Arrays of the opponent; empty where it cannot change."""
+    before: PyTree
+    """Arrays of the opponent before the last change."""
+    waiting: jax.Array
+    """Environments whose episode is still against the opponent before the change (B,) bool."""
+    memory: Memory
+    """Recurrent state, leading axis B."""
+    outcomes: jax.Array
+    """Episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TeamState(EnvironmentState):
+    """State of M environments of one team of T agents, in N matches of A agents; metrics are those of team 0.
+
+    Every (M / N)th of `step` and `assistance` is that of a match; `key` is that of the opponents' actions.
+    """
+
+    match: EnvironmentState
+    """State of the matches, leading axis N."""
+    action: jax.Array
+    """Actions of all agents in the last step (N, A, D)."""
+    opponents: tuple[Opponent, ...]
+    """The opponent of each block of environments."""
+
+
+class OneTeam(Outer):
+    """What `Versus` and `Mirror` share: M environments of the only team, around matches."""
+
+    def __init__(self, matches: VectorEnv | Wrapper, num_envs: int) -> None:
+        if len(check("env", matches, AnyBatch).teams) != 2:
+            raise InputError(f"env: {matches.name} is not a match; it has one team")
+        super().__init__(matches)
+        self.num_envs, self.num_agents = num_envs, len(matches.teams[0])
+        self.teams = (tuple(range(self.num_agents)),)
+
+    def _stepped(self, state: TeamState, action: jax.Array) -> EnvironmentState:
+        """Advances the matches by a step with the actions of all agents (N, A, D)."""
+        every = self.num_envs // self.inner.num_envs
+        match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
+        return self.inner.step(match, action)
+
+
+class Versus(OneTeam):
+    """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`.
+
+    Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
+    """
+
+    opponents: tuple[Policy, ...]
+    """Opponent of each block at the start."""
+
+    @checked(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
+    def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
+        super().__init__(matches, matches.num_envs)
+        self.draw_reward = draw_reward
+        for policy in opponents:
+            check_policy(policy, matches, "an opponent")
+        self.opponents = tuple(opponents)
+        self._check_blocks(self.num_envs)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.num_envs} against {list(self.opponents)}: {self.inner!r}>"
+
+    def share(self, parts: int) -> Self:
+        """Returns the environments of one of several processes; each process meets all opponents."""
+        self._check_blocks(self.num_envs // parts)
+        return super().share(parts)
+
+    def _check_blocks(self, num_envs: int) -> None:
+        if not self.opponents or num_envs % len(self.opponents):
+            fail("opponents", len(self.opponents), f"a divisor of the environments of a process, {num_envs}")
+
+    @single
+    @checked(key=RandomKey)
+    def reset(self, key: jax.Array) -> TeamState:
+        """Returns the initial states of all environments, against the opponents given at the start."""
+        key, match_key = jax.random.split(key)
+        match = self.inner.reset(match_key)
+        opponents = []
+        for policy in self.opponents:
+            arrays = _arrays(policy)
+            waiting, memory = jnp.zeros((self._size,), bool), policy.initial_memory(self._size)
+            opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
+        action = jnp.zeros((self.num_envs, self.inner.num_agents, self.action_size))
+        return self._seen(match, action, tuple(opponents), key)
+
+    @single
+    def step(self, state: TeamState, action: jax.Array) -> TeamState:
+        """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
+        self.check_step(state, action, TeamState)
+        self._check_opponents(state)
+        key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
+        others, opponents = [], []
+        for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
+            block = jax.tree.map(lambda x: x[self._block(i)], observations(state.match))  # noqa: B023
+            shape = (self._size, self.num_agents, self.action_size)
+            returned = _act(policy, opponent, block.of(slice(self.num_agents, None)), keys[i])
+            other, memory = check_act("opponents", returned, shape, opponent.memory)
+            others.append(jnp.asarray(other, jnp.float32))
+            opponents.append(dataclasses.replace(opponent, memory=memory))
+        theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
+        both = jnp.concatenate([jnp.asarray(action, jnp.float32), theirs], axis=1)
+        match = self._stepped(state, both)
+        done = match.terminated | match.truncated
+        ended = done[:, None] & (match.outcome.result[:, 0] > 0)
+        match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32))
+        started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
+        return self._seen(match, both, started, key)
+
+    @checked(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
+    def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
+        """Returns the state with another opponent in a block.
+
+        Each environment keeps its opponent until its episode ends; the state holds both until then. While environments
+        still wait for an earlier change, only the opponent for which they wait is replaced, also where it already
+        plays.
+
+        Args:
+            state: of the environments.
+            block: index of the block.
+            policy: the new opponent, of the same architecture as the first one.
+            at_once: exchange the opponent within the episodes, as for an opponent that is the newest policy itself.
+
+        Raises:
+            InputError: for a block whose opponent is not a trained policy, or a policy of another architecture.
+        """
+        self._check_opponents(state)
+        if not block < len(self.opponents):
+            fail("block", block, f"below {len(self.opponents)}, the number of blocks")
+        check_policy(policy, self.inner)
+        first, opponent = self.opponents[block], state.opponents[block]
+        if not isinstance(first, TrainedPolicy):
+            raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
+        if policy.architecture != first.architecture:
+            other = f"{policy.architecture}, not {first.architecture}"
+            raise InputError(f"policy: of another architecture than block {block}: {other}")
+        changed = exchange(opponent, _arrays(policy), at_once=at_once)
+        return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
+
+    def _check_opponents(self, state: TeamState) -> None:
+        """Raises an InputError for a state against opponents of other kinds."""
+        ours = [(_arrays(policy), policy.initial_memory(1)) for policy in self.opponents]
+        if jax.tree.structure(ours) != jax.tree.structure([(each.arrays, each.memory) for each in state.opponents]):
+            fail("state", "one against other opponents", f"one that `reset` of this {type(self).__name__} returns")
+
+    @property
+    def _size(self) -> int:
+        return self.num_envs // len(self.opponents)
+
+    def _block(self, index: int) -> slice:
+        return slice(index, None, len(self.opponents))
+
+    def _restarted(self, index: int, opponent: Opponent, done: jax.Array, ended: jax.Array) -> Opponent:
+        """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
+        done, ended = done[self._block(index)], ended[self._block(index)]
+        first = self.opponents[index].initial_memory(self._size)
+        memory = where_rows(done, first, opponent.memory)
+        outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
+        return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
+
+    def _seen(
+        self, match: EnvironmentState, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array
+    ) -> TeamState:
+        """Returns the state of team 0."""
+        own = slice(0, self.num_agents)
+        return TeamState(
+            match=match,
+            action=action,
+            obs=match.obs[:, own],
+            privileged_obs=match.privileged_obs,
+            final_obs=jax.tree.map(lambda x: x[:, own], match.final_obs),
+            final_privileged_obs=match.final_privileged_obs,
+            reward=match.reward[:, own],
+            terminated=match.terminated,
+            truncated=match.truncated,
+            outcome=match.outcome.by_team(lambda x: x[:, :1]),
+            metrics={name: value for name, value in match.metrics.items() if not name.startswith("team1/")},
+            step=match.step,
+            assistance=match.assistance,
+            opponents=opponents,
+            key=key,
+            active=jax.tree.map(lambda x: x[:, own], match.active),
+            groups=jax.tree.map(lambda x: x[:, own], match.groups),
+            final_groups=jax.tree.map(lambda x: x[:, own], match.final_groups),
+        )
+
+
+@checked(env=AnyBatch, draw_reward=Number)
+def versus(
+    env: VectorEnv | Wrapper,
+    opponents: Policy | str | Path | Sequence[Policy | str | Path],
+    *,
+    draw_reward: float = 0.0,
+) -> Versus:
+    """Returns matches as environments of team 0 alone, against opponents that control team 1.
+
+    The environments meet the opponents in turn, equally many each. Trained policies act as they are loaded (sampled,
+    unless deterministic) and can be exchanged (`Versus.change`); others are fixed.
+
+    Args:
+        env: the matches.
+        opponents: policies, or what `load_policy` accepts; their number divides the number of environments. A single
+            one may be given without a list.
+        draw_reward: added to the reward of a step that ends an episode with a draw.
+
+    Raises:
+        InputError: for a task that is not a match, another number of opponents, or a policy of another task.
+    """
+    alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
+    given: Any = [opponents] if alone else opponents
+    if not isinstance(given, Sequence):
+        fail("opponents", given, "a policy, or a list of policies")
+    return Versus(env, [load_as("opponents", each, env.env) for each in given], draw_reward)
+
+
+class Mirror(OneTeam):
+    """N matches as 2 N environments of one team, the two of each match side by side: one policy learns as both.
+
+    The privileged observation has one more number, the index of the team. Outcome and metrics are those of team 0;
+    `diverged` and `overflow` are counted for the first.
+    """
+
+    def __init__(self, matches: VectorEnv) -> None:
+        super().__init__(matches, 2 * check("env", matches, AnyBatch).num_envs)
+        self.privileged_observation_size += 1
+
+    @single
+    def reset(self, key: jax.Array) -> TeamState:
+        """Returns the initial states of all environments."""
+        action = jnp.zeros((self.inner.num_envs, self.inner.num_agents, self.action_size))
+        return self._seen(self.inner.reset(key), action)
+
+    @single
+    def step(self, state: TeamState, action: jax.Array) -> TeamState:
+        """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
+        self.check_step(state, action, TeamState)
+        both = action.reshape(self.inner.num_envs, 2 * self.num_agents, self.action_size)
+        return self._seen(self._stepped(state, both), both)
+
+    def _seen(self, match: EnvironmentState, action: jax.Array) -> TeamState:
+        def teams(x: jax.Array) -> jax.Array:
+            return x.reshape(self.num_envs, self.num_agents, *x.shape[2:])
+
+        def twice(x: jax.Array) -> jax.Array:
+            return jnp.repeat(x, 2, axis=0)
+
+        def privileged(x: jax.Array) -> jax.Array:
+            return jnp.concatenate([twice(x), jnp.tile(jnp.arange(2.0), len(x))[:, None]], axis=1)
+
+        metrics = {name: twice(value) for name, value in match.metrics.items() if not name.startswith("team1/")}
+        for name in ("diverged", "overflow"):
+            metrics[name] = jnp.where(jnp.arange(self.num_envs) % 2 == 0, metrics[name], 0.0)
+        return TeamState(
+            match=match,
+            action=action,
+            obs=teams(match.obs),
+            privileged_obs=privileged(match.privileged_obs),
+            final_obs=jax.tree.map(teams, match.final_obs),
+            final_privileged_obs=jax.tree.map(privileged, match.final_privileged_obs),
+            reward=teams(match.reward),
+            terminated=twice(match.terminated),
+            truncated=twice(match.truncated),
+            outcome=jax.tree.map(twice, match.outcome.by_team(lambda x: x[:, :1])),
+            metrics=metrics,
+            step=twice(match.step),
+            assistance=twice(match.assistance),
+            opponents=(),
+            key=jnp.zeros((2,), jnp.uint32),
+            active=jax.tree.map(teams, match.active),
+            groups=jax.tree.map(teams, match.groups),
+            final_groups=jax.tree.map(teams, match.final_groups),
+        )
+
+
+def exchange(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:
+    """Returns the opponent of a block with other arrays; see `Versus.change`."""
+    if at_once:
+        return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting))
+    pending = devices.any_of(jnp.any(opponent.waiting))
+    before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
+    waiting = jnp.where(pending, opponent.waiting, True)
+    return dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)
+
+
+def _arrays(policy: Policy) -> PyTree:
+    """Returns the arrays in which a trained policy can change; none of others."""
+    return jax.tree.map(jnp.asarray, policy.arrays) if isinstance(policy, TrainedPolicy) else ()
+
+
+def _act(policy: Policy, opponent: Opponent, obs: Observations, key: jax.Array) -> tuple[jax.Array, Any]:
+    """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
+    if not isinstance(policy, TrainedPolicy):
+        return policy.act(obs.to(policy), opponent.memory, key)
+
+    def now() -> tuple[jax.Array, Any]:
+        return policy.act_with(opponent.arrays, obs, opponent.memory, key)
+
+    def either() -> tuple[jax.Array, Any]:
+        before = policy.act_with(opponent.before, obs, opponent.memory, key)
+        return where_rows(opponent.waiting, before, now())
+
+    return jax.lax.cond(jnp.any(opponent.waiting), either, now)

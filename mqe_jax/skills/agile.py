@@ -1,0 +1,142 @@
+"""The agile skill: fast velocity commands to joint targets, for one robot, by a small network.
+
+Its memory holds what every skill could share: frames of the last steps, the action that the joint targets of the last
+step amount to, and the phase of the gait cycle. A frame has 39 numbers:
+
+| block | size | content |
+|---|---|---|
+| projected gravity | 3 | unit gravity vector in the trunk frame |
+| joint position | 12 | minus the default angles, rad |
+| joint velocity | 12 | times 0.05, rad/s |
+| joint targets | 12 | of the step before: minus the default angles, divided by the robot's action scale |
+
+Input of the network: the frames of the steps `OFFSETS` before this one, oldest first (zeros before an episode's first
+step), the three commands times their scale, and the clock. The clock is sine and cosine of the phase of a trot, or
+zeros where the robot shall stand; the trot's frequency grows with the commanded velocity. 200-256-256-128-12 with ELU
+give the action, clipped to +-10; the joint target is default + scale x action.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.skills import Command, Skill, register
+from mqe_jax.skills.weights import Networks, Params, layers
+
+OFFSETS = (8, 4, 2, 1, 0)  # steps before the present one
+LENGTH = max(OFFSETS) + 1
+FRAME_SIZE = 3 + 3 * NUM_JOINTS
+NOW_SIZE = 5  # commands and clock
+NETWORKS = Networks("agile", "agile skill", {"body": (len(OFFSETS) * FRAME_SIZE + NOW_SIZE, 256, 256, 128, NUM_JOINTS)})
+STEP = 0.02  # s
+ACTION_CLIP = 10.0
+JOINT_VELOCITY_SCALE = 0.05
+PRECISION = "tensorfloat32"  # as in the walk policy
+FREQUENCY = (3.0, 4.2)  # of the trot, Hz: at rest, and from the velocity `FAST` on
+FAST = np.array([2.5, 1.0, 2.5], np.float32)  # m/s forward, m/s to the left, rad/s
+STAND = 0.02  # share of `FAST` below which the robot shall stand
+
+COMMANDS = (
+    Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.5, 2.5)),
+    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-1.0, 1.0)),
+    Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, mirror=-1.0, trained=(-2.5, 2.5)),
+)
+_SCALE = np.array([command.scale for command in COMMANDS], np.float32)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class AgileMemory:
+    """Recurrent state of one robot's agile skill."""
+
+    frames: jax.Array
+    """Frames of the last steps, oldest first (9, 39); zeros after a reset."""
+    action: jax.Array
+    """Action that the last joint targets amount to (12,)."""
+    gait: jax.Array
+    """Phase of the gait cycle () in [0, 1)."""
+
+
+def _pace(velocity: jax.Array) -> jax.Array:
+    """Returns the commanded velocity (3,) as a share () of `FAST`."""
+    return jnp.linalg.norm(velocity / FAST)
+
+
+def stands(velocity: jax.Array) -> jax.Array:
+    """Returns whether a robot with this commanded velocity (3,) shall stand () bool."""
+    return _pace(velocity) < STAND
+
+
+def frequency(velocity: jax.Array) -> jax.Array:
+    """Returns the frequency () of the trot, Hz, at a commanded velocity (3,)."""
+    low, high = FREQUENCY
+    return low + (high - low) * jnp.minimum(_pace(velocity), 1.0)
+
+
+def foot_phases(gait: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above; 0.25 in standing."""
+    phases = jnp.mod(gait + jnp.array([0.5, 0.0, 0.0, 0.5]), 1.0)
+    return jnp.where(stands(velocity), 0.25, phases)
+
+
+def advance_gait(gait: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Advances the gait phase by one step."""
+    return jnp.mod(gait + STEP * frequency(velocity), 1.0)
+
+
+def frame(robot: Robot, sensed: Proprioception, action: jax.Array) -> jax.Array:
+    """Builds a frame (39,); `action` (12,) are the last joint targets as an action."""
+    position = sensed.joint_position - robot.default_joints
+    velocity = sensed.joint_velocity * JOINT_VELOCITY_SCALE
+    return jnp.concatenate([sensed.gravity_b, position, velocity, action]).astype(jnp.float32)
+
+
+def now(gait: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Returns scaled commands and clock (5,)."""
+    angle = 2 * jnp.pi * gait
+    clock = jnp.where(stands(velocity), 0.0, jnp.stack([jnp.sin(angle), jnp.cos(angle)]))
+    return jnp.concatenate([velocity * _SCALE, clock]).astype(jnp.float32)
+
+
+def infer(params: Params, inputs: jax.Array, *, precision: str = "highest") -> jax.Array:
+    """Computes unclipped actions (..., 12) from inputs of the network (..., 200)."""
+    return layers(params["body"], inputs, precision)
+
+
+@register
+class AgileSkill(Skill):
+    """The agile skill."""
+
+    name = "agile"
+    commands = COMMANDS
+    period = STEP
+    turn = 3.0
+
+    def init_memory(self) -> AgileMemory:
+        return AgileMemory(jnp.zeros((LENGTH, FRAME_SIZE)), jnp.zeros(NUM_JOINTS), jnp.zeros(()))
+
+    def targets(
+        self, params: Params, memory: AgileMemory, command: jax.Array, proprioception: Proprioception
+    ) -> tuple[jax.Array, AgileMemory]:
+        newest = frame(self.robot, proprioception, memory.action)
+        frames = jnp.concatenate([memory.frames[1:], newest[None]])
+        chosen = frames[LENGTH - 1 - np.array(OFFSETS)]
+        inputs = jnp.concatenate([chosen.ravel(), now(memory.gait, command)])
+        action = jnp.clip(infer(params, inputs, precision=PRECISION), -ACTION_CLIP, ACTION_CLIP)
+        gait = advance_gait(memory.gait, command)
+        return self.robot.joint_targets(action), AgileMemory(frames, action, gait)
+
+    def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
+        return NETWORKS.load(self.robot, path)
+
+    def clock(self, memory: AgileMemory) -> jax.Array:
+        """Returns sine and cosine of the phase of the gait cycle (2,)."""
+        angle = 2 * jnp.pi * memory.gait
+        return jnp.stack([jnp.sin(angle), jnp.cos(angle)])

@@ -1,0 +1,228 @@
+"""Control: from agents' actions to actuator targets (`mqe_jax.physics.actuators` applies them).
+
+| mode | per robot | meaning |
+|---|---|---|
+| `command` | one number per command that the action sets (3) | commands for the skill, by default velocities to walk |
+| `position` | 12 | joint target = default + scale x action, then PD at every physics step |
+| `torque` | 12 | joint torque = action x torque limit |
+
+Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the command, a negative one
+by the lowest, both times the skill's gain / limit. PD control runs inside the physics engine, at every physics step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import fail
+from mqe_jax.physics.robots.index import Proprioception, placed
+from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.skills import Skill
+
+MODES = ("command", "position", "torque")
+
+
+def check_mode(mode: str) -> str:
+    """Returns the mode, or raises an InputError that names the allowed ones."""
+    if mode not in MODES:
+        raise InputError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
+    return mode
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ControlState:
+    """Controller state of one environment (R robots)."""
+
+    skill: Any
+    """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and NPC robots, if
+    these have another skill."""
+    delayed: jax.Array
+    """Past actuator targets, newest first (lag + 1, R, 12)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Controller:
+    """Computes actuator targets from actions."""
+
+    mode: str
+    """Action mode: one of `MODES`."""
+    robot: Robot
+    """Robot type shared by all R robots."""
+    num_robots: int
+    """Number of robots R."""
+    num_agents: int
+    """Number of agents A: the first A robots."""
+    skill: Skill
+    """Skill of the agents in the mode `command`, and of the NPC robots in every mode unless `npc` is set."""
+    skill_params: Any
+    """Parameters of the skill, or None if no robot uses it."""
+    commands: tuple[str, ...]
+    """Commands that the action sets, in order."""
+    default_commands: np.ndarray
+    """Default commands of the skill (C,)."""
+    ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Lowest and highest value of some of `commands`; the others have the skill's default ranges."""
+    npc: tuple[Skill, Any] | None = None
+    """Skill of the NPC robots and its parameters if it is another one."""
+    lag: int = 0
+    """Maximum action lag, environment steps."""
+    position_scale: float = 1.0
+    """Factor on the range of the joint targets in the mode `position`."""
+
+    @property
+    def action_size(self) -> int:
+        """Length of one agent's action."""
+        return len(self.commands) if self.mode == "command" else NUM_JOINTS
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """Neutral actuator targets (R, 12), used without an action."""
+        rest = np.tile(self.robot.default_joints, (self.num_robots, 1)).astype(np.float32)
+        if self.mode == "torque":
+            rest[: self.num_agents] = 0.0
+        return rest
+
+    def checked(self, action: jax.Array) -> jax.Array:
+        """Returns actions (A, action_size) as an array; InputError for others, or known ones that are not finite."""
+        try:
+            action = jnp.asarray(action)
+        except (TypeError, ValueError, OverflowError):
+            fail("action", action, "an array of numbers")
+        shape = (self.num_agents, self.action_size)
+        if action.shape != shape:
+            raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
+        if not jnp.issubdtype(action.dtype, jnp.floating):
+            raise InputError(f"action: dtype {action.dtype}; expected a floating-point type")
+        # Under jit the result is traced even where the action is a captured constant.
+        finite = jnp.all(jnp.isfinite(action))
+        if not isinstance(finite, Tracer) and not bool(finite):
+            raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
+        return action
+
+    def reset(self) -> ControlState:
+        """Returns the controller state after a reset."""
+        memories = [
+            jax.tree.map(lambda x, n=n: jnp.broadcast_to(x, (n, *x.shape)), skill.init_memory())
+            for skill, _, n in self._groups
+        ]
+        return ControlState(_one_or_all(memories), jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1)))
+
+    def clock(self, state: ControlState) -> jax.Array:
+        """Returns the clocks of the robots' skills (R, n); n is 0 if no robot uses the skill."""
+        clocks = [
+            jax.vmap(skill.clock, axis_size=n)(memory)
+            for (skill, _, n), memory in zip(self._groups, self._memories(state), strict=True)
+        ]
+        width = max((clock.shape[1] for clock in clocks), default=0)
+        clocks = [jnp.pad(clock, ((0, 0), (0, width - clock.shape[1]))) for clock in clocks]
+        rest = self.num_robots - sum(len(clock) for clock in clocks)
+        return jnp.concatenate([jnp.zeros((rest, width)), *clocks]) if rest or len(clocks) > 1 else clocks[0]
+
+    def skill_commands(self, action: jax.Array) -> jax.Array:
+        """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in [-1, 1]."""
+        down, up = self._slopes
+        change = jnp.clip(jnp.where(action < 0, down, up) * action, *self.changes.T)
+        default, columns = self.default_commands, self.skill.index(self.commands)
+        commands = jax.vmap(lambda change: placed(default, columns, default[columns] + change))(change)
+        return self.skill.bounded(commands)
+
+    def action_of(self, change: jax.Array) -> jax.Array:
+        """Computes the actions (..., action_size) that change the commands (..., action_size) from the defaults."""
+        down, up = (np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes)
+        return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
+
+    def rescaled(self, action: jax.Array) -> jax.Array:
+        """Computes the actions that give the commands of `action` (..., action_size) with the skill's own ranges."""
+        gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
+        if np.array_equal(self.changes.T, [-limit, limit]):
+            return action
+        return self.action_of(jnp.clip(gain * action, -limit, limit))
+
+    @jax.named_scope("control")
+    def targets(
+        self,
+        state: ControlState,
+        action: jax.Array,
+        proprioception: Proprioception,
+        npc_commands: jax.Array | None = None,
+        lag: jax.Array | int = 0,
+    ) -> tuple[jax.Array, ControlState]:
+        """Computes the actuator targets (R, 12) of all robots from the agents' actions.
+
+        Args:
+            state: control state.
+            action: of the A agents, the first robots (A, action_size), in [-1, 1].
+            proprioception: of all robots, leading axis R.
+            npc_commands: commands for the NPC robots (R - A, C) of their skill, if there are any.
+            lag: delay of the targets, environment steps ().
+        """
+        agents = self.num_agents
+        target = jnp.asarray(self.neutral)
+        commands, memories = jnp.tile(jnp.asarray(self.default_commands), (agents, 1)), []
+        if self.mode == "command":
+            commands = self.skill_commands(action)
+        elif self.mode == "position":
+            target = target.at[:agents].set(self.robot.joint_targets(action, self.position_scale))
+        else:
+            target = target.at[:agents].set(action * self.robot.torque_limit)
+        asked = [commands] if npc_commands is None else [commands, npc_commands]
+        asked = asked[-len(self._groups) :] if self.npc else [jnp.concatenate(asked)]
+        first, skilled = self.num_robots - sum(n for *_, n in self._groups), []
+        for (skill, params, n), memory, commands in zip(self._groups, self._memories(state), asked, strict=False):
+            sensed = jax.tree.map(lambda x, first=first, n=n: x[first : first + n], proprioception)
+            targets, memory = jax.vmap(functools.partial(skill.targets, params))(memory, commands, sensed)
+            skilled, memories, first = [*skilled, targets], [*memories, memory], first + n
+        if skilled:
+            rest = [target[: self.num_robots - sum(map(len, skilled))]]
+            uses = np.arange(self.num_robots)[:, None] >= (0 if self.mode == "command" else agents)
+            target = jnp.where(uses, jnp.concatenate([*rest, *skilled]), target)
+        delayed = jnp.concatenate([target[None], state.delayed[:-1]])
+        return (delayed[lag] if self.lag else target), ControlState(_one_or_all(memories), delayed)
+
+    @property
+    def npc_skill(self) -> Skill:
+        """Skill of the NPC robots."""
+        return self.npc[0] if self.npc else self.skill
+
+    @property
+    def npc_default_commands(self) -> np.ndarray:
+        """Default commands of the NPC robots' skill (C,)."""
+        return self.npc[0].default_commands() if self.npc else self.default_commands
+
+    @functools.cached_property
+    def changes(self) -> np.ndarray:
+        """Lowest and highest change of each of `commands` by an action (n, 2)."""
+        return self.skill.changes(self.commands, self.ranges, self.default_commands)
+
+    @property
+    def _slopes(self) -> np.ndarray:
+        """Change of each command per unit of a negative and of a positive action (2, n)."""
+        gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
+        return np.abs(self.changes.T) * (gain / limit)
+
+    @property
+    def _groups(self) -> list[tuple[Skill, Any, int]]:
+        """The robots that use a skill, the last ones, in groups: skill, parameters and number."""
+        if self.npc is None:
+            return [] if self.skill_params is None else [(self.skill, self.skill_params, self.num_robots)]
+        agents = [(self.skill, self.skill_params, self.num_agents)] if self.mode == "command" else []
+        return [*agents, (*self.npc, self.num_robots - self.num_agents)]
+
+    def _memories(self, state: ControlState) -> Sequence[Any]:
+        """Returns the recurrent states of the groups."""
+        return [state.skill][: len(self._groups)] if len(self._groups) < 2 else state.skill
+
+
+def _one_or_all(memories: Sequence[Any]) -> Any:
+    """Returns the recurrent state of one group, or those of several; () without one."""
+    return memories[0] if len(memories) == 1 else tuple(memories)
