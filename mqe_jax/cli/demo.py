@@ -48,6 +48,7 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     run = learn(DEMO_TASK, config, impl=impl, run_dir=run_dir, resume=resume)
     if not run.finished:
         raise interrupts.Interrupted("the same command resumes from here")
+    echo("mqe demo: evaluating the trained policy")
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
     curves.save_figure(curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU"), run_dir / "curve.png")

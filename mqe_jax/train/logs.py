@@ -266,7 +266,8 @@ class ProgressLog:
         known = {name: value for name, value in row.items() if math.isfinite(value)}
         rewards = {"average_step_reward": "reward", "episode_return": "return"}
         parts = [f"{word} {known[name]:.3g}" for name, word in rewards.items() if name in known][:1]
-        parts += [f"success {known['success']:.0%}"] if "success" in known else []
+        assisted = " with assistance" if known.get("assistance", 0.0) > 0.0 else ""
+        parts += [f"success {known['success']:.0%}{assisted}"] if "success" in known else []
         self._numbers = ", ".join([*parts, f"{row['fps']:,.0f} steps/s"])
         if self._bar is not None:
             self._bar.update(self._task, completed=self._step)

@@ -70,7 +70,7 @@ def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figur
             rate = [100 * v for v in smooth(table["success"])]
             right.plot(table["env_steps"] / 1e6, rate, color=_SECOND, lw=1.4, alpha=0.9)
         right.set(ylim=(0, 100))
-        right.set_ylabel("success rate (%)", color=_SECOND)
+        right.set_ylabel("success rate in training (%)", color=_SECOND)
         right.spines[["top", "left"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="best")
     return figure
