@@ -138,7 +138,7 @@ def test_seeds_are_trained_in_one_program_into_their_folders() -> None:
 def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     figure = run.plot()
     reward, rate = figure.axes
-    assert (reward.get_ylabel(), rate.get_ylabel()) == ("average step reward", "success rate (%)")
+    assert (reward.get_ylabel(), rate.get_ylabel()) == ("average step reward", "success rate in training (%)")
     np.testing.assert_allclose(np.asarray(reward.lines[0].get_xdata()), run.metrics["env_steps"] / 1e6)
     assert figure._repr_png_().startswith(b"\x89PNG")  # pyright: ignore[reportAttributeAccessIssue]
 
