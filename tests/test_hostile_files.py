@@ -316,7 +316,6 @@ def test_a_policy_of_impossible_numbers(name: str, value: float, trained: Path, 
         ("updates", -1),
         ("updates", 10**6),
         ("learning_rate", -1e-3),
-        ("assistance", 2.0),
         ("optimizer/square/log_std", -1.0),
         ("optimizer/updates", -3),
         ("obs_normalizer/privileged/variance", -1.0),
@@ -360,7 +359,7 @@ def test_a_checkpoint_of_impossible_metadata(
 ) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     path = checkpoint.list_checkpoints(run)[-1]
-    rewrite(path, "checkpoint", "assistance", 0.0, metadata)
+    rewrite(path, "checkpoint", "learning_rate", 1e-3, metadata)
     with pytest.raises(InputError, match=said):
         train(PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
 

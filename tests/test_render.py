@@ -203,11 +203,11 @@ def test_only_libraries_that_draw_without_a_window_are_tried(
 ) -> None:
     found: list[str] = []
 
-    def child(command: Any, *, env: dict[str, str], **options: Any) -> Any:
+    def run(command: Any, *, env: dict[str, str], **options: Any) -> Any:
         found.append(env["MUJOCO_GL"])
         raise OSError
 
-    monkeypatch.setattr(render, "child", child)
+    monkeypatch.setattr(render.subprocess, "run", run)
     monkeypatch.setenv("MUJOCO_GL", chosen)
     assert render._working_backend.__wrapped__() is None and found == tried
 

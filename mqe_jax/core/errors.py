@@ -34,7 +34,7 @@ class NonFiniteError(ArithmeticError):
 
 def warn(message: str) -> None:
     """Warns at the line outside of the package that led to the call."""
-    package, frame, level = f"{Path(__file__).parent}{os.sep}", sys._getframe(), 1
+    package, frame, level = f"{Path(__file__).parents[1]}{os.sep}", sys._getframe(), 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, stacklevel=level)
