@@ -234,6 +234,30 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     viewer.server.stop()
 
 
+def test_the_scene_is_lit_without_visers_own_lights_and_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mjviser")
+    from viser import SceneApi
+
+    from mqe_jax.view.viewer import Viewer
+
+    lights: list[tuple[str, Any, Any]] = []
+
+    def noted(name: str, real: Any) -> Any:
+        def add(self: Any, *arguments: Any, **options: Any) -> Any:
+            lights.append((name, arguments, options.get("cast_shadow")))
+            return real(self, *arguments, **options)
+
+        return add
+
+    for name in ("configure_default_lights", "add_light_hemisphere", "add_light_directional"):
+        monkeypatch.setattr(SceneApi, name, noted(name, getattr(SceneApi, name)))
+    viewer = Viewer(port=free_port())
+    viewer.show(session(Driven(), num_envs=1))
+    viewer.server.stop()
+    assert ("configure_default_lights", (False,), None) in lights
+    assert [shadow for name, _, shadow in lights if name == "add_light_directional"] == [False]
+
+
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_cameras_start_at_the_action_of_one_environment_and_above_several(num_envs: int) -> None:
     pytest.importorskip("mjviser")
