@@ -142,7 +142,7 @@ class FakeVectorEnv:
         return jax.vmap(one)(state, action)
 
 
-def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, *_: Any) -> Any:
+def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, *_: Any, final: Any = ()) -> Any:
     """Replaces `mqe_jax.runs.build.make_env`."""
     return made(num_envs)
 

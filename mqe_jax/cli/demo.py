@@ -33,7 +33,7 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     config = for_task(base_config(DEMO_TASK, settings), DEMO_TASK)
     check_folder(run_dir)
     resume = (run_dir / CONFIG_FILE).exists()
-    _, batch = make_env(DEMO_TASK, impl, config.env, config.num_envs)
+    _, batch = make_env(DEMO_TASK, impl, config.env, config.num_envs, final=config.network.critic_reads)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
     playing: dict[str, Any] = {"env": config.env, "impl": impl, "deterministic": True}
