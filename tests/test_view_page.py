@@ -89,8 +89,11 @@ class Page:
 
     def robots(self) -> np.ndarray:
         """x, y, z, vx, vy, turn of each robot, from the table (A, 6)."""
-        rows = self.page.locator("table").first.locator("tbody tr").all_inner_texts()
-        return np.array([[float(cell) for cell in row.split("\t")[1:]] for row in rows])
+        cells: list[list[str]] = [[]]
+        while not all(len(row) == 6 for row in cells):  # the page may be drawing the table anew
+            rows = self.page.locator("table").first.locator("tbody tr").all_inner_texts()
+            cells = [row.split("\t")[1:] for row in rows] or [[]]
+        return np.array(cells, float)
 
     def text(self) -> str:
         return self.page.locator("body").inner_text()
