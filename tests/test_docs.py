@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, FIRST_STEPS, parse
 from mqe_jax.core.settings import override
 from mqe_jax.envs import PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
@@ -144,6 +145,26 @@ def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
     check_commands(
         "```bash\n" + re.sub(r"   .*", "", "\n".join(re.findall(r"^  (mqe .*)", FIRST_STEPS, re.M))) + "\n```"
     )
+
+
+class Begun(Exception):
+    """Ends a demo after its untrained policy is made."""
+
+
+def test_the_demo_makes_a_policy_of_its_real_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other tests of the demo have a task without physics, whose states hold all final observations."""
+
+    def evaluated(task: str, policy: Any, **_: Any) -> None:
+        assert (task, policy.task, policy.agents) == ("go1gate", "go1gate", 2)
+        raise Begun
+
+    monkeypatch.setattr(demo, "evaluate", evaluated)
+    settings = tmp_path / "small.yaml"
+    settings.write_text(
+        "{num_envs: 4, rollout_steps: 8, total_steps: 32, env: {control: position}, ppo: {minibatches: 1}}"
+    )
+    with pytest.raises(Begun):
+        demo.demo(tmp_path / "run", str(settings), 4, "c")
 
 
 # -- examples and notebooks --------------------------------------------------------------------------------------------
