@@ -4,6 +4,7 @@ import functools
 import gc
 import importlib.util
 import os
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -112,3 +113,11 @@ def shared_programs() -> Iterator[None]:
         patch.setattr(Seeds, "map", seeds_map)
         patch.setattr(runner, "Seeds", seeds)
         yield
+
+
+@pytest.fixture
+def sigint() -> Iterator[None]:
+    """Python's own handler, which a background job of a shell lacks."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -155,8 +155,9 @@ def test_a_later_signal_does_not_wait_for_the_saving(tmp_path: Path) -> None:
     assert end(process, signal.SIGINT, seconds=5) == ["mqe: interrupted"]
 
 
+@pytest.mark.usefixtures("sigint")
 def test_without_the_command_line_only_sigint_is_deferred() -> None:
-    """As in a notebook, where a later one raises KeyboardInterrupt."""
+    """As in a notebook, where a later one raises KeyboardInterrupt; an ignored one stays ignored."""
     with interrupts.deferred() as signalled:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
@@ -165,6 +166,10 @@ def test_without_the_command_line_only_sigint_is_deferred() -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interrupts.deferred() as signalled:
+        signal.raise_signal(signal.SIGINT)
+    assert signalled() == 0
 
 
 def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:

@@ -210,6 +210,7 @@ def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path
     assert len(rows(tmp_path)) == 5
 
 
+@pytest.mark.usefixtures("sigint")
 def test_an_interrupt_saves_the_last_complete_update(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     """SIGINT or a KeyboardInterrupt in a program or notebook that calls `train`."""
     wanted = [1, 3]

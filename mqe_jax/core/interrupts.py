@@ -66,7 +66,7 @@ def installed() -> bool:
 def deferred() -> Iterator[Callable[[], int]]:
     """Yields a function that returns the signal that came since, or 0; a later one ends the process at once.
 
-    Without `install`, as in a notebook, it defers SIGINT, and a later one raises KeyboardInterrupt.
+    Without `install`, as in a notebook, it defers SIGINT, unless ignored, and a later one raises KeyboardInterrupt.
     """
     global _deferring, _noted
 
@@ -75,7 +75,8 @@ def deferred() -> Iterator[Callable[[], int]]:
             raise KeyboardInterrupt
 
     restore = None
-    if not _installed and threading.current_thread() is threading.main_thread():
+    handled = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
+    if handled and not _installed and threading.current_thread() is threading.main_thread():
         restore = signal.signal(signal.SIGINT, note)
     _deferring, _noted = True, 0
     try:
