@@ -147,51 +147,10 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     return figures
 
 
-ONE_STEP = 1e-3
-"""Largest difference of a position, m, quaternion or angle, rad, after one environment step."""
-ENVS = 2
-
-
 def covering() -> list[tuple[str, str, str]]:
     """Returns one combination for every task, which has every pair of robot and control mode several times."""
     pairs = list(itertools.product(robots.ROBOTS, MODES))
     return [(task, *pairs[number % len(pairs)]) for number, task in enumerate(TASKS)]
-
-
-def one_step(task: str, robot: str, control: str, engine: str) -> tuple[dict[str, float], list[str]]:
-    """Returns the difference after one step and how far robots moved, and what is wrong."""
-    with jax.default_device(jax.devices("cpu")[0]):
-        env, *arrays = stepped(task, robot, control)
-    states, action, after = jax.device_get(arrays)
-    moved = after.data.qvel[:, env.index.joint_qvel]
-    metrics = {**after.metrics, **after.outcome.named()}
-    shown = (after.obs, after.privileged_obs, after.reward, *metrics.values(), after.data.qpos, after.data.qvel)
-    wrong = [] if all(np.all(np.isfinite(leaf)) for leaf in shown) else ["not finite"]
-    wrong += [] if after.obs.shape == (ENVS, env.num_agents, env.observation_size) else [f"obs {after.obs.shape}"]
-    wrong += [] if np.ptp(moved, axis=0).max() > 1e-3 else ["two actions have the same effect"]
-    row = {"joint_speed": float(f"{np.abs(moved).max():.3g}")}
-    if engine != "c":
-        other: Any = make(task, impl=engine, robot=robot, control=control, num_envs=ENVS)
-        fresh = jax.jit(jax.vmap(other.reset))(jax.random.split(jax.random.PRNGKey(0), ENVS))
-        data = fresh.data.replace(**{name: getattr(states.data, name) for name in STATE_FIELDS})
-        there = jax.jit(jax.vmap(other.step))(dataclasses.replace(states, data=data), action)
-        row["apart"] = float(f"{np.abs(np.asarray(there.data.qpos - after.data.qpos)).max():.3g}")
-        wrong += [] if row["apart"] <= ONE_STEP else [f"engines differ by {row['apart']}"]
-    return row, wrong
-
-
-def stepped(task: str, robot: str, control: str, settle: int = 1) -> tuple[Any, State, jax.Array, State]:
-    """Returns an environment on the C engine, states after `settle` steps without action, an action, the states after.
-
-    The actions of the two environments differ.
-    """
-    env: Any = make(task, impl="c", robot=robot, control=control, num_envs=ENVS)
-    states = jax.jit(jax.vmap(env.reset))(jnp.tile(jax.random.PRNGKey(0), (ENVS, 1)))
-    step = jax.jit(jax.vmap(env.step))
-    for _ in range(settle):
-        states = step(states, jnp.zeros((ENVS, env.num_agents, env.action_size)))
-    action = jax.random.uniform(jax.random.PRNGKey(1), (ENVS, env.num_agents, env.action_size), minval=-1.0)
-    return env, states, action, step(states, action)
 
 
 def main() -> None:

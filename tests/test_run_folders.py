@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from fake_env import SMALL
@@ -21,8 +20,7 @@ from mqe_jax import cli
 from mqe_jax.cli import programs
 from mqe_jax.core import files, interrupts
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import locked, remove_temporaries, replacing, write_atomically
-from mqe_jax.core.settings import override
+from mqe_jax.core.files import remove_temporaries, replacing
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -68,32 +66,6 @@ def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> N
         assert [path.name for path in list_checkpoints(moved)] == ["step_000000000000.safetensors"]
         assert len((moved / "metrics.csv").read_text().splitlines()) == (3 if how == "replaced" else 2)
     assert [path.name for path in tmp_path.rglob(".*")] == [files.LOCK] * (how != "removed")  # not through the old path
-
-
-def test_a_second_training_keeps_its_checkpoints(tmp_path: Path) -> None:
-    """Of a folder that is renamed while a training writes to it, and replaced by another training."""
-    folder, seen = tmp_path / "run", {}
-
-    def lose(state: object, row: dict[str, float]) -> None:
-        if row["updates"] == 1:
-            folder.rename(tmp_path / "moved")
-            train(PROBE, SETTINGS, folder)
-            seen.update({path: path.read_bytes() for path in folder.rglob("*") if path.is_file()})
-
-    with pytest.raises(InputError, match="was removed, renamed or replaced"):
-        train(PROBE, SETTINGS, folder, on_update=lose)
-    assert len(seen) >= 5 and {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == seen
-
-
-def test_a_lock_that_ends_is_forgotten(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    with locked(folder):
-        replace(folder)
-        with pytest.raises(InputError, match="run_dir"):
-            write_atomically(folder / "file", b"1")
-    write_atomically(folder / "file", b"2")
-    assert (folder / "file").read_bytes() == b"2"
 
 
 @pytest.mark.usefixtures("fake_tasks")
@@ -234,24 +206,6 @@ def alone(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tu
     return folder, state
 
 
-@pytest.mark.soak
-def test_each_seed_trains_as_alone_and_resumes(tmp_path: Path, alone: tuple[Path, TrainState]) -> None:
-    configs = [seeded(seed) for seed in (0, 1, 2)]
-    folders = [tmp_path / f"seed{config.seed}" for config in configs]
-    with pytest.raises(Stop):
-        train_seeds(PROBE, configs, folders, on_update=stop_after(2))
-    (folders[1] / "checkpoints" / "step_000000000032.safetensors").unlink()  # killed between two seeds' checkpoints
-    states = train_seeds(PROBE, configs, folders, resume=True)
-    pairs = zip(jax.tree.leaves(states[1].params), jax.tree.leaves(alone[1].params), strict=True)
-    for together, single in pairs:
-        np.testing.assert_allclose(together, single, rtol=1e-4, atol=1e-5)
-    assert int(states[1].updates) == 5
-    assert [len((folder / "metrics.csv").read_text().splitlines()) for folder in (folders[1], alone[0])] == [6, 6]
-    assert read_policy(folders[2]).metadata["env_steps"] == 80
-    longer = [override(config, {"total_steps": 96}) for config in configs]
-    assert int(train(PROBE, longer[1], folders[1], resume=True).updates) == 6  # one seed resumes separately
-
-
 def test_seeds_killed_between_two_checkpoints_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where each keeps one checkpoint, they keep the one before too, which all have."""
     configs, folders = [seeded(seed, checkpoint__kept=1) for seed in (0, 1)], [tmp_path / "0", tmp_path / "1"]
@@ -294,17 +248,6 @@ def test_seeds_must_have_the_same_settings(tmp_path: Path) -> None:
         train_seeds(PROBE, [seeded(0), seeded(1, ppo__clip=0.3)], [tmp_path / "a", tmp_path / "b"])
 
 
-def test_a_checkpoint_without_environments_is_small_and_resumes(tmp_path: Path, alone: tuple[Path, TrainState]) -> None:
-    config = seeded(1, checkpoint__environments=False)
-    with pytest.raises(Stop):
-        train(PROBE, config, tmp_path, on_update=stop_after(2))
-    small, large = (list_checkpoints(folder)[-1].stat().st_size for folder in (tmp_path, alone[0]))
-    assert small < large
-    state = train(PROBE, config, tmp_path, resume=True)
-    assert int(state.updates) == 5
-    assert np.all(np.asarray(state.rollout.env_state.step) >= 0)
-
-
 def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_path: Path) -> None:
     configs = [seeded(seed, evaluation__every=2, evaluation__episodes=4) for seed in (0, 1)]
     folders = [tmp_path / f"seed{config.seed}" for config in configs]
@@ -345,15 +288,3 @@ def test_a_compiled_program_is_stored_whole_or_not_at_all(tmp_path: Path) -> Non
     assert cache.get("jit_step-1") is None and list(tmp_path.iterdir()) == []
     cache.put("jit_step-1", bytes(1000))
     assert cache.get("jit_step-1") == bytes(1000)
-
-
-def test_parts_of_programs_that_a_killed_process_left_are_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    left = tmp_path / f".mqe-{16 * 'a'}.tmp"
-    left.write_bytes(b"half")
-    os.utime(left, (1.0, 1.0))
-    (tmp_path / "jit_step-2-cache").write_bytes(b"whole")
-    programs.write_whole()
-    assert [path.name for path in tmp_path.iterdir()] == ["jit_step-2-cache"]
