@@ -221,11 +221,6 @@ def test_gate_stands_where_each_environment_drew_it() -> None:
     np.testing.assert_allclose(gap[:, 1] - right[:, 1] - half, 0.3, atol=1e-5)
 
 
-def test_engine_names_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"impl.*'wrap'.*did you mean 'warp'"):
-        engines.resolve("wrap")
-
-
 class Frozen(CEngine):
     """An engine on which nothing moves."""
 

@@ -21,7 +21,7 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import foot_positions, knee_positions
 from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
-from mqe_jax.terrain import Gate, Plane, RoughGround, SpawnArea, Track
+from mqe_jax.terrain import Plane, RoughGround, SpawnArea, Track
 from tests.states import made
 
 PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
@@ -196,16 +196,6 @@ def test_missing_walk_weights_say_how_to_make_them() -> None:
 
 
 ROUGH = RoughGround(amplitude=0.08, wavelength=1.0, octaves=3, seed=1)
-
-
-def test_the_walls_of_a_gate_reach_the_side_walls_wherever_it_stands() -> None:
-    gate = Gate(length=4.0, width=0.8, offset=(0.0, 0.3), random=(0.0, 0.5))
-    layout = Track((gate,), width=3.0).layout()
-    right, left = layout.walls
-    (middle, aside), reach = (layout.anchors[0].position[1], layout.anchors[0].spread[1]), 1.5 - 1e-6
-    for center in (middle - aside, middle + aside):
-        assert center + right.center[1] - right.size[1] / 2 <= -reach
-        assert center + left.center[1] + left.size[1] / 2 >= reach
 
 
 def rough_scene() -> CompiledScene:
