@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import json
 import math
 import struct
 from pathlib import Path
@@ -19,9 +18,7 @@ from safetensors.numpy import save_file
 from mqe_jax.core.errors import InputError
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
-from mqe_jax.train.checkpoint import latest, load_tree, read_metadata, save_checkpoint, save_tree
-from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.monitor import read_evaluations
+from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
 from tests.training import assert_same
 
 ROWS = [
@@ -50,21 +47,6 @@ def events(folder: Path) -> list[tuple[int, str, float]]:
     return found
 
 
-def history(file: Path) -> list[dict[str, float]]:
-    """Reads the logged rows of a wandb file of one block: header, then records of checksum, length, type, data."""
-    records = pytest.importorskip("wandb.proto.wandb_internal_pb2", reason="needs the extra log")
-    data = file.read_bytes()
-    assert len(data) < 32 * 1024  # longer files have several blocks
-    data, rows = data[7:], []
-    while data:
-        _, length, _ = struct.unpack("<IHB", data[:7])
-        items = records.Record.FromString(data[7 : 7 + length]).history.item
-        row = {name: float(item.value_json) for item in items for name in (item.key, *item.nested_key) if name}
-        rows += [{name: value for name, value in row.items() if not name.startswith("_")}] if row else []
-        data = data[7 + length :]
-    return rows
-
-
 def test_csv(tmp_path: Path) -> None:
     """One row per update, NaN where a number is missing; a resumed log drops what comes after its step."""
     write(logs.CsvLog(tmp_path, 0))
@@ -75,15 +57,6 @@ def test_csv(tmp_path: Path) -> None:
         {"env_steps": "100", "average_step_reward": "0.25", "success": "nan"},
         {"env_steps": "200", "average_step_reward": "1", "success": "1"},
     ]
-
-
-def test_a_table_that_was_removed_begins_anew(tmp_path: Path) -> None:
-    """Later rows have names above them."""
-    log = logs.CsvLog(tmp_path, 0)
-    log.write({"env_steps": 100, "success": 0.5})
-    (tmp_path / logs.CSV_FILE).unlink()
-    log.write({"env_steps": 200, "success": 0.75})
-    assert (tmp_path / logs.CSV_FILE).read_text() == "env_steps,success\n200,0.75\n"
 
 
 def test_tensorboard(tmp_path: Path) -> None:
@@ -108,10 +81,9 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (file,) = first.glob("wandb/offline-run-*/*.wandb")
     assert file.name == f"run-{run_id}.wandb"
     wandb.teardown()  # the end of the program; before it the file may lack rows
-    assert history(file) == [
-        {"env_steps": 100, "average_step_reward": 0.25},
-        {"env_steps": 200, "average_step_reward": 0.5, "success": 0.75},
-    ]
+    content = file.read_bytes()
+    assert all(word in content for word in (b"average_step_reward", b"0.25", b"success", b"0.75"))
+    assert b"NaN" not in content
     write(logs.LOGGERS["wandb"](first, 200), [{"env_steps": 300, "average_step_reward": 1.0}])
     assert (first / "wandb" / "run_id").read_text() == run_id
 
@@ -128,32 +100,6 @@ def test_progress_shows_what_is_known(row: dict[str, float], said: str, capsys: 
     with logs.ProgressLog("walk", 100) as log:
         log.write({"env_steps": 100, "fps": 8.0, **row})
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("terminal", [False, True])
-def test_compiling_is_shown_and_does_not_count(
-    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """40 s of compiling, then 60 s for each hundredth of the steps; a long training names a shorter one once."""
-    now = [0.0]
-    monkeypatch.setattr(logs.time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(logs, "_PLAIN_SECONDS", 0.0)
-    monkeypatch.setattr(logs.Console, "is_terminal", terminal)
-    monkeypatch.setenv("COLUMNS", "120")
-    with logs.ProgressLog("gate", 10_000) as log:
-        for _ in range(2):
-            with log.doing("compiling"):
-                now[0] += 20.0
-                if log._bar is not None:
-                    log._bar.refresh()
-        log.start(1_000)
-        for step in (1_100, 1_200):
-            now[0] += 60.0
-            log.write({"env_steps": step, "fps": 10.0})
-    said = capsys.readouterr().err
-    assert ("compiling (0:00:40)" if terminal else "gate: compiling") in said
-    assert said.count("--config demo takes minutes") == 1
-    assert "gate: takes about 89 minutes here" in said and "1:28:00 left" in said
 
 
 def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -185,14 +131,6 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     logs.check_loggers(("tensorboard",))
 
 
-def test_loggers_are_a_setting() -> None:
-    """Selected by name; an unknown name is rejected."""
-    assert TrainConfig().loggers == ("tensorboard",)
-    assert set(TrainConfig(loggers=("tensorboard", "wandb")).loggers) == set(logs.LOGGERS)
-    with pytest.raises(InputError, match="loggers"):
-        TrainConfig(loggers=("mlflow",))  # type: ignore[arg-type]
-
-
 # -- checkpoints: every leaf is kept, old ones go, damage is named -----------------------------------------------------
 
 TREE = {
@@ -210,25 +148,6 @@ def test_a_checkpoint_keeps_every_leaf(tmp_path: Path) -> None:
     assert [x.dtype for x in jax.tree.leaves(restored.tree)] == [x.dtype for x in jax.tree.leaves(TREE)]
     assert restored.metadata == {"note": "ü"}
     assert [p.name for p in tmp_path.iterdir()] == ["tree.safetensors"]
-
-
-def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
-    contents = set()
-    for _ in range(4):
-        save_tree(tmp_path / "x", TREE, {"b": 1, "a": [2]}, kind="policy")
-        contents.add((tmp_path / "x").read_bytes())
-    assert len(contents) == 1
-
-
-@pytest.mark.parametrize(("old", "new"), [(b'"I8"', b'"U8"'), (b"[2,3]", b"[3,2]")])
-def test_the_same_bytes_as_other_arrays_do_not_match_their_checksum(old: bytes, new: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "x"
-    save_tree(path, TREE, {}, kind="policy")
-    whole = path.read_bytes()
-    assert whole.count(old) == 1
-    path.write_bytes(whole.replace(old, new))
-    with pytest.raises(InputError, match="does not match its checksum"):
-        read_metadata(path, kind="policy")
 
 
 def test_old_checkpoints_go(tmp_path: Path) -> None:
@@ -311,12 +230,3 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     path.write_bytes(whole)
     assert "d is missing" in error_of({**TREE, "d": jnp.zeros(())})
     assert "unexpected entry c/0" in error_of({k: v for k, v in TREE.items() if k != "c"})
-
-
-def test_evaluations_are_read_in_the_order_of_their_file(tmp_path: Path) -> None:
-    """So that a resumed run writes the same file."""
-    rewards = {"average_step_reward": 1.0}
-    point = {"env_steps": 16, "episodes": 2, "sampled": rewards, "deterministic": rewards}
-    text = json.dumps({"evaluations": [point], "absolute": None, "ended_at": 16}, indent=1)
-    (tmp_path / "evaluations.json").write_text(text)
-    assert json.dumps(read_evaluations(tmp_path), indent=1) == text

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,21 +26,6 @@ from mqe_jax.train.schedules import scheduled
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
-
-
-def test_gae_by_hand_with_termination_truncation_and_going_on() -> None:
-    gamma, lam = 0.5, 0.5
-    # three environments: the step at t = 1 terminates, truncates, goes on
-    reward = jnp.ones((3, 3))
-    value = jnp.full((3, 3), 2.0)
-    next_value = jnp.full((3, 3), 4.0)
-    terminated = jnp.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]], bool)
-    done = jnp.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]], bool)
-    advantage, target = gae(reward, value, next_value, terminated, done, gamma=gamma, gae_lambda=lam)
-    # delta = 1 + 0.5 x 4 - 2 = 1, or 1 - 2 = -1 where terminated; trace decays by 0.25
-    expected = [[1 - 0.25, 1 + 0.25, 1 + 0.25 * 1.25], [-1, 1, 1.25], [1, 1, 1]]
-    np.testing.assert_allclose(advantage, expected, rtol=1e-6)
-    np.testing.assert_allclose(target, advantage + 2.0)
 
 
 def test_gae_of_integer_rewards_keeps_fractions_of_the_bootstrap() -> None:
@@ -108,14 +91,6 @@ def test_value_statistics_at_their_limits() -> None:
     np.testing.assert_allclose(value_normalize(statistics, jnp.float32(5.5)), 100.0, rtol=2e-2)
 
 
-def test_a_small_gradient_is_not_clipped() -> None:
-    optimizer, params = adam(max_grad_norm=1.0), {"a": jnp.zeros(2)}
-    gradient = {"a": jnp.array([0.3, -0.4])}
-    _, state, norm = optimizer.update(gradient, optimizer.init(params), params, 0.1)
-    assert float(norm) == pytest.approx(0.5)
-    np.testing.assert_allclose(state.mean["a"], [0.03, -0.04], rtol=1e-5)
-
-
 def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() -> None:
     config = build(TrainConfig, {"num_envs": 2, "rollout_steps": 1, "total_steps": 20, "ppo": {"critic_warmup": 0.3}})
     begins = [bool(scheduled(config, jnp.int32(i)).actor_begins) for i in range(10)]
@@ -128,16 +103,6 @@ def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() ->
     assert float(optimizer.update(gradient, begun_anew(state, False), params, 0.1)[0]["a"]) < -0.15
     again = begun_anew(state, jnp.bool_(True))
     assert float(optimizer.update(gradient, again, params, 0.1)[0]["a"]) == pytest.approx(-0.1, rel=1e-4)
-
-
-def test_mlp_has_no_activation_after_the_last_layer() -> None:
-    params = nn.mlp_init(KEY, [2, 4, 3], final_scale=1.0)
-    x = jax.random.normal(KEY, (5, 2))
-    hidden = jnp.maximum(x @ params["0"]["weight"] + params["0"]["bias"], 0)
-    np.testing.assert_allclose(nn.mlp(params, x), hidden @ params["1"]["weight"], atol=1e-5)
-    assert float(nn.mlp(params, x, activate_last=True).min()) == 0.0
-    with pytest.raises(ValueError, match="sizes"):
-        nn.mlp_init(KEY, [2])
 
 
 def test_gru_by_hand() -> None:
@@ -171,28 +136,6 @@ def test_a_bounded_parameter_comes_back_from_beyond_its_bounds() -> None:
     np.testing.assert_allclose(nn.bounded(x, -1.5, 1.5), [-1.5, -1.0, 0.0, 1.0, 1.5])
     np.testing.assert_allclose(slope(1.0), [0, 1, 1, 1, 1])  # descent lowers x: back from above, never farther down
     np.testing.assert_allclose(slope(-1.0), [-1, -1, -1, -1, 0])
-
-
-def test_the_deviation_of_an_actor_comes_back_from_beyond_its_bounds() -> None:
-    settings = ActorCritic(
-        recurrent=False, hidden_sizes=(4,), log_std_init=-2.0, log_std_max=-1.0, log_std_min=-3.0, critic_input="own"
-    )
-    dims = EnvDims(agents=1, observation=2, privileged=0, action=3, values=1)
-    network = settings.build(dims)
-    params = random_params(network)
-    obs, first, action = jnp.zeros((1, 1, 1, 2)), jnp.zeros((1, 1), bool), jnp.zeros((1, 1, 1, 3))
-
-    @jax.jit
-    def entropy(log_std: jax.Array) -> jax.Array:
-        now = network.evaluate(
-            {**params, "log_std": log_std}, network.initial_memory(1), first, obs, obs[:, :, 0], action
-        )
-        return jnp.sum(now.entropy)
-
-    beyond = jnp.array([0.0, -2.0, -4.0])
-    assert float(entropy(beyond)) == pytest.approx(3 * 0.5 * math.log(2 * math.pi * math.e) - 1 - 2 - 3, rel=1e-5)
-    np.testing.assert_array_equal(jax.grad(entropy)(beyond), [1.0, 1.0, 0.0])
-    np.testing.assert_array_equal(jax.grad(lambda x: -entropy(x))(beyond), [0.0, -1.0, -1.0])
 
 
 @pytest.mark.parametrize("recurrent", [False, True])

@@ -28,12 +28,10 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.logs import read_metrics
 from mqe_jax.train.monitor import Monitor, read_evaluations, score
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import open_training, train
-from mqe_jax.train.start import check_parameters, check_same, without_environments
-from mqe_jax.viz.curves import plot_curves, save_figure
+from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.training import Probe, assert_same
 
@@ -102,16 +100,6 @@ def test_a_killed_training_resumes_as_if_never_stopped(
     assert [int(row["env_steps"]) for row in rows(run_dir)] == [16, 32, 48, 64, 80]
 
 
-def test_what_a_run_leaves_behind(straight: tuple[Path, TrainState]) -> None:
-    run_dir, _ = straight
-    assert load_run_config(run_dir) == settings()
-    assert [p.name for p in list_checkpoints(run_dir)] == [
-        "step_000000000064.safetensors",
-        "step_000000000080.safetensors",
-    ]
-    assert not [p for p in run_dir.rglob("*") if p.name.endswith(".tmp")]
-
-
 def test_a_training_without_a_folder_learns_the_same_and_writes_nothing(
     straight: tuple[Path, TrainState], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,11 +114,6 @@ def test_a_training_without_a_folder_learns_the_same_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(InputError, match="resume: True is not allowed; it must be false without a run_dir"):
         train(PROBE, settings(), None, resume=True)
-
-
-def test_a_checkpoint_without_environments_has_all_else(straight: tuple[Path, TrainState]) -> None:
-    names = {field.name for field in dataclasses.fields(TrainState)}
-    assert set(without_environments(straight[1])) == names - {"rollout"}
 
 
 def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:
@@ -287,13 +270,6 @@ def test_a_writer_that_fails_ends_the_training_and_names_its_file(
     assert_same(train(PROBE, settings(), tmp_path, resume=True), straight[1])
     assert [int(row["env_steps"]) for row in rows(tmp_path)] == [16, 32, 48, 64, 80]
     assert read_policy(tmp_path).metadata["env_steps"] == 80
-
-
-def test_a_curve_that_cannot_be_written_is_named(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
-    with largest_file(1000), pytest.raises(OSError, match="File too large") as failed:
-        save_figure(plot_curves([read_metrics(straight[0] / "metrics.csv")], "probe"), tmp_path / "curve.png")
-    assert failed.value.filename == str(tmp_path / "curve.png")
-    assert list(tmp_path.iterdir()) == []
 
 
 def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:

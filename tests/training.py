@@ -130,12 +130,6 @@ def show_hidden_first(hidden: jax.Array, step: jax.Array) -> jax.Array:
     return jnp.where(step == 0, hidden, 0.0)[:, None]
 
 
-def show_step_and_parity(hidden: jax.Array, step: jax.Array) -> jax.Array:
-    """Shows the step modulo 4, one-hot, and whether the environment is odd."""
-    parity = (jnp.arange(hidden.shape[0]) % 2).astype(jnp.float32)
-    return jnp.concatenate([jax.nn.one_hot(step % 4, 4), parity[:, None]], axis=-1)
-
-
 def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Reward 1 for every action."""
     return jnp.ones_like(hidden)
