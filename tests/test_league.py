@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +26,13 @@ from mqe_jax.selfplay.opponents import versus
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, env_dims, make_learner
-from mqe_jax.train.policy import policy_of, read_policy, save_policy
+from mqe_jax.train.policy import policy_of, save_policy
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-import pool_member
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}
@@ -92,22 +88,6 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
             jax.tree.map(np.testing.assert_array_equal, opponent.arrays, of_pool)
 
 
-def test_new_environments_play_what_the_league_says(history: list[TrainState]) -> None:
-    """As after a resume without environments: they are reset, and the rest is of an earlier update."""
-    league = League(matches(num_envs=8), SOURCES, config_of())
-    reset = league.env.reset(KEY)
-    state = dataclasses.replace(history[9], rollout=history[9].rollout._replace(env_state=reset))
-    newest, *drawn, idle = league.seat(state).rollout.env_state.opponents
-    same = lambda x, y: jax.tree.map(np.testing.assert_array_equal, x, y)  # noqa: E731
-    for opponent, arrays in (
-        (newest, league._own(state)),
-        *((o, league._member(state.extra, 1 + i)) for i, o in enumerate(drawn)),
-    ):
-        same(opponent.arrays, arrays)
-        same(opponent.before, arrays)
-    same(idle, reset.opponents[3])
-
-
 def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainState], tmp_path: Path) -> None:
     config, state = config_of(start=str(tmp_path)), history[9]
     league = League(matches(num_envs=8), SOURCES, config)
@@ -133,22 +113,6 @@ def test_a_league_resumed_without_environments_plays_its_members(history: list[T
     seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)
     for now, before in seats:
         jax.tree.map(np.testing.assert_array_equal, now.arrays, before.arrays)
-
-
-@pytest.mark.parametrize(("share", "nearest"), [(0.45, 4), (1.0, 9)])
-def test_a_member_of_a_pool_becomes_a_policy_file(
-    history: list[TrainState], tmp_path: Path, share: float, nearest: int
-) -> None:
-    config, state = config_of(), history[9]
-    dims, born = env_dims(versus(matches(), ["idle"]), config), np.asarray(state.extra.pool.born)
-    save_policy(tmp_path, policy_of(state, dims, config, task="go1tug", env_steps=9 * config.steps_per_update))
-    save_checkpoint(tmp_path, state, 9, {}, keep=1)
-    place = int(np.abs(born - share * 9).argmin())
-    assert abs(born[place] - nearest) <= 1
-    save_policy(tmp_path, pool_member.member(tmp_path, share), "member.safetensors")
-    member = read_policy(tmp_path / "member.safetensors")
-    assert member.metadata["env_steps"] == born[place] * config.steps_per_update
-    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[place]), member.params, state.extra.pool.arrays.params)
 
 
 def test_a_block_plays_another_member_after_its_episodes(history: list[TrainState]) -> None:
@@ -192,16 +156,6 @@ def test_a_winning_policy_joins_early_but_not_at_once(
         return rules.after(dataclasses.replace(state, updates=updates))[0].extra.snapshot
 
     assert jax.jit(jax.vmap(last))(jnp.array([1, 2, 7, 8], jnp.int32)).tolist() == snapshots
-
-
-def test_blocks_with_other_opponents_protect_no_member(history: list[TrainState]) -> None:
-    rules, state = League(matches(num_envs=8), SOURCES, config_of()), history[5]
-    beaten = state.extra.pool._replace(score=jnp.array([9.0, 8.0, 7.0, 0.0]), games=jnp.full(4, 9.0))
-    after = jax.jit(rules.after)
-    for member, replaced in (([0, 2, 3, 0], 0), ([0, 0, 3, 0], 1), ([0, 0, 1, 0], 2)):
-        league = state.extra._replace(pool=beaten, member=jnp.array(member, jnp.int32), played=jnp.zeros(4, jnp.int32))
-        born = after(dataclasses.replace(state, updates=jnp.int32(99), extra=league))[0].extra.pool.born
-        assert jnp.argmax(born) == replaced and int(born[replaced]) == 99
 
 
 def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
@@ -268,30 +222,6 @@ def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     assert {"league/win/newest", "league/loss/idle", "league/rating", "league/members"} <= set(header)
 
 
-@pytest.mark.soak
-def test_a_league_killed_five_times_ends_as_if_never_killed(tmp_path: Path) -> None:
-    """SIGKILL at random moments: while an update runs, a row or a checkpoint is written."""
-    random, updates = np.random.default_rng(), 400
-    arguments = [sys.executable, "-m", "mqe_jax.cli", *training(16 * updates, "--checkpoint.every", "3", "--resume")]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run([*arguments, "--run-dir", str(whole)], check=True, capture_output=True)
-    table = killed / "metrics.csv"
-
-    def rows() -> int:
-        return len(table.read_text().splitlines()) if table.is_file() else 0
-
-    moments = [*np.sort(random.choice(np.arange(2, updates - 40), 5, replace=False)), None]
-    for moment in moments:
-        with subprocess.Popen([*arguments, "--run-dir", str(killed)], stderr=subprocess.DEVNULL) as process:
-            while moment is not None and rows() < moment and process.poll() is None:
-                time.sleep(0.001)
-            if moment is not None:
-                time.sleep(random.uniform(0.0, 0.02))
-                process.send_signal(signal.SIGKILL)
-        assert process.returncode == (0 if moment is None else -signal.SIGKILL), moments
-    assert_same_run(whole, killed)
-
-
 @pytest.mark.parametrize("task", MATCHES)
 def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> None:
     config = base_config(task, None)
@@ -333,14 +263,6 @@ def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> No
 
     few, many = interval(4), interval(256)
     assert few[1] - few[0] > 200 and few[0] < many[0] and few[1] < many[1]
-
-
-def test_a_round_robin_names_what_is_wrong() -> None:
-    nothing: Any = None
-    with pytest.raises(InputError, match="matches: None is not allowed; it must be an environment"):
-        tournament.round_robin(nothing, {}, KEY)
-    with pytest.raises(InputError, match="policies: None is not allowed"):
-        tournament.round_robin(matches(), nothing, KEY)
 
 
 @pytest.mark.parametrize("params", [{"control": "position"}, {"commands": ["vx", "yaw_rate"]}])

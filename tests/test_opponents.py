@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -110,15 +109,6 @@ def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv)
     np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))  # without opponent: idle
 
 
-@pytest.mark.parametrize("task", MATCHES)
-def test_scripted_policies_act_for_one_team(task: str) -> None:
-    env = make(task, impl="c", num_envs=1)
-    size = env.num_agents // 2
-    obs = jnp.ones((3, size, env.observation_size))
-    action, _ = load_policy("scripted", env).act(obs, (), KEY)
-    assert action.shape == (3, size, 3)
-
-
 def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
     env = versus(door, ["idle", "forward"])
     assert (env.num_envs, env.num_agents, env.teams, env.observation_size) == (4, 1, ((0,),), 12)
@@ -166,17 +156,6 @@ def test_opponents_change_at_resets(policies: list[TrainedPolicy], door: VectorE
     assert played[1] == played[2] == [[False, True], [True, False]]
     assert state.opponents[0].waiting.tolist() == [False, True]
     np.testing.assert_allclose(state.action[1::2, 1], 0.0)
-
-
-def test_the_newest_policy_is_exchanged_within_an_episode(policies: list[TrainedPolicy], door: VectorEnv) -> None:
-    old, new = (dataclasses.replace(policy, deterministic=True) for policy in policies)
-    env = versus(door, [old])
-    state = jax.jit(env.step)(env.reset(KEY), jnp.zeros((4, 1, 12)))
-    state = env.change(state, 0, new, at_once=True)
-    expected, _ = new.act(state.match.obs[:, 1:], state.opponents[0].memory)
-    assert not bool(state.opponents[0].waiting.any())
-    state = jax.jit(env.step)(state, jnp.zeros((4, 1, 12)))
-    np.testing.assert_allclose(state.action[:, 1:], expected, atol=1e-5)
 
 
 def test_scale_and_statistics_belong_to_the_opponent(policies: list[TrainedPolicy], door: VectorEnv) -> None:
@@ -278,21 +257,6 @@ def test_a_team_wins_from_both_sides() -> None:
     assert result.episode_return > 0.0 and result.average_step_reward > 0.0
 
 
-@pytest.mark.soak
-def test_the_command_line_plays_two_runs_against_each_other(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    task = ["go1revolvingdoor", "--impl", "c", "--control", "position", "--set", "episode_length=0.2"]
-    small = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "32", "--ppo.minibatches", "1"]
-    small += ["--config", "paper/mappo"]
-    runs = [str(tmp_path / name) for name in "ab"]
-    for seed, run in enumerate(runs):
-        assert cli.main(["train", *task, *small, "--seed", str(seed), "--run-dir", run]) == 0
-    assert load_policy(runs[0]).agents == 1
-    capfd.readouterr()
-    assert cli.main(["eval", runs[0], "--opponent", runs[1], "--episodes", "4", "--num-envs", "2", "--json"]) == 0
-    result = json.loads(capfd.readouterr().out)
-    assert result["win_rate"] + result["draw_rate"] + result["loss_rate"] == pytest.approx(1.0)
-
-
 def test_the_best_policy_of_a_match_is_the_one_that_wins_most() -> None:
     def evaluation(**sampled: float | None) -> dict[str, Any]:
         return {"sampled": sampled}
@@ -321,12 +285,6 @@ def even(task: str, episodes: int, num_envs: int) -> None:
 
 def test_random_weights_win_as_often_as_they_lose() -> None:
     even("go1revolvingdoor", 32, 16)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("task", MATCHES)
-def test_random_weights_win_as_often_as_they_lose_in_every_match(task: str) -> None:
-    even(task, 512, 64)
 
 
 # -- `mqe train MATCH --opponent`: team 0 is trained against fixed opponents ------------------------------------------
