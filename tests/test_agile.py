@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -142,17 +141,6 @@ def test_a_shove_acts_at_one_point_of_the_trunk_for_its_time() -> None:
         force, torque = shoves[i][:3], shoves[i][3:]
         assert 0.0 < np.linalg.norm(force[:2]) <= 100.0 and abs(force @ torque) < 1e-3
         assert np.linalg.norm(torque) <= np.linalg.norm(SHOVED) * np.linalg.norm(force)
-
-
-def test_a_delayed_robot_has_the_targets_of_the_step_before() -> None:
-    env = WalkEnv(GO1, override(AGILE_TASK, {"shove": 0.0}), skill="agile", impl="c", num_envs=1)
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    step, moved = jax.jit(env.step), []
-    for lag in (0, 1):
-        late = dataclasses.replace(state, randomized=dataclasses.replace(state.randomized, action_lag=jnp.int32(lag)))
-        after = [step(late, jnp.full((1, 12), size)) for size in (0.0, 1.0)]
-        moved.append(float(jnp.abs(after[0].data.qpos - after[1].data.qpos).max()))
-    assert moved[0] > 1e-3 and moved[1] == 0.0
 
 
 def test_errors_are_means_over_a_gait_cycle_a_second_after_a_change_of_command() -> None:

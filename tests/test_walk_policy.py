@@ -23,8 +23,6 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.physics import actuators
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.physics.scene import Scene
-from mqe_jax.skills.control import Controller
 from mqe_jax.walk import torchscript
 from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
@@ -176,24 +174,6 @@ def test_converted_weights_are_rounded_to_float16_only_on_request(tmp_path: path
             np.testing.assert_array_equal(found[part][layer][kind], stored)
 
 
-def test_checkpoints_of_torch_itself_are_read(tmp_path: pathlib.Path) -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed; files of the same layout are tested above")
-    nets = {}
-    for name, sizes in (("a", ADAPTATION_SIZES), ("b", BODY_SIZES)):
-        layers: list[Any] = []
-        for n_in, n_out in itertools.pairwise(sizes):
-            layers += [torch.nn.Linear(n_in, n_out), torch.nn.ELU()]
-        nets[name] = torch.nn.Sequential(*layers[:-1])
-        torch.jit.script(nets[name]).save(str(tmp_path / f"{name}.jit"))
-    params = torchscript.convert(tmp_path / "a.jit", tmp_path / "b.jit")
-    history = torch.randn(2, 2100)
-    latent = nets["a"](history)
-    action = nets["b"](torch.cat([history, latent], -1)).detach().numpy()
-    found = walk_policy.infer(params, jnp.asarray(history.numpy()))
-    np.testing.assert_allclose(found[0], action, atol=1e-5)
-    np.testing.assert_allclose(found[1], latent.detach().numpy(), atol=1e-5)
-
-
 def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     text = tmp_path / "text.jit"
     text.write_text("hello")
@@ -301,15 +281,6 @@ def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, 
         np.testing.assert_allclose(memories[short].action, memories[SKILL].action, atol=1e-6)
 
 
-@pytest.mark.parametrize(("platform", "barriers"), [("cpu", 0), ("cuda", 1)])
-def test_the_history_is_written_once_except_on_a_cpu(platform: str, barriers: int) -> None:
-    short = SKILL.restricted(("vx",), None)
-    sensed = Proprioception(DOWN, jnp.zeros(12), jnp.zeros(12))
-    command, params = jnp.asarray(short.default_commands()), short.load_params()
-    program = jax.jit(short.targets).trace(params, short.init_memory(), command, sensed)
-    assert program.lower(lowering_platforms=(platform,)).as_text().count("optimization_barrier") == barriers
-
-
 def test_environments_store_what_actions_can_change() -> None:
     """All of an observation where a task may give NPC robots any commands."""
     gate, defender = (make(task, impl="c", num_envs=1) for task in ("go1gate", "go1football-defender"))
@@ -339,26 +310,6 @@ def test_actions_are_clipped_and_remembered_as_such() -> None:
     target, memory = SKILL.targets(params, SKILL.init_memory(), jnp.asarray(SKILL.default_commands()), still)
     np.testing.assert_array_equal(memory.action, np.tile([10.0, -10.0], 6))
     np.testing.assert_allclose(target, GO1.joint_targets(memory.action))
-
-
-def test_a_new_walk_policy_begins_with_small_actions() -> None:
-    """Weights of a layer are uniform within 1 / sqrt(inputs), those of the action layer within a tenth of it."""
-    body = walk_policy.init_params(jax.random.PRNGKey(0))["body"]
-    largest = {
-        name: float(jnp.abs(layer["weight"]).max()) * layer["weight"].shape[1] ** 0.5 for name, layer in body.items()
-    }
-    assert largest == pytest.approx({"0": 1.0, "2": 1.0, "4": 1.0, "6": 0.1}, rel=0.02)
-    bias = {name: float(jnp.abs(body[name]["bias"]).max()) * body[name]["weight"].shape[1] ** 0.5 for name in body}
-    assert bias == pytest.approx({"0": 1.0, "2": 1.0, "4": 1.0, "6": 0.0}, rel=0.05)
-
-
-def test_command_actions_are_the_papers() -> None:
-    action = jnp.array([[0.25, -1.0, 0.5], [1.0, 0.0, 0.0]])
-    default = SKILL.default_commands()
-    commands = Controller("command", GO1, 2, 2, SKILL, (), ("vx", "vy", "yaw_rate"), default).skill_commands(action)
-    np.testing.assert_allclose(commands[0, :3], [0.5, -0.5, 0.25])
-    assert float(commands[1, 0]) == 1.0
-    np.testing.assert_allclose(commands[:, 3:], np.tile(default[3:], (2, 1)))
 
 
 def test_slope_turns_gravity() -> None:
@@ -396,12 +347,6 @@ def test_actuator_network_computes_softsign_layers() -> None:
     expected = (x @ flat["4.weight"].T + flat["4.bias"])[:, 0]
     found = jax.jit(actuators.actuator_torque)(params, jnp.asarray(error), jnp.asarray(velocity))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
-
-
-def test_a_physics_step_that_does_not_fit_the_policy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mqe_jax.walk.env.Scene", functools.partial(Scene, timestep=0.004))
-    with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
-        WalkEnv(GO1, impl="c")
 
 
 @jax.tree_util.register_dataclass

@@ -15,14 +15,12 @@ from mqe_jax import cli, walk_policy
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory
-from mqe_jax.envs import VectorEnv
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import JOINT_NAMES
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import EnvDims
-from mqe_jax.walk.env import WalkEnv
-from mqe_jax.walk.network import WALK_FORM, WalkNetwork, mirror_action, windows
+from mqe_jax.walk.network import WALK_FORM, WalkNetwork, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
 from tests.training import Probe, random_params
@@ -134,13 +132,6 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
         WalkNetwork().build(DIMS._replace(agents=2))
 
 
-def test_walking_is_a_batch_of_one_agent() -> None:
-    batch = VectorEnv(WalkEnv(GO1, impl="c", num_envs=2), 2)
-    state = jax.eval_shape(batch.reset, jax.random.PRNGKey(0))
-    state = jax.eval_shape(batch.step, state, jnp.zeros((2, 1, 12)))
-    assert state.obs.shape == (2, 1, walk_policy.OBSERVATION_SIZE) and state.reward.shape == (2, 1)
-
-
 @pytest.mark.soak
 def test_a_run_is_resumed_and_its_weights_walk(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights = str(walk_policy.ASSETS / "walk_go1.safetensors")
@@ -181,13 +172,6 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
         left = observation(joints, gravity, commands, 0.15)
         right = observation(mirrored, gravity * [1, -1, 1], other, 0.65)
         np.testing.assert_allclose(WALK_FORM.mirrored(jnp.tile(left, 30))[:70], right, atol=1e-5)
-
-
-def test_mirroring_twice_changes_nothing() -> None:
-    history = jax.random.normal(jax.random.PRNGKey(0), (3, 2100))
-    action = jax.random.normal(jax.random.PRNGKey(1), (3, 12))
-    np.testing.assert_array_equal(WALK_FORM.mirrored(WALK_FORM.mirrored(history)), history)
-    np.testing.assert_array_equal(mirror_action(mirror_action(action)), action)
 
 
 def test_descending_the_loss_makes_a_policy_symmetric() -> None:
