@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import http.server
 import io
-import itertools
 import json
 import os
 import shutil
@@ -190,22 +189,6 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
         TaskFunctions(SimpleNamespace(control="position"))  # type: ignore[arg-type]
 
 
-def test_no_policy_of_a_page_replaces_another(tmp_path: Path) -> None:
-    from mqe_jax.policies import zoo
-
-    sources = ["go1gate"]
-    for name in ("a/seed0", "b/seed0", "v1.2", "v1.3", "shipped", "c/scripted", "x/b/seed0", "run.safetensors"):
-        file = tmp_path / name / "policy.safetensors" if not name.endswith(".safetensors") else tmp_path / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(zoo.file_of("go1gate"), file)
-        sources.append(str(tmp_path / name))
-    last_two = ["seed0", "b/seed0", "v1.2", "v1.3", f"{tmp_path.name}/shipped", "c/scripted"]
-    with pytest.raises(InputError, match=r"^run: .*x/b/seed0' is not allowed; .* seed0 and b/seed0, which are taken"):
-        entries(sources)
-    (entry,) = entries([*sources[:7], sources[8], sources[1]])
-    assert list(entry.policies) == ["shipped", *last_two, "run", "scripted"]
-
-
 def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     folder = tmp_path / "mqe_jax" / "play"
@@ -288,53 +271,3 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         tab.keyboard.press("r")
         tab.keyboard.press("Space")
         tab.wait_for_function("document.querySelector('#pause').textContent === 'Continue'")
-
-
-DRIVEN = "document.querySelector('#drive').value === '0'"
-
-
-def test_the_page_says_what_to_do_and_its_button_drives(page: Path) -> None:
-    """From the start of an episode, behind and above the robot; the dots have names."""
-    with opened(page, "seed=3") as tab:
-        assert tab.locator("#aim").inner_text() == "Drive the sheep through the gate."
-        assert tab.locator("#free").inner_text() == "W: take over" and not tab.locator("#walk").is_visible()
-        assert tab.locator(".who").all_inner_texts() == ["robot 1", "robot 2"]
-        tab.locator("#take").click()
-        tab.wait_for_function(DRIVEN)
-        tab.wait_for_function("document.querySelector('.who').innerText === 'robot 1 (you)'")
-        assert "sidestep" in tab.locator("#driving").inner_text() and tab.locator("#view").input_value() == "0"
-        photograph(tab, "desktop")
-        tab.locator("#take").click()
-        tab.wait_for_function("document.querySelector('#drive').value === ''")
-
-
-def test_a_pad_drives_on_a_touch_screen(page: Path) -> None:
-    """Both pads and the button are there before anything is touched, and do not cover each other."""
-    with opened(page, "seed=3", 390, 844, touch=True) as tab:
-        boxes = [tab.locator(name).bounding_box() for name in ("#bar", "#guide", "#walk")]
-        assert all(one["y"] + one["height"] <= other["y"] for one, other in itertools.pairwise(boxes))
-        assert tab.locator("#turn").is_visible() and not tab.locator("#free").is_visible()
-        assert tab.evaluate("document.documentElement.scrollWidth") == 390
-        tab.locator("#walk").tap()
-        tab.wait_for_function(DRIVEN)
-        photograph(tab, "phone")
-
-
-@pytest.mark.soak
-def test_keys_win_or_lose_a_match_and_every_task_loads(tmp_path: Path) -> None:
-    """In sumo a robot driven straight on meets the shipped policy; the other tasks are chosen one after another."""
-    add_libraries(tmp_path)
-    tasks = site.write_site([], tmp_path, tmp_path / "lib")
-    with opened(tmp_path, "task=go1wrestling&drive=0") as tab:
-        tab.set_default_timeout(120_000)
-        tab.keyboard.down("w")
-        tab.wait_for_function("!document.querySelector('#result').hidden")
-        assert tab.locator("#result").inner_text().startswith(("You win", "You lose", "Draw"))
-        assert float(tab.evaluate("document.body.dataset.rate")) > 5
-        photograph(tab, "sumo-result")
-        tab.keyboard.up("w")
-        for entry in tasks:
-            tab.locator("#task").select_option(entry.name)
-            tab.wait_for_function(f"document.title.startsWith('{entry.env.title} ')")
-            tab.wait_for_function("parseFloat(document.querySelector('#clock').textContent) > 0.8")
-            photograph(tab, entry.name)

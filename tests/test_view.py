@@ -1,6 +1,5 @@
 """The viewer: its simulation, its scene and its arguments."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -123,26 +122,6 @@ def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(st
     np.testing.assert_allclose(scene._root.position, 0.0)
 
 
-def test_the_scene_before_the_session_is_the_middle_of_the_initial_states(stage: Any) -> None:
-    from mqe_jax.view.stage import start_frame
-
-    frame, index = start_frame(stage.env, 3), stage.env.index
-    assert [x.shape for x in (frame.qpos, frame.mocap_pos)] == [stage.frame.qpos.shape, stage.frame.mocap_pos.shape]
-    np.testing.assert_allclose(frame.qpos[:, index.base_qpos], stage.frame.qpos[:, index.base_qpos], atol=0.3)
-    np.testing.assert_allclose(frame.qpos[:, index.joint_qpos], stage.frame.qpos[:, index.joint_qpos], atol=0.8)
-    spread = stage.env.compiled.anchor_spread.max()
-    np.testing.assert_allclose(frame.mocap_pos, stage.frame.mocap_pos, atol=spread + 1e-6)
-    stage.stage.draw(frame)
-
-
-def test_cameras_follow_robots_and_the_ball() -> None:
-    pytest.importorskip("mjviser")
-    from mqe_jax.view.stage import followable
-
-    env = make("go1football-1vs1", impl="c", control="position", num_envs=1)
-    assert list(followable(env.mj_model)) == ["robot 1", "robot 2", "ball"]
-
-
 def test_contact_forces_carry_the_robots() -> None:
     """Of two Go1s that stand on their feet; robots are named by colour."""
     pytest.importorskip("mjviser")
@@ -191,18 +170,6 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
     assert (menu.is_match("go1tug"), menu.is_match("go1gate")) == (True, False)
 
 
-def test_bars_point_to_the_side_of_their_sign_and_observations_come_in_blocks() -> None:
-    from mqe_jax.view.markup import bars, observation_table
-
-    page = bars(["up & on", "down", "none"], [0.2, -0.1, 0.0])
-    assert "up &amp; on" in page and "left:50%;width:50.0%" in page and "right:50%;width:25.0%" in page
-    layout = make("go1gate", impl="c", control="position", num_envs=1).observation_layout
-    table = observation_table(layout, np.arange(layout.size, dtype=float))
-    assert re.findall(r"<tr><td[^>]*>([^<]*)<", table) == [block.name for block in layout.blocks]
-    assert "0.00 1.00" in table and f"{layout.size - 1}.00</td>" in table
-    assert re.findall(r"<td[^>]*>([^<]*)<", observation_table(None, np.zeros(2))) == ["observation", "0.00 0.00"]
-
-
 def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     """Widgets and keys of the last session are gone; overlays can be switched on and off in the new one."""
     pytest.importorskip("mjviser")
@@ -231,48 +198,6 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     viewer._panel.shapes = viewer._panel.contacts = False
     viewer._draw()
     assert not viewer._shapes and viewer._overlay._arrows is None
-    viewer.server.stop()
-
-
-def test_the_scene_is_lit_without_visers_own_lights_and_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mjviser")
-    from viser import SceneApi
-
-    from mqe_jax.view.viewer import Viewer
-
-    lights: list[tuple[str, Any, Any]] = []
-
-    def noted(name: str, real: Any) -> Any:
-        def add(self: Any, *arguments: Any, **options: Any) -> Any:
-            lights.append((name, arguments, options.get("cast_shadow")))
-            return real(self, *arguments, **options)
-
-        return add
-
-    for name in ("configure_default_lights", "add_light_hemisphere", "add_light_directional"):
-        monkeypatch.setattr(SceneApi, name, noted(name, getattr(SceneApi, name)))
-    viewer = Viewer(port=free_port())
-    viewer.show(session(Driven(), num_envs=1))
-    viewer.server.stop()
-    assert ("configure_default_lights", (False,), None) in lights
-    assert [shadow for name, _, shadow in lights if name == "add_light_directional"] == [False]
-
-
-@pytest.mark.parametrize("num_envs", [1, 3])
-def test_cameras_start_at_the_action_of_one_environment_and_above_several(num_envs: int) -> None:
-    pytest.importorskip("mjviser")
-    from mqe_jax.view.viewer import Viewer
-
-    viewer, run = Viewer(port=free_port()), session(Driven(), num_envs=num_envs)
-    viewer.show(run)
-    camera, robots = viewer.server.initial_camera, run.frame().qpos[0, FakeEnv.robot_x[:, None] + np.arange(2)]
-    distance = float(np.linalg.norm(np.subtract(camera.position, camera.look_at)))
-    followed = num_envs == 1
-    middle = robots.mean(axis=0) if followed else np.zeros(2)
-    np.testing.assert_allclose(np.asarray(viewer._stage._root.position)[:2], -middle, atol=1e-5)
-    apart = float(np.linalg.norm(np.subtract(*robots)))
-    whole = float(np.linalg.norm(np.subtract(*viewer._stage.overview())))
-    assert distance == pytest.approx(3.0 + apart if followed else whole, abs=0.02) and whole > 3.2 + apart
     viewer.server.stop()
 
 

@@ -1,6 +1,5 @@
 """`mqe view` as a process: its sockets, its page in a real browser, pages of other origins, and bad messages."""
 
-import http.server
 import os
 import re
 import signal
@@ -163,38 +162,3 @@ def test_the_page_pauses_steps_and_resets(page: Page) -> None:
     assert page.page.locator("canvas").count() >= 2  # the scene, and the plots
     if folder := os.environ.get("MQE_SCREENSHOTS"):
         page.page.screenshot(path=str(Path(folder) / "view.png"))
-
-
-CONNECT = """address => new Promise(done => {
-    const socket = new WebSocket(address, ["viser-v%s"]);
-    socket.onopen = () => done("open");
-    socket.onerror = () => done("refused");
-})"""
-
-
-def test_a_page_of_another_origin_cannot_open_the_socket(viewer: SimpleNamespace, page: Page) -> None:
-    """A page from another port of this machine is refused, by each name of the viewer; its own page is not."""
-    viser = pytest.importorskip("viser")
-    script = CONNECT % viser.__version__
-
-    class Foreign(http.server.SimpleHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(b"<!doctype html><title>another origin</title>")
-
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
-
-    tab = page.page.context.browser.new_page()
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Foreign) as other:
-        threading.Thread(target=other.serve_forever, daemon=True).start()
-        for name in ("localhost", "127.0.0.1"):
-            tab.goto(f"http://{name}:{other.server_port}")
-            assert tab.title() == "another origin"
-            assert tab.evaluate(script, f"ws://localhost:{viewer.port}") == "refused"
-            assert tab.evaluate(script, f"ws://127.0.0.1:{viewer.port}") == "refused"
-        other.shutdown()
-    tab.close()
-    assert len(page.robots()) == 2
-    assert page.page.evaluate(script, f"ws://127.0.0.1:{viewer.port}") == "open"
