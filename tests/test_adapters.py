@@ -19,7 +19,6 @@ from gymnasium.vector import AutoresetMode
 import mqe_jax
 from mqe_jax.adapters import task_env
 from mqe_jax.adapters.gymnasium import SingleEnv, VectorEnv, register
-from mqe_jax.adapters.host import HostEnvs, _compile
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
@@ -246,18 +245,6 @@ def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:
     assert [x.shape[0] for x in jax.tree.leaves(shapes.rival_memory)] == [1] * len(jax.tree.leaves(shapes.rival_memory))
     after: Any = jax.eval_shape(team.step, shapes, jnp.zeros((1, 3)))
     assert jax.tree.structure(after) == jax.tree.structure(shapes)
-
-
-def test_environments_with_the_same_opponent_share_compiled_functions() -> None:
-    env = mqe_jax.make("go1wrestling", impl="c", num_envs=1)
-    first, second, other = (TeamEnv(env, source) for source in ("go1wrestling", "go1wrestling", "scripted"))
-    assert first.identity == second.identity != other.identity
-    before = _compile.cache_info()
-    hosts = [HostEnvs(team, 1) for team in (first, second, other)]
-    programs = [host._programs for host in hosts]
-    after = _compile.cache_info()
-    assert (after.misses - before.misses, after.hits - before.hits) == (2, 1)
-    assert hosts[0].env is first and programs[0] is programs[1]
 
 
 def test_every_adapter_takes_an_opponent() -> None:

@@ -71,19 +71,6 @@ def test_brax_rollout(task: str) -> None:
     assert np.abs(obs[LIMIT - 1] - obs[2 * LIMIT - 1]).max(-1).min() > 1e-3
 
 
-@pytest.mark.soak
-def test_brax_done_is_a_termination() -> None:
-    """Without EpisodeWrapper, only info reports the time limit; the metrics are the task's."""
-    env = adapter("brax").Env(task_env("go1gate"))
-    state = env.reset(jax.random.PRNGKey(0))
-    own: Any = state.pipeline_state
-    late = own.__class__(**{**own.__dict__, "step": jnp.asarray(LIMIT - 1)})
-    shapes: Any = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
-    assert set(shapes.metrics) == set(state.metrics) and shapes.obs.shape == (env.observation_size,)
-    after = env.step(state.replace(pipeline_state=late), jnp.zeros(env.action_size))  # type: ignore[attr-defined]
-    assert float(after.done) == 0.0 and float(after.info["truncation"]) == 1.0
-
-
 def test_brax_wrap_names_what_it_does_not_take() -> None:
     """Foreign environments, and randomisation functions of Brax's kind."""
     brax = adapter("brax")
@@ -141,21 +128,6 @@ def test_jaxmarl_rollout(task: str) -> None:
     assert obs[first].shape == (STEPS, COUNT, *spaces[first].shape)
     np.testing.assert_array_equal(np.abs(obs[first] - final_obs[:, :, 0]).max(-1) > 1e-3, ends)
     assert np.abs(obs[first][LIMIT - 1] - start[first]).max(-1).min() > 1e-3
-
-
-@pytest.mark.soak
-def test_jaxmarl_resets_to_a_given_state() -> None:
-    """An ended episode continues from `reset_state`; a running one does not."""
-    env = adapter("jaxmarl").Env(mqe_jax.make("go1gate", impl="c", episode_length=2 * 0.02))
-    obs, start = env.reset(jax.random.PRNGKey(1))
-    zero = {agent: jnp.zeros(3) for agent in env.agents}
-    running, state, *_ = env.step(jax.random.PRNGKey(2), start, zero, start)
-    assert np.abs(running["robot_0"] - obs["robot_0"]).max() > 1e-4
-    after, state, _, done, _ = env.step(jax.random.PRNGKey(3), state, zero, start)
-    assert bool(done["__all__"])
-    np.testing.assert_array_equal(after["robot_0"], obs["robot_0"])
-    np.testing.assert_array_equal(state.data.qpos, start.data.qpos)
-    assert np.abs(state.final_obs - state.obs).max() > 1e-4
 
 
 @pytest.mark.parametrize("library", ["brax", "jaxmarl", "pettingzoo"])
@@ -295,12 +267,6 @@ def test_steps_of_both_forms(zoo: Any) -> None:
     env.close()
 
 
-def test_teams_and_zero_sum_rewards_of_a_match(zoo: Any) -> None:
-    """A match has two teams, by name."""
-    env = zoo.parallel_env("go1tug", impl="c")
-    assert env.teams == (("robot_0",), ("robot_1",)) and env.metadata["name"] == "go1tug"
-
-
 def test_pettingzoo_knows_the_tasks_by_name(zoo: Any) -> None:
     """In both registries, once however often the module registers."""
     pettingzoo = importlib.import_module("pettingzoo")
@@ -321,15 +287,6 @@ def test_a_copy_is_a_new_environment_with_the_same_settings(zoo: Any) -> None:
     one, other = (copy.reset()[0]["robot_0"] for copy in copies)
     assert (one != other).any()
     np.testing.assert_array_equal(copies[0].reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"])
-
-
-def test_render_of_pettingzoo(zoo: Any) -> None:
-    """An image in the mode rgb_array, otherwise none."""
-    env = zoo.parallel_env("go1gate", render_mode="rgb_array", render_size=(96, 64), **SHORT)
-    env.reset(seed=0)
-    image = env.render()
-    assert image is not None and image.shape == (64, 96, 3) and image.std() > 5
-    assert zoo.parallel_env("go1gate", **SHORT).render() is None
 
 
 def test_bad_input_is_named(zoo: Any) -> None:

@@ -15,13 +15,10 @@ from test_policies import StandAndLean
 from mqe_jax import cli, load_policy, make
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
-from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import zoo
 from mqe_jax.skills import SKILLS
-from mqe_jax.train import networks, nn
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import log_prob
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
@@ -143,33 +140,6 @@ def stub_env(agents: int) -> Any:
 def test_agents_of_mat_act_one_after_another() -> None:
     env = stub_env(2)
     assert error_on_random_inputs(new_policy(env, "torque", name="mat", heads=2, blocks=2), env) < 2e-5
-
-
-def test_a_registered_network_is_exported_with_all_its_recurrent_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(networks, "NETWORKS", dict(networks.NETWORKS))
-
-    @networks.register_network("averaging")
-    class Averaging(networks.NetworkSettings):
-        def build(self, dims: EnvDims) -> networks.Network:
-            def act(params: Any, memory: Any, obs: jax.Array, key: Any, active: Any = None) -> Any:
-                slow, fast = 0.9 * memory["slow"] + 0.1 * obs, 0.5 * memory["fast"] + 0.5 * obs
-                mean = nn.dense(params, fast - slow)
-                return mean, log_prob(mean, mean, params["bias"]), {"slow": slow, "fast": fast}
-
-            def initial_memory(num_envs: int) -> NetworkMemory:
-                zeros = jnp.zeros((num_envs, dims.agents, dims.observation))
-                return NetworkMemory({"slow": zeros, "fast": zeros}, ())
-
-            def init(key: jax.Array) -> Any:
-                return nn.dense_init(key, dims.observation, dims.action)
-
-            unused: Any = None
-            return networks.Network(init, lambda params: params, initial_memory, act, unused, unused)
-
-    env = stub_env(2)
-    policy = new_policy(env, "torque", name="averaging")
-    assert sorted(input_shapes(policy, env)) == ["memory_fast", "memory_slow", "obs"]
-    assert error_on_random_inputs(policy, env) < 2e-5
 
 
 @pytest.mark.soak
