@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax.envs import QuadrupedEnv, State, make
 from mqe_jax.policies.scripted import scripted_policy
-from tests.states import ending, initial, made, moment, observation, placed, stepper, still, terms_of, with_object
+from tests.states import ending, made, moment, observation, placed, stepper, still, terms_of, with_object
 
 NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
@@ -118,26 +118,6 @@ def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
     assert model.body_mass[duel.objects["ball"].body] == pytest.approx(0.318)
 
 
-def test_the_robots_have_their_teams_colours(envs: dict[str, Any]) -> None:
-    assert [envs[task].compiled.scene.colors for task in TASKS] == [(0, 1, 2), (0, 2), (0, 1, 2, 3)]
-
-
-def test_a_shot_goes_in_or_bounces_off(duel: Any, duel_step: Any, fresh: Any) -> None:
-    seen = jax.jit(lambda state: (duel.ball(state.data)[0], duel.wins(state, duel.read(state.data))[0]))
-    for y, inside in ((0.0, True), (0.7, True), (-1.3, False)):
-        state = standing(duel, fresh[duel.name], [(4, 4, 0), (10, -4, np.pi)])
-        state = with_ball(duel, state, (11.0, y), (3.0, 0.0, 0.0))
-        scored = False
-        for _ in range(40):
-            state = duel_step(state, still(duel))
-            x, won = seen(state)
-            scored |= bool(won)
-            assert inside or x < 11.95  # the wall is at 12, the ball's radius 0.1
-            if inside and x > 12.0:
-                assert state.terminated
-        assert scored == inside, y
-
-
 # -- observations -----------------------------------------------------------------------------------------------------
 
 PLACES = [(4.2, 0.7, 0.3), (9.1, -1.2, 2.8), (8.4, 2.2, -2.0), (10.6, 0.4, 3.0)]
@@ -146,20 +126,6 @@ PLACES = [(4.2, 0.7, 0.3), (9.1, -1.2, 2.8), (8.4, 2.2, -2.0), (10.6, 0.4, 3.0)]
 def turned(places: Any) -> np.ndarray:
     """Poses x, y, yaw after a half turn about the field's middle."""
     return np.array([(14 - x, -y, yaw + np.pi) for x, y, yaw in places])
-
-
-@pytest.mark.parametrize("task", TASKS[1:])
-def test_both_sides_see_the_same_after_a_half_turn(envs: dict[str, Any], fresh: Any, task: str) -> None:
-    env = envs[task]
-    count, half = env.num_agents, env.num_agents // 2
-    places = PLACES[:count]
-    state = fresh[env.name]
-    here = with_ball(env, standing(env, state, places), (6.3, 1.1, 0.4), (0.8, -0.3, 0.1))
-    there = standing(env, state, np.roll(turned(places), half, axis=0))
-    there = with_ball(env, there, (14 - 6.3, -1.1, 0.4), (-0.8, 0.3, 0.1))
-    first, second = observation(env, here), observation(env, there)
-    np.testing.assert_allclose(second, np.roll(first, half, axis=0), atol=1e-5)
-    assert np.abs(first[0] - first[half]).max() > 0.5  # the two teams' observations differ
 
 
 def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
@@ -313,20 +279,6 @@ def test_passes_and_goals_of_both(envs: dict[str, Any], fresh: Any, task: str, t
 # -- the defender -----------------------------------------------------------------------------------------------------
 
 
-def test_the_defender_keeps_between_ball_and_goal_in_the_physics(attack: Any, attack_step: Any, fresh: Any) -> None:
-    """Under the walk policy it reaches its target and follows the ball to the other side."""
-    start = standing(attack, fresh[attack.name], [(4, -4, 0), (4, 4, 0), (10, 0, np.pi)])
-    goal, state = np.array([12.0, 0.0]), start
-    for ball in ((8.0, -2.0), (8.0, 2.0)):
-        state = with_ball(attack, state, ball)
-        for _ in range(250):
-            state = attack_step(state, still(attack))
-        assert not np.asarray(state.terminated)
-        target = goal + 0.6 * (np.array(ball) - goal)
-        place = np.asarray(attack.read(state.data).position_w)[2, :2]
-        assert np.linalg.norm(place - target) < 0.35
-
-
 def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> None:
     state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
     idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
@@ -339,25 +291,7 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
     np.testing.assert_array_equal(commands[3:], rest[3:])
 
 
-def test_the_defender_stands_while_the_agents_give_torques() -> None:
-    """It follows joint targets of the walk policy in every action mode of the agents."""
-    env: Any = make("go1football-defender", impl="c", control="torque")
-    state = standing(env, initial(env), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
-    np.testing.assert_allclose(env.controller.neutral[:2], 0)
-    step = jax.jit(env.step)
-    for _ in range(50):
-        state = step(state, still(env))
-    height = np.asarray(env.read(state.data).position_w)[:, 2]
-    assert height[2] > 0.25  # while the agents, without torques, lie down
-    assert height[:2].max() < 0.2
-
-
 # -- the whole --------------------------------------------------------------------------------------------------------
-
-
-def test_wrong_numbers_of_robots_are_named() -> None:
-    with pytest.raises(ValueError, match="num_agents: 4; go1football-1vs1 requires 2 robots"):
-        make("go1football-1vs1", impl="c", num_agents=4)
 
 
 def test_the_planner_dribbles_to_the_goal() -> None:

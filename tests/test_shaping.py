@@ -14,7 +14,6 @@ import pytest
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.envs import Moment, State, make
-from mqe_jax.envs.reward import faded
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.train.config import TrainConfig
 from tests.states import terms_of
@@ -188,27 +187,6 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
         assert float(terms_of(env, before, end)[0]["first_goal"]) == goal
 
 
-def test_shaping_terms_fade_to_their_floor() -> None:
-    terms = {"win": jnp.float32(1.0), "push": jnp.array([2.0, 3.0]), "approach": jnp.float32(4.0)}
-    scaled = faded(terms, make(SUMO, impl="c").params.rewards, 0.25)
-    assert float(scaled["win"]) == 1.0 and float(scaled["approach"]) == 1.0
-    np.testing.assert_allclose(scaled["push"], [0.5, 0.75])
-
-
-@pytest.mark.parametrize("task", [BOX, BALL])
-def test_weights_of_shaping_terms_count_in_training_only_where_given(task: str) -> None:
-    weights: dict[str, Any] = {"rewards.approach": 2.0}
-    env: Any = make(task, impl="c", control="position", **weights)
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    step = jax.jit(env.step)
-    for _ in range(5):
-        state = step(state, jnp.zeros((env.num_agents, 12)))
-    approach = float(state.metrics["reward/approach"])
-    rest = sum(float(x) for name, x in state.metrics.items() if name.startswith("reward/")) - approach
-    assert approach != 0
-    assert float(state.reward[0]) == pytest.approx(rest + approach, abs=1e-6)
-
-
 # -- episodes that start in states of a demonstrator's episodes ---------------------------------------------------
 
 N = 32
@@ -293,15 +271,6 @@ def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> N
     assert len(step) == 128 * 16 and len(set(step.tolist())) > 8
     bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(env.env.robot.action_scale, env.num_agents)
     np.testing.assert_allclose(bent, 0.01 * np.tile(step[:, None], bent.shape[1]), atol=1e-5)
-
-
-def test_demonstrations_do_not_depend_on_the_key(rollout: Any) -> None:
-    """Two runs of a task have the same demonstrations."""
-    env, runs = rollout
-    begin = jax.jit(lambda key: env.reset(key).demonstrations)
-    one, other = begin(jax.random.PRNGKey(2)), begin(jax.random.PRNGKey(3))
-    jax.tree.map(np.testing.assert_array_equal, one, other)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), one, runs["all"][0])  # another program
 
 
 def test_a_demonstrator_needs_assistance() -> None:
