@@ -1,14 +1,12 @@
 """The command line: output, streams, settings, run folders and policies."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import fake_env
-import jax
 import numpy as np
 import pytest
 from fake_env import SMALL, FakeEnv
@@ -22,9 +20,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
-from mqe_jax.policies import load_policy
 from mqe_jax.runs import build
-from mqe_jax.train import checkpoint
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
@@ -56,23 +52,6 @@ def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFi
         cli.main([*command, "--help"])
     assert not stop.value.code
     assert "usage: mqe" in capfd.readouterr().out
-
-
-def test_help_names_all_that_is_accepted(capfd: pytest.CaptureFixture[str]) -> None:
-    """And every training setting, with its default."""
-    settings = ("--ppo.gae-lambda FLOAT", "(default: 0.95)", "--network.hidden-sizes", "demo, league, tuned/TASK")
-    for command, said in (("eval", ("TASK|RUN|FILE", "policy file")), ("train", settings)):
-        with pytest.raises(SystemExit):
-            cli.main([command, "--help"])
-        out = " ".join(capfd.readouterr().out.replace("│", " ").split())
-        assert [words for words in said if words not in out] == []
-
-
-def test_a_training_leaves_what_it_says(run_folder: Path) -> None:
-    names = {path.name for path in run_folder.iterdir()}
-    assert {"config.yaml", "metrics.csv", "curve.png", "policy.safetensors", "checkpoints"} <= names
-    columns = (run_folder / "metrics.csv").read_text().splitlines()[0]
-    assert {"overflow", "diverged", "episode_return"} <= set(columns.split(","))
 
 
 def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -223,15 +202,6 @@ def test_set_keeps_the_other_parameters_of_a_run(run_folder: Path, monkeypatch: 
     assert made == [{"rewards": {"collision": -5.0, "success": 9, "approach": 1}}]
 
 
-def test_only_sampled_actions_depend_on_the_key(run_folder: Path) -> None:
-    env: Any = FakeEnv()
-    obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs
-    for deterministic in (False, True):
-        policy = load_policy(run_folder, env, deterministic=deterministic)
-        one, two = (policy.act(obs, policy.initial_memory(2), jax.random.PRNGKey(key))[0] for key in (1, 2))
-        assert bool((one == two).all()) is deterministic
-
-
 def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for flag in ("--policy", "--opponent"):
         assert cli.main(["eval", "go1tug", flag, str(run_folder)]) == 2
@@ -270,20 +240,6 @@ def test_the_task_comes_first(words: str, capfd: pytest.CaptureFixture[str]) -> 
     assert capfd.readouterr().err.startswith("mqe: task: is missing; it comes first: mqe train TASK --")
 
 
-def test_a_damaged_policy_is_refused(run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    broken = tmp_path / "broken"
-    broken.mkdir()
-    (broken / "config.yaml").write_bytes((run_folder / "config.yaml").read_bytes())
-    (broken / "policy.safetensors").write_bytes((run_folder / "policy.safetensors").read_bytes()[:200])
-    assert cli.main(["eval", str(broken)]) == 2
-    assert "policy.safetensors" in capfd.readouterr().err
-    arrays, metadata = checkpoint._read(run_folder / "policy.safetensors", "policy")
-    arrays[next(name for name in arrays if name.endswith("weight"))][0] = float("nan")
-    checkpoint.save_tree(broken / "policy.safetensors", arrays, metadata, kind="policy")
-    assert cli.main(["eval", str(broken)]) == 2
-    assert "holds nan" in capfd.readouterr().err
-
-
 START = """
 import sys
 class Missing:
@@ -318,20 +274,6 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     errors = [line for line in done.stderr.splitlines() if line.startswith("mqe: ")]
     assert len(errors) == 7 and all("did you mean" in line for line in errors[:6]) and "'nobody'" in errors[6]
     assert all(f"--{flag}" in done.stderr for flag in ("seed", "ppo.epochs", "network.heads"))
-
-
-def test_a_command_starts_without_what_it_does_not_need() -> None:
-    """Nobody chose a GL library before the command, or after it."""
-    code = """
-import os, sys
-from mqe_jax.cli import main
-sys.argv = ["mqe", "zoo"]
-assert main() == 0
-print([name for name in ("glfw", "mqe_jax.study.runs") if name in sys.modules], "MUJOCO_GL" in os.environ)
-"""
-    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[] False"
 
 
 def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str], monkeypatch: Any) -> None:

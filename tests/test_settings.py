@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
-import yaml
 from annotated_types import Gt, MinLen
 
 from mqe_jax.core.errors import InputError
@@ -206,22 +205,6 @@ def test_files(tmp_path: Path) -> None:
 
 
 # -- settings of a training -------------------------------------------------------------------------------------------
-
-CONFIGS = Path(__file__).parent.parent / "configs"
-
-
-@pytest.mark.parametrize("file", ["league", "paper", "tuned"])
-def test_every_part_of_a_file_changes_what_is_common(file: str) -> None:
-    parts = load_yaml(CONFIGS / f"{file}.yaml")
-    common = override(TrainConfig(), parts.pop("common"))
-    assert parts and all(override(common, changes) != common for changes in parts.values())
-
-
-def test_there_and_back() -> None:
-    config = build(TrainConfig, {"network.hidden_sizes": (32, 16), "ppo.dual_clip": 3, "env": {"episode_length": 3}})
-    text = yaml.safe_dump(to_mapping(config))
-    assert build(TrainConfig, yaml.safe_load(text)) == config
-    assert yaml.safe_load(text)["network"]["name"] == "actor_critic"
 
 
 def test_parameters_in_training_change_those_that_they_name() -> None:

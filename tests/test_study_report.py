@@ -17,8 +17,8 @@ import pytest
 from mqe_jax.core.errors import InputError
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import band, evaluated, group, score_matrices
-from mqe_jax.study.report import report, to_marl_eval, write_report
-from mqe_jax.study.runs import REWARD, Cell, Reference, Run, load_reference, read_curve
+from mqe_jax.study.report import to_marl_eval, write_report
+from mqe_jax.study.runs import REWARD, Cell, Reference, Run
 
 REFERENCE = Reference(label="theirs", values={"plain": {"go1gate": {"mappo": 2.75}}}, tasks={"go1sheep-hard": "Hard"})
 
@@ -116,22 +116,6 @@ def test_evaluations_take_the_place_of_training_rewards() -> None:
     )
     ((cell, (run,)),) = evaluated(cells).items()
     assert cell.variant == "tuned" and list(run.curve["env_steps"]) == [20_000_000, 40_000_000]
-
-
-def test_mistakes_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="has no finished run"):
-        report(tmp_path)
-    (tmp_path / "metrics.csv").write_text("env_steps\nhello\n")
-    with pytest.raises(InputError, match=r"metrics\.csv: damaged, or not a metrics"):
-        read_curve(tmp_path / "metrics.csv")
-    (tmp_path / "values.yaml").write_text("value: 3")
-    with pytest.raises(InputError, match=r"values\.yaml: value: unknown name"):
-        load_reference(tmp_path / "values.yaml")
-
-
-def test_cells_are_named_by_their_folders() -> None:
-    for cell in (Cell("go1gate", "mat"), Cell("go1gate", "mat", "tuned")):
-        assert Cell.at(Path("runs") / cell.path) == cell
 
 
 # -- statistics --

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 import shutil
@@ -11,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from mqe_jax import cli
-from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import locked
-from mqe_jax.core.settings import build, override, to_mapping
+from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
 from mqe_jax.runs import build as setup
@@ -47,10 +45,6 @@ settings:
 VARIANTS = FILE + "variants: {plain: {}, scratch: {env: {control: position}}}\n"
 
 
-class Stop(Exception):
-    """An externally stopped sweep."""
-
-
 def config_of(task: str, algorithm: str) -> TrainConfig:
     return override(TrainConfig(task=task), preset(algorithm))
 
@@ -64,47 +58,6 @@ def load(tmp_path: Path, text: str = FILE) -> Sweep:
     path = tmp_path / "small.yaml"
     path.write_text(text)
     return sweeps.load_sweep(path)
-
-
-def run_until(folder: Path, sweep: Sweep, updates: int) -> bool:
-    """Runs a sweep and stops it at a number of seeds' updates; returns whether it ended before."""
-    seen = 0
-
-    def on_update(state: Any, row: dict[str, float]) -> None:
-        nonlocal seen
-        seen += 1
-        if seen > updates:
-            raise Stop
-
-    try:
-        sweeps.run(folder, sweeps.plan(sweep, folder, config_of), lambda config, seeds: Cast(PROBE, PROBE), on_update)
-    except Stop:
-        return False
-    return True
-
-
-@pytest.mark.soak
-def test_a_sweep_stopped_again_and_again_ends_with_every_cell(tmp_path: Path) -> None:
-    sweep, folder = load(tmp_path), tmp_path / "study"
-    sweeps.prepare(sweep, folder)
-    assert [job.steps_left for job in sweeps.plan(sweep, folder, config_of)] == [96, 96]
-    assert not run_until(folder, sweep, 5)
-    left = sweeps.plan(sweep, folder, config_of)
-    assert [job.steps_left for job in left] == [32, 96]
-    assert not run_until(folder, sweep, 5)
-    assert [job.cell.algorithm for job in sweeps.plan(sweep, folder, config_of)] == ["jrpo"]
-    assert sweeps.estimate(folder, left)[0] > 0
-    path = folder / "runs" / "go1gate" / "mappo" / "seed1" / "evaluations.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "absolute": None}))  # killed before its last file
-    assert sweeps.plan(sweep, folder, config_of)[0].folders == (path.parent,)
-    assert run_until(folder, sweep, 100)
-    assert sweeps.plan(sweep, folder, config_of) == []
-    runs = read_runs(folder)
-    assert [(run.cell.algorithm, run.seed) for run in runs] == [("jrpo", 0), ("jrpo", 1), ("mappo", 0), ("mappo", 1)]
-    for run in runs:
-        assert [point["env_steps"] for point in run.evaluations] == [32, 48]
-        assert run.absolute is not None and run.absolute["episodes"] == 40
-        assert list(run.curve["env_steps"]) == [16, 32, 48]
 
 
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
@@ -124,19 +77,6 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
     assert sweeps.run(folder, jobs, environments) == ([], [])
     assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
-
-
-def test_a_run_that_becomes_non_finite_does_not_keep_others_from_training(tmp_path: Path) -> None:
-    sweep, folder = load(tmp_path), tmp_path / "study"
-
-    def environments(config: TrainConfig, seeds: int) -> Cast:
-        if config.ppo.ratio == "dimension":
-            raise NonFiniteError("the first job")
-        return Cast(PROBE, PROBE)
-
-    outcome = sweeps.run(folder, sweeps.plan(sweep, folder, config_of), environments)
-    assert [str(error) for _, error in outcome.failed] == ["the first job"] and not outcome.others
-    assert [job.cell.algorithm for job in sweeps.plan(sweep, folder, config_of)] == ["mappo"]
 
 
 def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) -> None:
@@ -162,53 +102,6 @@ def test_seeds_and_names_of_tasks(tmp_path: Path) -> None:
     assert jobs[0].configs[0].opponents == ("go1gate", "idle") and jobs[0].configs[0].start == "go1gate.safetensors"
     with pytest.raises(InputError, match="seeds: 7 is not allowed; it must be one of the sweep's: 0, 1"):
         sweeps.plan(load(tmp_path), tmp_path, config_of, (), [1, 7])
-
-
-@pytest.mark.parametrize("part", yaml.safe_load((CONFIGS / "zoo.yaml").read_text()))
-def test_the_shipped_policies_are_remade_with_the_settings_of_train(part: str) -> None:
-    sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
-    jobs = sweeps.plan(sweep, CONFIGS, of_train)
-    assert {job.cell.task for job in jobs} == set(sweep.tasks)
-    changed = {"checkpoint", "seed"} | ({"opponents", "total_steps"} if "responses" in part else set())
-    for job in jobs:
-        if "levers" in part and job.cell.variant != "none":
-            continue
-        changed |= {"total_steps"} if "levers" in part else set()
-        default = to_mapping(of_train(job.cell.task, ""))
-        own = to_mapping(job.configs[0])
-        different = {name for name in own if own[name] != default[name]}
-        assert different <= (
-            changed | {"start", "imitation", "ppo"} if job.cell.variant == "from-champion" else changed
-        )
-        if own["start"]:
-            assert own["start"] == job.cell.task
-
-
-@pytest.mark.parametrize("task", [task for task in zoo.names() if zoo.card(task).command.startswith("mqe sweep")])
-def test_the_command_on_a_card_trains_one_run(task: str) -> None:
-    words = zoo.card(task).command.split()
-    option = {name: value for name, value in itertools.pairwise(words) if name.startswith("--")}
-    sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", option["--part"])
-    jobs = sweeps.plan(sweep, CONFIGS, of_train, [option["--cells"]], [int(option["--seeds"])])
-    assert [(job.cell.task, len(job.configs)) for job in jobs] == [(task, 1)]
-
-
-def test_a_part_must_be_named() -> None:
-    with pytest.raises(InputError, match=r"part: none is named; .*zoo\.yaml has: selection"):
-        sweeps.load_sweep(CONFIGS / "zoo.yaml")
-
-
-def test_seeds_added_later_are_trained_alone(tmp_path: Path) -> None:
-    sweep, folder = load(tmp_path), tmp_path / "study"
-    sweeps.prepare(sweep, folder)
-    checkpoint = folder / "runs" / "go1gate" / "mappo" / "seed0" / "checkpoints" / "step_000000000032.safetensors"
-    checkpoint.parent.mkdir(parents=True)
-    checkpoint.touch()
-    more = override(sweep, {"seeds": (0, 1, 2), "algorithms": ("mappo",)})
-    sweeps.prepare(more, folder)
-    jobs = sweeps.plan(more, folder, config_of)
-    assert [[config.seed for config in job.configs] for job in jobs] == [[0], [1, 2]]
-    assert [job.steps_left for job in jobs] == [16, 96]
 
 
 def test_seeds_that_stopped_at_other_steps_are_trained_alone(tmp_path: Path) -> None:
