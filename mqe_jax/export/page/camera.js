@@ -5,7 +5,8 @@ import { OrbitControls } from './lib/OrbitControls.js';
 const BESIDE = [-0.45, -1, 0.9]; // direction of the camera from its target, with the x axis to the right
 const BEHIND_START = [-1, -0.25, 0.9]; // with the x axis upwards
 const STEEP = 1.2; // m above the robot that it follows per m behind it, so that no robot hides its ball
-const [AHEAD, AROUND] = [2.5, 4]; // m from that robot: in front, and of others, within which the picture has them
+const AHEAD = 2.5; // m in front of that robot
+const [ROBOTS_WITHIN, OBJECTS_WITHIN] = [4, 8]; // m from that robot, within which the picture has them
 const [SMOOTH, TURN] = [0.12, 0.3]; // s, of the camera that follows a robot
 const [MOVE, RETREAT, APPROACH] = [0.3, 0.2, 1.5]; // s, of the camera that shows the action
 const NEAREST = 2.5; // m, their distance at least
@@ -109,8 +110,9 @@ export class Camera {
     const yaw = Math.atan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k));
     const own = new three.Vector3(x, y, z);
     const forward = new three.Vector3(Math.cos(yaw), Math.sin(yaw), 0);
-    const others = [...this.robots.map((body) => [point(xpos, body), ROBOT]), ...this.objectSpheres(xpos)];
-    const near = others.filter(([place, radius]) => place.distanceTo(own) - radius < AROUND);
+    const within = (spheres, most) => spheres.filter(([place, radius]) => place.distanceTo(own) - radius < most);
+    const robots = this.robots.map((body) => [point(xpos, body), ROBOT]);
+    const near = [...within(robots, ROBOTS_WITHIN), ...within(this.objectSpheres(xpos), OBJECTS_WITHIN)];
     this.heading = this.jumps ? forward : this.heading.lerp(forward, share(TURN));
     const direction = new three.Vector3(-this.heading.x, -this.heading.y, STEEP).normalize();
     const [target, needed] = this.fitted([[own.clone().addScaledVector(forward, AHEAD), 0], ...near], direction);
