@@ -17,7 +17,7 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import load_as, load_policy
 from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
-from mqe_jax.skills.control import Controller
+from mqe_jax.skills.control import Commander
 from mqe_jax.train.policy import save_policy
 from mqe_jax.walk_policy import WalkPolicy
 
@@ -32,9 +32,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges: Any) -> Controller:
+def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges: Any) -> Commander:
     made = make_skill(skill, GO1)
-    return Controller("command", GO1, 1, 1, made, (), commands, made.default_commands(), ranges)
+    return Commander(made, commands, made.default_commands(), ranges)
 
 
 @pytest.mark.parametrize(

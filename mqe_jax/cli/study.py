@@ -145,16 +145,18 @@ class Tournament(TaskOptions):
         import jax
 
         from mqe_jax.policies import load_policy
-        from mqe_jax.runs.build import anchors, make_env
+        from mqe_jax.runs.build import anchors, make_env, meeting
         from mqe_jax.selfplay.league import tournament
 
         for name in (tournament.CSV, tournament.PICTURE):
             check_output(self.output / name)
-        env, _ = make_env(self.task, self.impl, self.overrides(), 1)
+        given = self.overrides()
+        params = given if {"skill", "command_ranges"} & {*given} else given | meeting(self.task, given, self.policies)
+        env, _ = make_env(self.task, self.impl, params, 1)
         if len(env.teams) < 2:
             fail("task", self.task, "a match: it has one team")
         names = list(dict.fromkeys([*self.policies, *anchors(env)]))
-        _, matches = make_env(self.task, self.impl, self.overrides(), len(names) * self.episodes)
+        _, matches = make_env(self.task, self.impl, params, len(names) * self.episodes)
         policies = {name: load_policy(name, matches.env, deterministic=self.deterministic) for name in names}
         results = tournament.round_robin(matches, policies, jax.random.PRNGKey(self.seed))
         ratings = tournament.rate(results, names.index(anchors(env)[0]))

@@ -83,7 +83,7 @@ def policy_step(policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, j
 
 def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
     """Returns the skill of a task's robots for any commands, with its parameters as they are in the file."""
-    skill = skills.make(env.controller.skill.name, env.robot)
+    skill = skills.make(env.params.skill, env.robot)
     return skill, skill.load_params(env.params.skill_weights)
 
 

@@ -21,6 +21,8 @@ from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.policies import zoo
 from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.policies.translated import translate
+from mqe_jax.skills.control import Commander
 from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, groups_of, read_policy
 
 NAMES = ("scripted", "random", "idle", "forward")
@@ -128,9 +130,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     else:
         policy = read_policy(source)
     policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
-    if env is not None:
-        check_policy(policy, env, str(source))
-    return policy
+    return policy if env is None else translate(policy, env, str(source), check_policy)
 
 
 def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
@@ -143,10 +143,11 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
             policy: Any = load_policy(source, env, deterministic=deterministic)
         else:
             policy = check("policy", source, PolicyOrAct)
-            if hasattr(policy, "task"):
-                check_policy(policy, env, repr(policy))
             if isinstance(policy, TrainedPolicy):
-                policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
+                name, mean = repr(policy), deterministic or policy.deterministic
+                policy = translate(dataclasses.replace(policy, deterministic=mean), env, name, check_policy)
+            elif hasattr(policy, "task"):
+                check_policy(policy, env, repr(policy))
     except InputError as error:
         optional = ", or none" if "." in field else ""
         raise InputError(str(error).replace("policy:", f"{field}:", 1) + optional) from None
@@ -232,7 +233,9 @@ def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Arr
 
 
 def _planned(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
-    return env.controller.rescaled(jax.vmap(scripted_policy(env, name))(obs))
+    part = env.controller.skill.parts[0]
+    own = Commander(part, env.params.commands, part.default_commands(), {})
+    return env.controller.translated(jax.vmap(scripted_policy(env, name))(obs), own)
 
 
 def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, Vec
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.policies import actions_of, all_agents, load_as, load_policy, zoo
+from mqe_jax.policies.translated import together
 from mqe_jax.runs.presets import base_config
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
@@ -280,6 +282,8 @@ def players(
             config = run_config(name)
             made, params, policy = config.task or "", joined(config.env, params), policy or name
     shipped = name in zoo.names() and not params and policy is None
+    if isinstance(made, str) and not {"skill", "command_ranges"} & {*(env or ())}:
+        params |= meeting(made, params, [name if shipped else policy, opponent])
     walking = "scripted" if name in PLANNERS else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
     task_env, batch = make_env(made, impl, params, num_envs)
@@ -290,12 +294,25 @@ def players(
     if opponent is not None:
         other, against = load_as("opponent", opponent, task_env, deterministic=deterministic), opponent
     about: dict[str, Any] = {"policy": str(chosen)}
-    if isinstance(own, TrainedPolicy):
-        about["actions"] = "mean" if own.deterministic else "sampled"
+    if isinstance(trained := getattr(own, "policy", own), TrainedPolicy):
+        about["actions"] = "mean" if trained.deterministic else "sampled"
     if match:
         about["opponent"] = str(against)
     everyone = all_agents(task_env, own, other)
     return Players(task_env, batch.with_groups(groups_of(everyone)), everyone, about)
+
+
+def meeting(task: str, params: Mapping[str, Any], sources: Sequence[Any]) -> dict[str, Any]:
+    """Returns the skills and ranges with which trained policies of a task can meet (`translated.together`).
+
+    Sources that are no such policies count nowhere.
+    """
+    trained = []
+    for source in sources:
+        with contextlib.suppress(InputError):  # of which the loading with the task tells
+            trained.append(source if isinstance(source, TrainedPolicy) else load_policy(source))
+    plain = {name: value for name, value in params.items() if name != "control"}
+    return together(override(TASKS[task].Params(), plain), trained) if task in TASKS and len(trained) > 1 else {}
 
 
 def run_config(target: str) -> Any:
