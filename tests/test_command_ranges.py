@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,8 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import load_as, load_policy
 from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
-from mqe_jax.skills.control import Controller
-from mqe_jax.train.networks import EnvDims
-from mqe_jax.train.policy import TrainedPolicy, save_policy
+from mqe_jax.skills.control import Commander
+from mqe_jax.train.policy import save_policy
 from mqe_jax.walk_policy import WalkPolicy
 
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -34,9 +32,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges: Any) -> Controller:
+def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges: Any) -> Commander:
     made = make_skill(skill, GO1)
-    return Controller("command", GO1, 1, 1, made, (), commands, made.default_commands(), ranges)
+    return Commander(made, commands, made.default_commands(), ranges)
 
 
 @pytest.mark.parametrize(
@@ -160,36 +158,24 @@ def test_ranges_beyond_training_warn() -> None:
 
 @pytest.mark.parametrize("field", ["policy", "opponent"])
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("parameters", "said"),
     [
-        ({"command_ranges": {"vx": (-1.0, 1.2)}}, r"command_ranges .*'vx': \(-1.0, 1.0\).* has .*'vx': \(-1.0, 1.2\)"),
-        ({"commands": ("yaw_rate", "vy", "vx")}, r"commands \('vx', 'vy', .* has \('yaw_rate', 'vy', 'vx'\)"),
-        ({"robot": "go2"}, "robot 'go1'; .* has 'go2'"),
-        ({"control": "position"}, "control 'command'; .* has 'position'"),
-        ({"skill": "agile"}, "skill 'walk'; .* has 'agile'"),
-        ({"gait": "pace"}, "gait 'trot'; .* has 'pace'"),
-        ({"needs.task": "go1tug"}, "task 'go1tug'; .* has 'go1football-1vs1'"),
-        ({"needs.version": 7}, "version 7; .* has 1"),
-        ({"needs.group": "camera"}, "group 'camera'; .* has 'policy, proprioception'"),
-        ({"needs.layout": "base 19 = 19"}, "layout 'base 19 = 19'; .* has 'one_hot 1 "),
-        ({"needs.dims": EnvDims(2, 19, 108, 3, 1)}, "agents 2; .* has 1"),
-        ({"needs.dims": EnvDims(1, 18, 108, 3, 1)}, "observation 18; .* has 19"),
+        ({"command_ranges": {"vx": (-1.0, 1.2)}}, "command_ranges"),
+        ({"commands": ("yaw_rate", "vy", "vx")}, "commands"),
+        ({"robot": "go2"}, "robot 'go1'"),
+        ({"control": "position"}, "control 'command'"),
+        ({"skill": "agile"}, "skill 'walk'"),
     ],
 )
-def test_policies_that_need_something_else_are_refused(
-    field: str, changes: dict[str, Any], said: str, weights: str, monkeypatch: pytest.MonkeyPatch
+def test_policies_whose_actions_mean_something_else_are_refused(
+    field: str, parameters: Any, said: str, weights: str
 ) -> None:
-    """Each by name with both values, whether the policy is an object, a name or a file."""
-    monkeypatch.setattr(TrainedPolicy, "__post_init__", lambda self: None)  # which checks the shapes of weights
-    own = {name.removeprefix("needs."): value for name, value in changes.items() if name.startswith("needs.")}
-    others = {name: value for name, value in changes.items() if not name.startswith("needs.")}
-    if "skill" in others:
-        others["skill_weights"] = weights
-    env = make("go1football-1vs1", impl="c", num_envs=1, **others)
+    if "skill" in parameters:
+        parameters = {**parameters, "skill_weights": weights}
+    env = make("go1football-1vs1", impl="c", num_envs=1, **parameters)
     policy = load_policy("go1football-1vs1")
-    policy = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **own))
-    for source in (policy, *([] if own else ["go1football-1vs1"])):
-        with pytest.raises(InputError, match=rf"{field}: .* needs {said}"):
+    for source in (policy, "go1football-1vs1"):
+        with pytest.raises(InputError, match=rf"{field}: .* was trained with {said}"):
             load_as(field, source, env)
 
 
@@ -200,7 +186,7 @@ def test_commands_refuse_them_by_name(
 ) -> None:
     file = str(save_policy(tmp_path, load_policy("go1tug")))
     assert cli.main([*words, file, "--impl", "c", "--set", changes]) == 2
-    assert f"{file} needs {changes.split('=')[0].split('.')[0]}" in capfd.readouterr().err
+    assert f"{file} was trained with {changes.split('=')[0].split('.')[0]}" in capfd.readouterr().err
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
@@ -209,5 +195,5 @@ def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
     policy = learn(batch, small).policy
     assert policy.config.env == {"control": "position", "position_scale": 2.0}
     load_as("policy", policy, batch.env)
-    with pytest.raises(InputError, match=r"policy: .* needs position_scale 2.0; the environment has 1.0"):
+    with pytest.raises(InputError, match=r"policy: .* was trained with position_scale 2.0; go1plane has 1.0 here"):
         load_as("policy", policy, make("go1plane", impl="c", num_envs=1, control="position"))

@@ -246,7 +246,7 @@ def test_shaping_fades_with_the_assistance() -> None:
 @pytest.mark.parametrize("mode", ["position", "torque"])
 def test_targets_are_scaled_actions_delayed_by_the_lag(mode: str) -> None:
     skill: Any = SimpleNamespace()
-    controller = Controller(mode, GO1, 3, 2, skill, None, (), np.zeros(0), lag=2, position_scale=1.5)
+    controller = Controller(skill, (), np.zeros(0), {}, mode, GO1, 3, 2, None, lag=2, position_scale=1.5)
     still = Proprioception(jnp.zeros((3, 3)), jnp.zeros((3, 12)), jnp.zeros((3, 12)))
     actions = jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)
     scale, offset = (GO1.torque_limit, 0.0) if mode == "torque" else (1.5 * GO1.action_scale, GO1.default_joints)

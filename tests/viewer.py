@@ -37,7 +37,7 @@ class Driven(FakeEnv):
     control = "command"
     params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
     skill = skills.make("walk", GO1)
-    controller = Controller("command", GO1, 2, 2, skill, (), params.commands, np.zeros(15, np.float32))
+    controller = Controller(skill, params.commands, np.zeros(15, np.float32), {}, "command", GO1, 2, 2, ())
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         return action * jnp.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]])

@@ -81,11 +81,10 @@ class Zoo:
         from mqe_jax.policies import zoo
 
         cards = {task: zoo.card(task) for task in (zoo.names() if self.task is None else [self.task])}
-        needs = {task: zoo.load(task).needs for task in cards}
+        params = {task: zoo.params(task) for task in cards}
         plain = {
-            task: {"version": own.version, "skill": own.skill, "commands": dict(own.command_ranges)}
-            | to_mapping(cards[task])
-            for task, own in needs.items()
+            task: {"skill": params[task].skill, "commands": params[task].commanded(), **to_mapping(card)}
+            for task, card in cards.items()
         }
         if self.json:
             return {"policies": plain}
@@ -93,8 +92,8 @@ class Zoo:
             card = plain[self.task]
             shares = card.pop("results") | {f"ends by {name}": share for name, share in card.pop("endings").items()}
             rates = {name: f"{100 * share:.1f}%" for name, share in shares.items()}
-            ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in card.pop("commands").items())
-            card["skill"] = f"{card['skill']}: {', '.join(ranges)}"
+            del card["commands"]
+            card["skill"] = params[self.task].commanded_text()
             for name, value in {"task": self.task, **rates, **card}.items():
                 print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23))
             return {}

@@ -109,7 +109,7 @@ class QuadrupedEnv(Task[S, P]):
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
         if uses_skill and (beyond := skill.untrained(self.params.command_ranges)):
-            warn(f"command_ranges: the skill {skill.name!r} was not trained for {', '.join(beyond)}")
+            warn(f"command_ranges: the skill {self.params.skill!r} was not trained for {', '.join(beyond)}")
         self.controller = Controller(
             mode=control,
             robot=self.robot,
@@ -117,7 +117,7 @@ class QuadrupedEnv(Task[S, P]):
             num_agents=self.num_agents,
             skill=skill,
             skill_params=skill.load_params(self.params.skill_weights) if uses_skill else None,
-            commands=self.params.commands,
+            commands=(*self.params.commands, *skill.selector),
             default_commands=skill.default_commands(self.params.gait),
             ranges=self.params.command_ranges,
             npc=npc,

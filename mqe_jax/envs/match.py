@@ -53,10 +53,11 @@ class Match(QuadrupedEnv[S, P]):
 
     def __init__(self, params: P | None = None, **options: Any) -> None:
         super().__init__(params, **options)
-        mirrors = self.controller.skill.column("mirror", self.params.commands)
         if self.symmetry == "turn" or self.control != "command":
             return
-        for name, mirror, (low, high) in zip(self.params.commands, mirrors, self.controller.changes, strict=True):
+        names = self.controller.commands
+        mirrors = self.controller.skill.column("mirror", names)
+        for name, mirror, (low, high) in zip(names, mirrors, self.controller.changes, strict=True):
             if mirror < 0 and low != -high:
                 given = self.params.command_ranges[name]
                 fail(f"command_ranges.{name}", given, f"symmetric in {self.name}, which mirrors team 1")
@@ -106,7 +107,7 @@ class Match(QuadrupedEnv[S, P]):
         if self.symmetry == "turn":
             return action
         if self.control == "command":
-            mirrored = action * self.controller.skill.column("mirror", self.params.commands)
+            mirrored = action * self.controller.skill.column("mirror", self.controller.commands)
         else:
             mirrored = action[:, MIRRORED_JOINTS] * MIRRORED_SIGNS
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)

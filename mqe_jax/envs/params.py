@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, record
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.physics import robots
 from mqe_jax.skills import agile  # noqa: F401  (skills register themselves
+from mqe_jax.skills.control import Commander
 
 
 @record
@@ -61,8 +62,10 @@ class TaskParams:
     """Whether a contact force on an agent's trunk above `collision_force` ends the episode."""
     collision_force: Positive = 1.0
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
-    skill: str = "walk"
-    """Skill of the agents with control `command` (`mqe_jax.skills`)."""
+    skill: str | tuple[str, ...] = "walk"
+    """Skill of the agents with control `command` (`mqe_jax.skills`); of several, a further action entry says which one
+    acts (`mqe_jax.skills.choice`).
+    """
     skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
@@ -110,33 +113,30 @@ class TaskParams:
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""
 
     def __post_init__(self) -> None:
-        skill = skills.make(self.skill, robots.get(self.robot))
-        skill.check_commands(self.commands)
-        skill.changes(self.commands, self.command_ranges, skill.default_commands(self.gait))
+        commander = self.commander
+        commander.skill.check_commands(commander.commands)
+        commander.skill.changes(self.commands, self.command_ranges, commander.default_commands)
         if self.min_height >= self.max_height:
             fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
 
+    @property
+    def commander(self) -> Commander:
+        """What actions mean with control `command`."""
+        skill = skills.make(self.skill, robots.get(self.robot))
+        commands = (*self.commands, *skill.selector)
+        return Commander(skill, commands, skill.default_commands(self.gait), self.command_ranges)
+
     def commanded(self) -> dict[str, tuple[float, float]]:
         """Returns the lowest and the highest value of each command that the action sets, in the command's unit."""
-        skill = skills.make(self.skill, robots.get(self.robot))
-        default = skill.default_commands(self.gait)
-        changes = skill.changes(self.commands, self.command_ranges, default)
-        limits = np.round(np.asarray(default[skill.index(self.commands), None] + changes, float), 6)
-        return {name: (float(low), float(high)) for name, (low, high) in zip(self.commands, limits, strict=True)}
-
-    def actions(self, control: str) -> dict[str, Any]:
-        """Returns what an agent's actions mean in a control mode, by names of parameters."""
-        meaning: dict[str, Any] = {"robot": self.robot, "control": control}
-        if control == "command":
-            gaits = skills.make(self.skill, robots.get(self.robot)).gaits
-            meaning |= {"skill": self.skill, "gait": self.gait or next(iter(gaits), None), "commands": self.commands}
-            meaning["command_ranges"] = self.commanded()
-        return meaning | ({"position_scale": self.position_scale} if control == "position" else {})
+        commander = self.commander
+        limits = np.round(commander.limits, 6)
+        return {name: (float(low), float(high)) for name, (low, high) in zip(commander.commands, limits, strict=True)}
 
     def commanded_text(self) -> str:
         """Returns the skill and these ranges, such as `walk: vx -1 to 1`."""
         ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in self.commanded().items())
-        return f"{self.skill}: {', '.join(ranges)}"
+        names = " or ".join([self.skill] if isinstance(self.skill, str) else self.skill)
+        return f"{names}: {', '.join(ranges)}"
 
 
 P = TypeVar("P", bound=TaskParams)

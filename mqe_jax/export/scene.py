@@ -51,7 +51,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
         "substeps": env.physics.num_substeps,
         "max_steps": env.max_steps,
         "teams": [list(team) for team in env.teams],
-        "commands": list(env.params.commands),
+        "commands": list(env.controller.commands),
         "robots": [
             {**row, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])}
             for row, color in zip(rows, colors, strict=True)

@@ -45,14 +45,16 @@ class Skill(abc.ABC):
 
     name: ClassVar[str]
     """Name in the registry, and prefix of the recurrent states in exported graphs."""
-    commands: ClassVar[tuple[Command, ...]]
+    commands: tuple[Command, ...]
     """Its commands, in order."""
-    gaits: ClassVar[Mapping[str, Mapping[str, float]]] = {}
+    gaits: Mapping[str, Mapping[str, float]] = {}
     """Named sets of default commands; the first is the default."""
     period: ClassVar[float] = 0.02
     """Environment step, s."""
     turn: ClassVar[float | None] = None
     """Maximum |vx x yaw_rate| for which the skill is trained, m/s^2; None sets no bound."""
+    selector: ClassVar[tuple[str, ...]] = ()
+    """Commands that an action sets besides those asked for, after them."""
     robot: Robot
     """Robot type."""
 
@@ -84,6 +86,15 @@ class Skill(abc.ABC):
     def clock(self, memory: Any) -> jax.Array:
         """Returns the part of the recurrent state that critics observe, any length."""
         return jnp.zeros(0)
+
+    @property
+    def parts(self) -> tuple[Skill, ...]:
+        """The skills that act: itself, or those between which actions choose."""
+        return (self,)
+
+    def select(self, name: str) -> tuple[float, ...]:
+        """Returns the values of the commands of `selector` with which the skill of this name acts."""
+        return ()
 
     # -- common to all skills -----------------------------------------------------------------------------------
 
@@ -201,9 +212,13 @@ def register(skill: type[S]) -> type[S]:
     return skill
 
 
-@checked(name=str, robot=Robot)
-def make(name: str, robot: Robot) -> Skill:
-    """Returns a skill of a robot; InputError for an unknown name, with the nearest known one."""
+@checked(name=str | Sequence[str], robot=Robot)
+def make(name: str | Sequence[str], robot: Robot) -> Skill:
+    """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with the nearest one."""
+    from mqe_jax.skills.choice import Choice
+
+    if not isinstance(name, str):
+        return Choice(robot, [make(each, robot) for each in name])
     if name not in SKILLS:
         raise InputError(f"skill: unknown name {name!r}{nearest(name, SKILLS)}; allowed: {', '.join(SKILLS)}")
     return SKILLS[name](robot)

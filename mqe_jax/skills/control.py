@@ -51,7 +51,71 @@ class ControlState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Controller:
+class Commander:
+    """What an agent's actions mean in the mode `command`."""
+
+    skill: Skill
+    """Skill of the agents."""
+    commands: tuple[str, ...]
+    """Commands that the action sets, in order."""
+    default_commands: np.ndarray
+    """Default commands of the skill (C,)."""
+    ranges: Mapping[str, tuple[float, float]]
+    """Lowest and highest value of some of `commands`; the others have the skill's default ranges."""
+
+    def skill_commands(self, action: jax.Array) -> jax.Array:
+        """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in [-1, 1]."""
+        change = self.change(action)
+        default, columns = self.default_commands, self.skill.index(self.commands)
+        commands = jax.vmap(lambda change: placed(default, columns, default[columns] + change))(change)
+        return self.skill.bounded(commands)
+
+    def action_of(self, change: jax.Array) -> jax.Array:
+        """Computes the actions (..., action_size) that change the commands (..., action_size) from the defaults."""
+        down, up = (np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes)
+        return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
+
+    def change(self, action: jax.Array) -> jax.Array:
+        """Computes the changes of the commands from the defaults that actions ask for (..., action_size)."""
+        down, up = self._slopes
+        return jnp.clip(jnp.where(action < 0, down, up) * action, *self.changes.T)
+
+    def admits(self, other: Commander) -> bool:
+        """Returns whether actions can have the skill of `other`, one of the skills here, act with all its commands."""
+        names = other.commands
+        if names != self.commands[: len(names)] or other.skill.name not in [part.name for part in self.skill.parts]:
+            return False
+        (low, high), (least, most) = other.limits.T, self.limits[: len(names)].T
+        return bool(np.all((low >= least - 1e-6) & (high <= most + 1e-6)))
+
+    def translated(self, action: jax.Array, other: Commander) -> jax.Array:
+        """Computes the actions that give here the commands of actions (..., n) of `other`, which this one `admits`."""
+        entries = self.skill.select(other.skill.name)
+        if not entries and np.array_equal(self.changes, other.changes):
+            return action
+        shift = (other.limits - other.changes - (self.limits - self.changes)[: len(other.commands)])[:, 0]
+        entries = jnp.broadcast_to(jnp.array(entries), (*action.shape[:-1], len(entries)))
+        return self.action_of(jnp.concatenate([other.change(action) + shift, entries], axis=-1))
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Lowest and highest value of each of `commands` (n, 2)."""
+        return self.default_commands[self.skill.index(self.commands), None] + self.changes
+
+    @functools.cached_property
+    def changes(self) -> np.ndarray:
+        """Lowest and highest change of each of `commands` by an action (n, 2)."""
+        return self.skill.changes(self.commands, self.ranges, self.default_commands)
+
+    @property
+    def _slopes(self) -> np.ndarray:
+        """Change of each command per unit of a negative and of a positive action (2, n)."""
+        gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
+        return np.abs(self.changes.T) * (gain / limit)
+
+
+@dataclasses.dataclass(frozen=True)
+class Controller(Commander):
     """Computes actuator targets from actions."""
 
     mode: str
@@ -62,16 +126,8 @@ class Controller:
     """Number of robots R."""
     num_agents: int
     """Number of agents A: the first A robots."""
-    skill: Skill
-    """Skill of the agents in the mode `command`, and of the NPC robots in every mode unless `npc` is set."""
     skill_params: Any
     """Parameters of the skill, or None if no robot uses it."""
-    commands: tuple[str, ...]
-    """Commands that the action sets, in order."""
-    default_commands: np.ndarray
-    """Default commands of the skill (C,)."""
-    ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """Lowest and highest value of some of `commands`; the others have the skill's default ranges."""
     npc: tuple[Skill, Any] | None = None
     """Skill of the NPC robots and its parameters if it is another one."""
     lag: int = 0
@@ -128,26 +184,6 @@ class Controller:
         rest = self.num_robots - sum(len(clock) for clock in clocks)
         return jnp.concatenate([jnp.zeros((rest, width)), *clocks]) if rest or len(clocks) > 1 else clocks[0]
 
-    def skill_commands(self, action: jax.Array) -> jax.Array:
-        """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in [-1, 1]."""
-        down, up = self._slopes
-        change = jnp.clip(jnp.where(action < 0, down, up) * action, *self.changes.T)
-        default, columns = self.default_commands, self.skill.index(self.commands)
-        commands = jax.vmap(lambda change: placed(default, columns, default[columns] + change))(change)
-        return self.skill.bounded(commands)
-
-    def action_of(self, change: jax.Array) -> jax.Array:
-        """Computes the actions (..., action_size) that change the commands (..., action_size) from the defaults."""
-        down, up = (np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes)
-        return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
-
-    def rescaled(self, action: jax.Array) -> jax.Array:
-        """Computes the actions that give the commands of `action` (..., action_size) with the skill's own ranges."""
-        gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
-        if np.array_equal(self.changes.T, [-limit, limit]):
-            return action
-        return self.action_of(jnp.clip(gain * action, -limit, limit))
-
     @jax.named_scope("control")
     def targets(
         self,
@@ -198,17 +234,6 @@ class Controller:
     def npc_default_commands(self) -> np.ndarray:
         """Default commands of the NPC robots' skill (C,)."""
         return self.npc[0].default_commands() if self.npc else self.default_commands
-
-    @functools.cached_property
-    def changes(self) -> np.ndarray:
-        """Lowest and highest change of each of `commands` by an action (n, 2)."""
-        return self.skill.changes(self.commands, self.ranges, self.default_commands)
-
-    @property
-    def _slopes(self) -> np.ndarray:
-        """Change of each command per unit of a negative and of a positive action (2, n)."""
-        gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
-        return np.abs(self.changes.T) * (gain / limit)
 
     @property
     def _groups(self) -> list[tuple[Skill, Any, int]]:

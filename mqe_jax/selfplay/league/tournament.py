@@ -23,8 +23,9 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, checked, fail
 from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
 from mqe_jax.envs import VectorEnv
+from mqe_jax.policies import check_policy
 from mqe_jax.selfplay.opponents import Versus
-from mqe_jax.train.policy import Policy, check_policy
+from mqe_jax.train.policy import Policy
 
 Array = NDArray[np.float64]
 CSV, PICTURE = "tournament.csv", "tournament.png"
