@@ -14,7 +14,7 @@ from mqe_jax import VectorEnv, make, versus
 from mqe_jax.core.settings import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Result, evaluate_batch
-from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import policy_of
 
 
@@ -28,20 +28,20 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
     one_team = versus(matches, ["idle"])  # for the sizes of a policy; its first snapshot is untrained
     learner = make_learner(one_team, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
-    snapshot = policy_of(state, env_dims(one_team, config), config, task=matches.name)
+    snapshot = policy_of(state, one_team, config)
 
     env = versus(matches, [snapshot, "scripted"])  # half of the environments each
     learner = make_learner(env, config)
     state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
     for i in range(updates):
         if i % snapshot_every == 0:
-            snapshot = policy_of(state, env_dims(env, config), config, task=matches.name)
+            snapshot = policy_of(state, env, config)
             env_state = env.change(state.rollout.env_state, 0, snapshot)  # when their episodes end
             state = dataclasses.replace(state, rollout=state.rollout._replace(env_state=env_state))
         state, metrics = update(state)
         print(f"update {i + 1}: average step reward {float(metrics['average_step_reward']):.4f}")
 
-    policy = policy_of(state, env_dims(env, config), config, task=matches.name)
+    policy = policy_of(state, env, config)
     fights = [versus(matches, [opponent]) for opponent in (snapshot, "scripted")]
     return [evaluate_batch(fight, policy, episodes, jax.random.PRNGKey(1)) for fight in fights]
 

@@ -276,7 +276,7 @@ def test_bad_opponents_are_named() -> None:
         task_env("go1gate", opponent="idle", impl="c", control="position")
     with pytest.raises(InputError, match="opponent: unknown 'scriptd'"):
         task_env(env, opponent="scriptd")
-    with pytest.raises(InputError, match=r"opponent: .* was trained on go1tug, not on go1wrestling"):
+    with pytest.raises(InputError, match=r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'"):
         task_env(env, opponent=counting("go1tug"))
     team = TeamEnv(env, "idle")
     with pytest.raises(InputError, match=r"action: shape \(2, 12\); expected \(1, 12\)"):

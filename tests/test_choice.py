@@ -34,9 +34,8 @@ TASK = "go1football-1vs1"
 def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Files of the shipped policy, and of one with the same network for the agile skill and its ranges."""
     policy, folder = load_policy(TASK), tmp_path_factory.mktemp("policies")
-    agile = dataclasses.replace(
-        policy, config=dataclasses.replace(policy.config, env={"skill": "agile", "command_ranges": WIDE})
-    )
+    needs = dataclasses.replace(policy.needs, skill="agile", gait=None, command_ranges=WIDE)
+    agile = dataclasses.replace(policy, needs=needs)
     return {
         name: str(save_policy(folder, x, f"{name}.safetensors")) for name, x in zip(BOTH, (policy, agile), strict=True)
     }
@@ -190,12 +189,9 @@ def test_ranges_for_which_no_skill_is_trained_warn() -> None:
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ({"skill": "agile", "command_ranges": WIDE}, r"was trained with skill 'walk'; .* has 'agile' here"),
-        (
-            {"skill": BOTH, "command_ranges": {"vx": (-0.5, 0.5)}},
-            r"was trained with skill 'walk'; .* \('walk', 'agile'\)",
-        ),
-        ({"skill": BOTH, "robot": "go2"}, "was trained with robot 'go1'"),
+        ({"skill": "agile", "command_ranges": WIDE}, "needs skill 'walk'; .* has 'agile'"),
+        ({"skill": BOTH, "command_ranges": {"vx": (-0.5, 0.5)}}, r"needs skill 'walk'; .* has \('walk', 'agile'\)"),
+        ({"skill": BOTH, "robot": "go2"}, "needs robot 'go1'"),
     ],
 )
 def test_policies_that_the_actions_do_not_admit_are_refused(policies: Any, parameters: Any, said: str) -> None:

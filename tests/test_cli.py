@@ -174,8 +174,9 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
     """A run's sampled actions unless --deterministic is given; a task's shipped policy, forward without any."""
     played: list[tuple[str, bool]] = []
 
-    def load(source: str, env: Any, *, deterministic: bool) -> None:
-        played.append((source, deterministic))
+    def load(source: str, env: Any = None, *, deterministic: bool = False) -> None:
+        if env is not None:
+            played.append((source, deterministic))
         raise InputError("stop")
 
     monkeypatch.setattr("mqe_jax.policies.load_policy", load)
@@ -206,7 +207,7 @@ def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: py
     for flag in ("--policy", "--opponent"):
         assert cli.main(["eval", "go1tug", flag, str(run_folder)]) == 2
         err = capfd.readouterr().err
-        assert err.startswith(f"mqe: {flag[2:]}: ") and "was trained on fake, not on go1tug" in err
+        assert err.startswith(f"mqe: {flag[2:]}: ") and "needs task 'fake'; the environment has 'go1tug'" in err
 
 
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:

@@ -32,7 +32,7 @@ BAD = {
     "parameter's value": (["bench", "go1gate", "--set", "gate_width=wide"], ["gate_width", "'wide'", "number"]),
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
     "policy": (["eval", "fake", "--policy", "randm"], ["policy: unknown 'randm'", "random", "a run folder"]),
-    "file without its suffix": (["eval", "./fifo"], ["'./fifo' is not a folder", "*.safetensors"]),
+    "file without its suffix": (["eval", "./fifo"], ["'./fifo' has no policy.safetensors", "*.safetensors"]),
     "control of a teacher": (
         ["train", "go1sheep-easy", "--control", "position"],
         ["imitation.teacher: 'scripted'", "'position'"],
@@ -51,7 +51,7 @@ BAD = {
     ),
     "robots": (["eval", "go1tug", "--set", "num_agents=3"], ["num_agents: 3", "go1tug requires 2 robots"]),
     "run": (["eval", "runs/none"], ["runs/none"]),
-    "no run": (["eval", "."], ["config.yaml"]),
+    "no run": (["eval", "."], ["policy.safetensors"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
     "config file": (["train", "fake", "--config", "none.yaml"], ["none.yaml"]),
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from mqe_jax.policies import load_as, load_policy
 from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import save_policy
+from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import WalkPolicy
 
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -158,24 +160,36 @@ def test_ranges_beyond_training_warn() -> None:
 
 @pytest.mark.parametrize("field", ["policy", "opponent"])
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("changes", "said"),
     [
-        ({"command_ranges": {"vx": (-1.0, 1.2)}}, "command_ranges"),
-        ({"commands": ("yaw_rate", "vy", "vx")}, "commands"),
-        ({"robot": "go2"}, "robot 'go1'"),
-        ({"control": "position"}, "control 'command'"),
-        ({"skill": "agile"}, "skill 'walk'"),
+        ({"command_ranges": {"vx": (-1.0, 1.2)}}, r"command_ranges .*'vx': \(-1.0, 1.0\).* has .*'vx': \(-1.0, 1.2\)"),
+        ({"commands": ("yaw_rate", "vy", "vx")}, r"commands \('vx', 'vy', .* has \('yaw_rate', 'vy', 'vx'\)"),
+        ({"robot": "go2"}, "robot 'go1'; .* has 'go2'"),
+        ({"control": "position"}, "control 'command'; .* has 'position'"),
+        ({"skill": "agile"}, "skill 'walk'; .* has 'agile'"),
+        ({"gait": "pace"}, "gait 'trot'; .* has 'pace'"),
+        ({"needs.task": "go1tug"}, "task 'go1tug'; .* has 'go1football-1vs1'"),
+        ({"needs.version": 7}, "version 7; .* has 1"),
+        ({"needs.group": "camera"}, "group 'camera'; .* has 'policy, proprioception'"),
+        ({"needs.layout": "base 19 = 19"}, "layout 'base 19 = 19'; .* has 'one_hot 1 "),
+        ({"needs.dims": EnvDims(2, 19, 108, 3, 1)}, "agents 2; .* has 1"),
+        ({"needs.dims": EnvDims(1, 18, 108, 3, 1)}, "observation 18; .* has 19"),
     ],
 )
-def test_policies_whose_actions_mean_something_else_are_refused(
-    field: str, parameters: Any, said: str, weights: str
+def test_policies_that_need_something_else_are_refused(
+    field: str, changes: dict[str, Any], said: str, weights: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if "skill" in parameters:
-        parameters = {**parameters, "skill_weights": weights}
-    env = make("go1football-1vs1", impl="c", num_envs=1, **parameters)
+    """Each by name with both values, whether the policy is an object, a name or a file."""
+    monkeypatch.setattr(TrainedPolicy, "__post_init__", lambda self: None)  # which checks the shapes of weights
+    own = {name.removeprefix("needs."): value for name, value in changes.items() if name.startswith("needs.")}
+    others = {name: value for name, value in changes.items() if not name.startswith("needs.")}
+    if "skill" in others:
+        others["skill_weights"] = weights
+    env = make("go1football-1vs1", impl="c", num_envs=1, **others)
     policy = load_policy("go1football-1vs1")
-    for source in (policy, "go1football-1vs1"):
-        with pytest.raises(InputError, match=rf"{field}: .* was trained with {said}"):
+    policy = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **own))
+    for source in (policy, *([] if own else ["go1football-1vs1"])):
+        with pytest.raises(InputError, match=rf"{field}: .* needs {said}"):
             load_as(field, source, env)
 
 
@@ -186,7 +200,7 @@ def test_commands_refuse_them_by_name(
 ) -> None:
     file = str(save_policy(tmp_path, load_policy("go1tug")))
     assert cli.main([*words, file, "--impl", "c", "--set", changes]) == 2
-    assert f"{file} was trained with {changes.split('=')[0].split('.')[0]}" in capfd.readouterr().err
+    assert f"{file} needs {changes.split('=')[0].split('.')[0]}" in capfd.readouterr().err
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
@@ -195,5 +209,5 @@ def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
     policy = learn(batch, small).policy
     assert policy.config.env == {"control": "position", "position_scale": 2.0}
     load_as("policy", policy, batch.env)
-    with pytest.raises(InputError, match=r"policy: .* was trained with position_scale 2.0; go1plane has 1.0 here"):
+    with pytest.raises(InputError, match=r"policy: .* needs position_scale 2.0; the environment has 1.0"):
         load_as("policy", policy, make("go1plane", impl="c", num_envs=1, control="position"))

@@ -19,7 +19,7 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import zoo
 from mqe_jax.skills import SKILLS
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
 from tests.training import random_params
@@ -42,13 +42,12 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> TrainedPol
         network["critic_input"] = "observations"
     settings = {"task": env.name, "env": {"control": control}, "action_scale": 0.5, "network": network}
     config = build(TrainConfig, settings)
-    agents = len(env.teams[0])
-    dims = EnvDims(agents, env.observation_size, 0, env.action_size, agents)
-    net = config.network.build(dims)
+    needs = needs_of(env, config)
+    net = config.network.build(needs.dims)
     keys = jax.random.split(jax.random.PRNGKey(3), 3)
     params = jax.tree.map(lambda x: x + 0.1, net.policy_params(random_params(net)))
     mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
-    return TrainedPolicy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), dims, config, {})
+    return TrainedPolicy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), needs, config, {})
 
 
 def error_on_random_inputs(policy: TrainedPolicy, env: Any) -> float:
@@ -133,7 +132,7 @@ def test_a_graph_holds_the_skill_of_the_task(monkeypatch: pytest.MonkeyPatch) ->
 
 def stub_env(agents: int) -> Any:
     """What `policy_step` reads of a task in `torque` control."""
-    sizes = {"num_agents": agents, "observation_size": 7, "action_size": 12, "teams": (tuple(range(agents)),)}
+    sizes = {"num_agents": agents, "observation_size": 7, "privileged_observation_size": 0, "action_size": 12}
     return SimpleNamespace(name="none", control="torque", robot=GO1, **sizes)
 
 
@@ -178,5 +177,5 @@ def test_what_cannot_be_exported_is_refused_in_a_line(
     assert "nothing is written" in said and "differs from JAX by" in said and "at most 0.0001" in said
     monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: jax.lax.nextafter(x, x))
     assert "jax2onnx cannot translate go1gate (" in refused(str(GATE), "--onnx", file)
-    with pytest.raises(InputError, match="was trained on go1gate, not on go1tug"):
+    with pytest.raises(InputError, match="needs task 'go1gate'; the environment has 'go1tug'"):
         to_onnx(load_policy(GATE), make("go1tug", impl="c", num_envs=1))

@@ -131,7 +131,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
     ("obs: ", lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY), (None, "x", np.zeros((2, 1, 9)), 3)),
     ("key: ", lambda x, v: load_policy("random", x["match"]).act(jnp.zeros((2, 1, 10)), (), v), (None, 3, "x")),
-    ("dims: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), dims=v), (None, (1, 2, 3))),
+    ("needs: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), needs=v), (None, (1, 2, 3))),
     ("config: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), config=v), (None, {})),
     ("metadata: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), metadata=v), (None, "x")),
     ("deterministic: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), deterministic=v), (None, 1)),

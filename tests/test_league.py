@@ -25,7 +25,8 @@ from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import TrainState, env_dims, make_learner
+from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.policy import policy_of, save_policy
 from mqe_jax.train.seeds import Seeds
 from mqe_jax.train.start import first_state, own_learner, without_environments
@@ -76,7 +77,7 @@ def history() -> list[TrainState]:
 
 def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainState]) -> None:
     assert [int(jnp.sum(state.extra.pool.born >= 0)) for state in history[:5]] == [1, 2, 3, 4, 4]
-    network = config_of().network.build(env_dims(versus(matches(), ["idle"]), config_of()))
+    network = config_of().network.build(needs_of(versus(matches(), ["idle"]), config_of()).dims)
     for state in history:
         newest, older, uniform, idle = state.rollout.env_state.opponents
         jax.tree.map(np.testing.assert_array_equal, newest.arrays.params, network.policy_params(state.params))
@@ -91,9 +92,9 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
 def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainState], tmp_path: Path) -> None:
     config, state = config_of(start=str(tmp_path)), history[9]
     league = League(matches(num_envs=8), SOURCES, config)
-    save_policy(tmp_path, policy_of(state, env_dims(league.env, config), config, task="go1tug", env_steps=0))
+    save_policy(tmp_path, policy_of(state, league.env, config, env_steps=0))
     learner, processes = own_learner(league.env, config, league)
-    begun, _ = first_state("go1tug", learner, processes, config, None, Seeds(learner.init, 1).shared, league)
+    begun, _ = first_state(league.env, learner, processes, config, None, Seeds(learner.init, 1).shared, league)
     mine = league._own(begun)
     jax.tree.map(np.testing.assert_array_equal, mine.params, league._own(state).params)
     for arrays in (
@@ -109,7 +110,7 @@ def test_a_league_resumed_without_environments_plays_its_members(history: list[T
     metadata = {"task": "go1tug", "config": to_mapping(config), "environments": False}
     file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
     learner, processes = own_learner(league.env, config, league)
-    resumed, _ = first_state("go1tug", learner, processes, config, file, Seeds(learner.init, 1).shared, league)
+    resumed, _ = first_state(league.env, learner, processes, config, file, Seeds(learner.init, 1).shared, league)
     seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)
     for now, before in seats:
         jax.tree.map(np.testing.assert_array_equal, now.arrays, before.arrays)

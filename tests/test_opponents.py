@@ -25,8 +25,9 @@ from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import Mirror, Versus, versus
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.monitor import score
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
 from tests.training import random_params
@@ -55,10 +56,10 @@ def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **se
     """An untrained policy of a team."""
     own = {"task": env.name, "env": {"control": env.env.control, **params}, "num_envs": env.num_envs}
     config = build(TrainConfig, {**SETTINGS, **own, **settings})
-    dims = env_dims(env, config)
-    network = config.network.build(dims)
+    needs = needs_of(env, config)
+    network = config.network.build(needs.dims)
     weights = network.policy_params(random_params(network, seed))
-    return TrainedPolicy(weights, running_init(dims.observation), dims, config, {"task": env.name})
+    return TrainedPolicy(weights, running_init(needs.dims.observation), needs, config, {})
 
 
 def test_teams_may_see_different_groups_of_observations() -> None:
@@ -182,7 +183,7 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
         versus(door, ["idle"] * 4).share(2)
     with pytest.raises(InputError, match="go1plane is not a match"):
         versus(matches("go1plane"), ["idle"])
-    with pytest.raises(InputError, match=r"opponents: .* was trained on go1revolvingdoor, not on go1tug"):
+    with pytest.raises(InputError, match=r"opponents: .* needs task 'go1revolvingdoor'; the environment has 'go1tug'"):
         versus(matches("go1tug"), [policies[0]])
     env = versus(door, ["idle", policies[0]])
     with pytest.raises(InputError, match="block 0 is fixed"):
@@ -200,7 +201,7 @@ def test_the_trainer_sees_one_team(kind: str) -> None:
     settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
     config = build(TrainConfig, {**SETTINGS, **settings, "num_envs": env.num_envs})
     learner = make_learner(env, config)
-    dims = env_dims(env, config)
+    dims = needs_of(env, config).dims
     assert (dims.agents, dims.values) == (inner.num_agents // 2, 1)
     if kind == "versus":
         metrics = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))[1]

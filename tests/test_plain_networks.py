@@ -14,6 +14,7 @@ import pytest
 from mqe_jax.core.settings import build
 from mqe_jax.core.types import NetworkMemory
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.needs import Needs
 from mqe_jax.train.networks import ActorCritic, EnvDims, Mat
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
@@ -159,7 +160,7 @@ def test_a_policy_normalises_scales_and_clips() -> None:
     network = config.network.build(dims)
     params = network.policy_params(jax.jit(network.init)(KEY))
     statistics = RunningStatistics(jnp.full(3, 0.5), jnp.full(3, 4.0), jnp.float32(9.0))
-    policy = TrainedPolicy(params, statistics, dims, config, {"task": "probe"})
+    policy = TrainedPolicy(params, statistics, Needs(task="probe", dims=dims), config, {})
     obs = 4.0 * jax.random.normal(KEY, (50, 2, 3))
     raw, _, _ = network.act(params, (), (obs - 0.5) / 2.0, None)
     np.testing.assert_allclose(policy.act(obs, ())[0], np.clip(0.5 * np.asarray(raw), -1, 1), atol=1e-5)

@@ -21,7 +21,7 @@ from mqe_jax.selfplay.league import league, pool, tournament
 from mqe_jax.train import learner as learning
 from mqe_jax.train.checkpoint import save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import Seeds
@@ -81,13 +81,13 @@ def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp
     config = build(TrainConfig, {**values, "network": {"recurrent": False}})
     learner, processes = own_learner(env, config)
     shared = Seeds(learner.init, 1).shared
-    start, _ = first_state("probe", learner, processes, config, None, shared)
+    start, _ = first_state(env, learner, processes, config, None, shared)
     keys = [start.rollout.env_state.key.tolist()]
     metadata = {"task": "probe", "config": to_mapping(config), "seconds": 1.0, "environments": False}
     for updates in (1, 2):
         later = without_environments(start) | {"updates": jnp.int32(updates)}
         path = save_checkpoint(tmp_path, later, 16 * updates, metadata, keep=2)
-        state, seconds = first_state("probe", learner, processes, config, path, shared)
+        state, seconds = first_state(env, learner, processes, config, path, shared)
         keys.append(state.rollout.env_state.key.tolist())
         assert seconds == 1.0 and int(state.updates) == updates and state.key.tolist() == start.key.tolist()
     assert len({tuple(key) for key in keys}) == 3
@@ -107,7 +107,7 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
             TrainConfig, {**values, "network": {"recurrent": False, "hidden_sizes": [4]}, "rollout_steps": 4}
         )
         state = jax.jit(make_learner(env, config).init)(KEY)
-        policy = policy_of(state, env_dims(env, config), config, task="probe")
+        policy = policy_of(state, env, config)
         one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
         assert (one["env_steps"], two["env_steps"]) == (3, 5) and one["sampled"] == two["sampled"] != one[
             "deterministic"

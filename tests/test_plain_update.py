@@ -16,6 +16,7 @@ from mqe_jax.core.types import Transition
 from mqe_jax.train import learner as learning
 from mqe_jax.train import nn, stages
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_init
 from mqe_jax.train.optim import AdamState
 from mqe_jax.train.rollout import ObservationNormalizer
@@ -111,7 +112,7 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         updates=jnp.int32(updates),
     )
     done: Any = random.random((T, N)) < 0.4
-    network = config.network.build(learning.env_dims(env, config))
+    network = config.network.build(needs_of(env, config).dims)
     memory, length = network.initial_memory(N), network.chunk_length
     first: Any = random.random((T, N)) < 0.3
     first[::length] = False  # the state of memory before a first step is zero in a rollout
@@ -328,7 +329,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
     random = np.random.default_rng(5)
     (env, state), data = drawn(random, config, updates)
     monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, data, {"ended": {"episodes": 0.0}}))
-    length = config.network.build(learning.env_dims(env, config)).chunk_length
+    length = config.network.build(needs_of(env, config).dims).chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
     monkeypatch.setattr(stages, "minibatches", lambda *_: jnp.asarray(order))
     after, metrics = jax.jit(learner_of(env, config).update)(state)

@@ -35,6 +35,7 @@ from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 
+AGILE = Path(__file__).parents[1] / "results" / "agile"
 MATCHES = [name for name in zoo.names() if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")]
 
 
@@ -48,7 +49,7 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
     policy, card = load_policy(task, env), zoo.card(task)
     assert isinstance(policy, TrainedPolicy) and policy.task == task
     assert policy.deterministic == (card.mode == "deterministic")
-    assert zoo.file_of(task).stat().st_size <= 125_000
+    assert zoo.file_of(task).stat().st_size <= 126_000
     assert card.episodes >= 512
     assert card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml ")) and task in card.command
     wins = {"win/scripted", "loss/scripted", "win/idle", "win/random"}
@@ -107,8 +108,8 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
 
 def test_an_outdated_policy_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(TASKS["go1gate"], "version", 2)
-    with pytest.raises(InputError, match=r"the shipped one of go1gate was trained on version 1 .*version 2 now"):
-        load_policy("go1gate")
+    with pytest.raises(InputError, match=r"policy: go1gate needs version 1; the environment has 2"):
+        load_policy("go1gate", make("go1gate", impl="c", num_envs=1))
     with pytest.raises(InputError, match=r"none is shipped for 'go1plane'"):
         zoo.card("go1plane")
 
@@ -116,7 +117,31 @@ def test_an_outdated_policy_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) 
 def test_a_policy_of_another_robot_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     file = save_policy(tmp_path, load_policy("go1gate"))
     assert cli.main(["eval", str(file), "--robot", "go2", "--impl", "c"]) == 2
-    assert "was trained with robot 'go1'; go1gate has 'go2' here" in capfd.readouterr().err
+    assert "needs robot 'go1'; the environment has 'go2'" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("file", sorted(AGILE.glob("*.safetensors")), ids=lambda file: file.stem)
+def test_a_policy_brings_the_parameters_that_it_needs(file: Path) -> None:
+    env: Any = players(file.stem.rpartition("-")[0], file, impl="c").env
+    assert env.params.skill == "agile" and set(env.params.commanded()) == {"vx", "vy", "yaw_rate"}
+    assert env.params.commanded()["vx"] == (-1.5, 2.5)
+
+
+def test_commands_apply_what_a_shipped_policy_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Where it is chosen by default, by its name, or as the opponent; settings against it are refused."""
+    zoo.ship(load_policy(AGILE / "go1tug-seed1.safetensors"), zoo.card("go1tug"), tmp_path)
+    monkeypatch.setattr(zoo, "FOLDER", tmp_path)
+    for chosen in ((), ("go1tug",), ("scripted", "go1tug")):
+        env = players("go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}).env
+        assert (env.params.skill, env.params.commanded()["vx"]) == ("agile", (-1.5, 2.5))
+    words = ["--impl", "c", "--set", "skill=walk"]
+    for command in (["eval", "go1tug", "--policy", "go1tug"], ["tournament", "go1tug", "go1tug"]):
+        assert cli.main([*command, *words]) == 2
+        assert "policy: go1tug needs skill 'agile'; the environment has 'walk'" in capfd.readouterr().err
+    assert cli.main(["zoo", "go1tug"]) == 0
+    assert "agile: vx -1.5 to 2.5" in capfd.readouterr().out
 
 
 def test_a_policy_is_shipped_with_its_card(tmp_path: Path) -> None:

@@ -330,7 +330,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     single, single_memory = policy.act(obs[0], policy.initial_memory())
     np.testing.assert_allclose(mean[0], single, atol=1e-6)
     assert jax.tree.leaves(single_memory)[0].shape == (2, 4)
-    assert policy.metadata["task"] == "probe"
+    assert policy.task == "probe"
     with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
         policy.act(np.zeros((3, 3, 2)), memory)
     result = evaluate_batch(PROBE, policy, 8, jax.random.PRNGKey(0))
@@ -353,7 +353,9 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
         np.testing.assert_array_equal(first[name], last[name])
     with pytest.raises(InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "):
         train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b")
-    with pytest.raises(InputError, match=rf"start: {run_dir} has a policy of probe; allowed: .* this run's network"):
+    with pytest.raises(
+        InputError, match=r"start: .*straight.* is not allowed; it must be a policy with this run's network"
+    ):
         train(PROBE, settings(start=str(run_dir), network__hidden_sizes=(8,)), tmp_path / "b")
 
 

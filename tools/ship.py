@@ -48,5 +48,4 @@ if __name__ == "__main__":
     with TemporaryDirectory() as folder:
         rounded = str(save_policy(folder, policy, half=True))
         results, endings = measure(rounded, policy.task, given["episodes"], given["mode"] == "deterministic")
-    version = TASKS[policy.task].version
-    print(zoo.ship(policy, zoo.Card(version=version, results=results, endings=endings, **given)))
+    print(zoo.ship(policy, zoo.Card(results=results, endings=endings, **given)))

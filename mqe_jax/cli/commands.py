@@ -81,10 +81,11 @@ class Zoo:
         from mqe_jax.policies import zoo
 
         cards = {task: zoo.card(task) for task in (zoo.names() if self.task is None else [self.task])}
-        params = {task: zoo.params(task) for task in cards}
+        needs = {task: zoo.load(task).needs for task in cards}
         plain = {
-            task: {"skill": params[task].skill, "commands": params[task].commanded(), **to_mapping(card)}
-            for task, card in cards.items()
+            task: {"version": own.version, "skill": own.skill, "commands": dict(own.command_ranges)}
+            | to_mapping(cards[task])
+            for task, own in needs.items()
         }
         if self.json:
             return {"policies": plain}
@@ -92,8 +93,8 @@ class Zoo:
             card = plain[self.task]
             shares = card.pop("results") | {f"ends by {name}": share for name, share in card.pop("endings").items()}
             rates = {name: f"{100 * share:.1f}%" for name, share in shares.items()}
-            del card["commands"]
-            card["skill"] = params[self.task].commanded_text()
+            ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in card.pop("commands").items())
+            card["skill"] = f"{card['skill']}: {', '.join(ranges)}"
             for name, value in {"task": self.task, **rates, **card}.items():
                 print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23))
             return {}

@@ -18,7 +18,7 @@ from mqe_jax.runs.build import base_config, for_task, make_env
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
 from mqe_jax.train.folder import CONFIG_FILE
-from mqe_jax.train.learner import env_dims, make_learner
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.start import initial_key
 from mqe_jax.viz import curves
@@ -40,7 +40,7 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     measure: dict[str, Any] = playing | {"episodes": episodes, "num_envs": config.num_envs, "seed": config.seed + 1000}
 
     state = jax.jit(make_learner(batch, config).init)(initial_key(config))
-    before = policy_of(state, env_dims(batch, config), config, task=DEMO_TASK)
+    before = policy_of(state, batch, config)
     del state
     echo("mqe demo: evaluating the untrained policy")
     table = {"before": evaluate(DEMO_TASK, before, **measure).to_dict()}

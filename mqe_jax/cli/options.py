@@ -65,7 +65,8 @@ class PolicyOptions(TaskOptions):
     """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
     another scripted policy of the task, a task with a shipped policy, a run folder, or a policy file. Default: that of
     the given run; of a task: the shipped one (see `mqe zoo`), else scripted, else forward; random, where actions are
-    not commands."""
+    not commands. A task by its id gets the skill, gait, command ranges, control mode and robot that a trained policy
+    needs."""
     opponent: PolicyName = None
     """Policy of team 1 in a match: what --policy accepts. Default: the same as team 0 where that is the shipped one by
     default, else idle."""

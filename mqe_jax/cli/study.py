@@ -18,7 +18,7 @@ from mqe_jax.core.errors import InputError, NonFiniteError, nearest, one_line
 from mqe_jax.core.files import check_output
 from mqe_jax.core.limits import Candidates, Positive
 from mqe_jax.core.literal import echo, line
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, joined, record
 
 if TYPE_CHECKING:
     from mqe_jax.study import sweep as sweeps
@@ -144,14 +144,13 @@ class Tournament(TaskOptions):
         """Plays all pairs; prints a table, or returns the object for `--json`."""
         import jax
 
-        from mqe_jax.policies import load_policy
-        from mqe_jax.runs.build import anchors, make_env, meeting
+        from mqe_jax.policies import load_policy, parameters_for
+        from mqe_jax.runs.build import anchors, make_env
         from mqe_jax.selfplay.league import tournament
 
         for name in (tournament.CSV, tournament.PICTURE):
             check_output(self.output / name)
-        given = self.overrides()
-        params = given if {"skill", "command_ranges"} & {*given} else given | meeting(self.task, given, self.policies)
+        params = joined(parameters_for(self.task, *self.policies), self.overrides())
         env, _ = make_env(self.task, self.impl, params, 1)
         if len(env.teams) < 2:
             fail("task", self.task, "a match: it has one team")

@@ -129,8 +129,7 @@ class VectorEnv(Batch):
         self.observation_size = env.observation_size
         self.privileged_observation_size = env.privileged_observation_size
         self.action_size = env.action_size
-        further = {name: layout.size for name, layout in getattr(env, "groups", {}).items()}
-        self.group_sizes = {"policy": self.observation_size, **further}
+        self.group_sizes = env.group_sizes
 
     def with_groups(self, names: Iterable[str]) -> Self:
         """Returns the batch that also observes further groups; InputError for one that the task does not have."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -129,8 +129,17 @@ class TaskParams:
     def commanded(self) -> dict[str, tuple[float, float]]:
         """Returns the lowest and the highest value of each command that the action sets, in the command's unit."""
         commander = self.commander
-        limits = np.round(commander.limits, 6)
+        limits = np.round(np.asarray(commander.limits, float), 6)
         return {name: (float(low), float(high)) for name, (low, high) in zip(commander.commands, limits, strict=True)}
+
+    def actions(self, control: str) -> dict[str, Any]:
+        """Returns what an agent's actions mean in a control mode, by names of parameters."""
+        meaning: dict[str, Any] = {"robot": self.robot, "control": control}
+        if control == "command":
+            gait, ranges = self.gait or next(iter(self.commander.skill.gaits), None), self.commanded()
+            meaning |= {"skill": self.skill, "gait": gait, "commands": self.commands}
+            meaning["command_ranges"] = {name: ranges[name] for name in self.commands}
+        return meaning | ({"position_scale": self.position_scale} if control == "position" else {})
 
     def commanded_text(self) -> str:
         """Returns the skill and these ranges, such as `walk: vx -1 to 1`."""

@@ -32,7 +32,7 @@ class Task(Generic[S, P]):
     name: ClassVar[str] = ""
     """Id of the task."""
     version: ClassVar[int] = 1
-    """Version of scene, observation and reward: policies of another one are outdated (`mqe_jax.policies.zoo`)."""
+    """Version of scene, observation and reward: a policy of another one is rejected."""
     title: ClassVar[str] = ""
     """Display title: the paper's name if the task is in the paper."""
     aim: ClassVar[str] = ""
@@ -130,6 +130,16 @@ class Task(Generic[S, P]):
     def groups(self) -> Mapping[str, ObservationLayout]:
         """Layouts of further groups of observations by name, which are computed if a policy or a critic names them."""
         return {"proprioception": PROPRIOCEPTION}
+
+    @property
+    def group_sizes(self) -> dict[str, int]:
+        """Lengths of an agent's observations by group."""
+        return {"policy": self.observation_size, **{name: layout.size for name, layout in self.groups.items()}}
+
+    def describe(self, group: str) -> dict[str, Any]:
+        """Returns what policies that see a group of observations need of the task, beside its name and sizes."""
+        layout = {"policy": self.observation_layout, **self.groups}[group]
+        return {"version": self.version, **self.params.actions(self.control), "layout": str(layout)}
 
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""

@@ -33,9 +33,8 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import NUM_JOINTS
-from mqe_jax.policies import check_policy
 from mqe_jax.skills import Skill
-from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.policy import TrainedPolicy, check_policy
 
 SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
 """Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
@@ -49,8 +48,8 @@ def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
         InputError: for another task than the policy's, or a network with an operation that has no translation.
     """
     check_policy(policy, env)
-    if policy.config.group != "policy":
-        raise InputError(f"group: {policy.config.group!r} is not allowed; graphs of policies see the group 'policy'")
+    if policy.needs.group != "policy":
+        raise InputError(f"group: {policy.needs.group!r} is not allowed; graphs of policies see the group 'policy'")
     step = functools.partial(policy_step, policy, env)
     return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
 

@@ -30,8 +30,8 @@ from mqe_jax.export.policy import shapes
 from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, state_arrays
 from mqe_jax.export.translate import Function
-from mqe_jax.policies import check_policy, load_policy, zoo
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.policies import load_policy, parameters_for, zoo
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 
 PAGE = Path(__file__).parent / "page"
 """Files of the page."""
@@ -138,7 +138,7 @@ def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], 
         if task not in playable:
             hint = nearest(task, playable)
             raise InputError(f"run: {source!r} is not allowed{hint}; allowed: a run folder, a policy file, a task's id")
-        return task, {}, {"shipped": zoo.load(task)} if task in zoo.names() else {}
+        return task, parameters_for(task, task), {"shipped": zoo.load(task)} if task in zoo.names() else {}
     policy = load_policy(source)
     if policy.task not in TASKS:
         raise InputError(f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -15,15 +16,16 @@ import jax.numpy as jnp
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check, checked, override
-from mqe_jax.core.types import AnyEnvironment, AnyPolicy, Memory, Observations, PolicyOrAct, RandomKey
+from mqe_jax.core.settings import PathText, check, checked
+from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
-from mqe_jax.envs.registry import NAMED_PLANNERS
+from mqe_jax.envs.registry import NAMED_PLANNERS, TASKS
 from mqe_jax.policies import zoo
 from mqe_jax.policies.scripted import scripted_policy
-from mqe_jax.policies.translated import translate
+from mqe_jax.policies.translated import together, translate
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, groups_of, read_policy
+from mqe_jax.train.needs import Needs
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, check_policy, groups_of, read_policy
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -130,7 +132,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     else:
         policy = read_policy(source)
     policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
-    return policy if env is None else translate(policy, env, str(source), check_policy)
+    return policy if env is None else translate(policy, env, str(source))
 
 
 def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
@@ -145,7 +147,7 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
             policy = check("policy", source, PolicyOrAct)
             if isinstance(policy, TrainedPolicy):
                 name, mean = repr(policy), deterministic or policy.deterministic
-                policy = translate(dataclasses.replace(policy, deterministic=mean), env, name, check_policy)
+                policy = translate(dataclasses.replace(policy, deterministic=mean), env, name)
             elif hasattr(policy, "task"):
                 check_policy(policy, env, repr(policy))
     except InputError as error:
@@ -157,48 +159,26 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
     return policy
 
 
-def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
-    """Checks that a policy is of one team of this task; a trained one, that its sizes and `actions_of` are the task's.
+def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
+    """Returns the parameters, and the control mode, in which what policies need differs from a task's defaults.
 
-    `env` is the task, or a batch of it. Settings without a task do not tell what the actions of a policy mean.
-
-    Raises:
-        InputError: naming both tasks, numbers of agents, parameters, or sizes.
+    Policies of different skills get those with which they can meet. The sources are policies, or what `load_policy`
+    accepts; those that are no trained policy of the task need nothing.
     """
-    check("policy", policy, AnyPolicy)
-    if policy.task != env.name:
-        raise InputError(f"policy: {name} was trained on {policy.task or 'no named task'}, not on {env.name}")
-    if policy.agents != len(env.teams[0]):
-        raise InputError(
-            f"policy: {name} acts for {policy.agents} agents; a team of {env.name} has {len(env.teams[0])}"
-        )
-    if not isinstance(policy, TrainedPolicy):
-        return
-    task = getattr(env, "env", env)
-    if policy.config.task is not None and isinstance(task, QuadrupedEnv):
-        given, ours = policy.config.training_env, actions_of(task.control, task.params)
-        read = {field.name: given[field.name] for field in dataclasses.fields(TaskParams) if field.name in given}
-        theirs = actions_of(given.get("control", "command"), override(task.Params(), read))
-        for field, value in theirs.items():
-            if value != ours[field]:
-                here = f"{env.name} has {ours[field]!r} here"
-                raise InputError(f"policy: {name} was trained with {field} {value!r}; {here}")
-    group, layouts = policy.config.group, {"policy": None, **getattr(task, "groups", {})}
-    if group not in layouts:
-        raise InputError(f"policy: {name} sees the group {group!r}; {env.name} has {', '.join(layouts)}")
-    seen = env.observation_size if group == "policy" else layouts[group].size
-    sizes = (len(env.teams[0]), seen, env.action_size)
-    trained = (policy.dims.agents, policy.dims.observation, policy.dims.action)
-    if sizes != trained:
-        raise InputError(
-            f"policy: {name} was trained with (agents, observation, action) {trained}, but {env.name} has {sizes} here"
-        )
-
-
-def actions_of(control: str, params: TaskParams) -> dict[str, Any]:
-    """Returns what an agent's actions mean in a control mode: the mode, the robot, and the task parameters it reads."""
-    read = {"command": ("skill", "commands", "command_ranges"), "position": ("position_scale",)}.get(control, ())
-    return {"control": control, **{name: getattr(params, name) for name in ("robot", *read)}}
+    params: dict[str, Any] = {}
+    every: list[Needs] = []
+    for source in sources:
+        policy = source
+        if isinstance(source, str | Path) and str(source) not in NAMES:
+            with contextlib.suppress(InputError):  # `load_as` raises it, where it matters
+                policy = load_policy(source)
+        if isinstance(policy, TrainedPolicy) and policy.needs.control is not None and policy.task == task:
+            every.append(policy.needs)
+    for needs in every:
+        usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
+        asked = {name: value for name in usual if (value := getattr(needs, name)) != usual[name]}
+        params = asked | {name: value for name, value in params.items() if value is not None}
+    return params | together(every)
 
 
 def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import Memory
-from mqe_jax.envs import QuadrupedEnv, TaskParams
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.needs import Needs
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,44 +51,37 @@ class Translated:
         return self.here.translated(action, self.own), memory
 
 
-def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str, check: Callable[..., None]) -> Policy:
+def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
     """Returns a trained policy as it acts in a task: itself, or of several skills with its own one.
 
-    `check(policy, env, name)` raises an InputError where the policy does not fit the task.
+    Raises:
+        InputError: if the policy does not fit the task.
     """
-    if env.control == "command" and len(env.controller.skill.parts) > 1:
-        params = dataclasses.replace(env.params, **meaning_of(policy))
+    needs = policy.needs
+    if needs.control == "command" == env.control and len(env.controller.skill.parts) > 1:
+        params = dataclasses.replace(env.params, skill=needs.skill, command_ranges=needs.command_ranges)
         own, here = params.commander, env.params.commander
         if here.admits(own):
             if beyond := own.skill.untrained(params.commanded()):
                 raise InputError(f"policy: {name} commands beyond what its skill is trained for: {', '.join(beyond)}")
             view = copy.copy(env)  # as the policy was trained
             view.params, view.controller = params, dataclasses.replace(env.controller, commands=own.commands)
-            check(policy, view, name)
+            check_policy(policy, view, name)
             return Translated(policy, own, here)
-    check(policy, env, name)
+    check_policy(policy, env, name)
     return policy
 
 
-def meaning_of(policy: TrainedPolicy) -> dict[str, Any]:
-    """Returns the skill and the command ranges with which a policy was trained, by names of task parameters."""
-    given = policy.config.training_env
-    return {name: given.get(name, getattr(TaskParams, name)) for name in ("skill", "command_ranges")}
-
-
-def together(params: TaskParams, policies: Sequence[Any]) -> dict[str, Any]:
+def together(every: Sequence[Needs]) -> dict[str, Any]:
     """Returns the skills and the command ranges with which policies of different skills can meet, each with its own.
 
-    Empty where all trained ones have the same skill.
+    Empty where all have the same skill.
     """
-    meanings = [meaning_of(policy) for policy in policies if isinstance(policy, TrainedPolicy)]
-    several = [name for meaning in meanings if not isinstance(meaning["skill"], str) for name in meaning["skill"]]
-    names = dict.fromkeys([*several, *(name for name in SKILLS if name in [x["skill"] for x in meanings])])
-    if len({meaning["skill"] for meaning in meanings}) < 2:
+    skills = [needs.skill for needs in every]
+    if len({*skills}) < 2:
         return {}
-    each = [dataclasses.replace(params, **meaning).commanded() for meaning in meanings]
-    lowest, highest = (
-        {name: of(limits[name][end] for limits in each) for name in params.commands}
-        for end, of in enumerate((min, max))
-    )
-    return {"skill": tuple(names), "command_ranges": {name: (lowest[name], highest[name]) for name in lowest}}
+    several = [name for skill in skills if isinstance(skill, tuple) for name in skill]
+    names = dict.fromkeys([*several, *(name for name in SKILLS if name in skills)])
+    common = [name for name in every[0].commands or () if all(name in needs.command_ranges for needs in every)]
+    limits = {name: list(zip(*(needs.command_ranges[name] for needs in every), strict=True)) for name in common}
+    return {"skill": tuple(names), "command_ranges": {x: (min(low), max(high)) for x, (low, high) in limits.items()}}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,8 +18,7 @@ from mqe_jax.core.types import VectorEnv as AnyVectorEnv
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.policies import actions_of, all_agents, load_as, load_policy, zoo
-from mqe_jax.policies.translated import together
+from mqe_jax.policies import all_agents, load_as, load_policy, parameters_for, zoo
 from mqe_jax.runs.presets import base_config
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
@@ -29,10 +27,10 @@ from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.train import learner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Act
-from mqe_jax.train.folder import CONFIG_FILE, load_run_config
-from mqe_jax.train.learner import Learner, env_dims
+from mqe_jax.train.learner import Learner
 from mqe_jax.train.logs import check_loggers
-from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
+from mqe_jax.train.needs import needs_of
+from mqe_jax.train.policy import POLICY_FILE, Policy, TrainedPolicy, groups_of
 from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import initial_key, policy_to_start
 
@@ -175,7 +173,7 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
         eval_env = eval_env.with_groups(groups)
     if config.train_env:
-        _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env)
+        _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env, config)
     _check_teams(both, config)
     league = teacher = None
     if len(both.teams) < 2:
@@ -202,19 +200,16 @@ def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None
     cast = environments(impl, config, seeds)
     learner.make_learner(cast.env, config, league=cast.league, teacher=cast.teacher)
     if config.start is not None:
-        network = config.network.build(env_dims(cast.env, config))
-        policy_to_start(cast.env.name, jax.eval_shape(network.init, initial_key(config)), config)
+        network = config.network.build(needs_of(cast.env, config).dims)
+        policy_to_start(cast.env, jax.eval_shape(network.init, initial_key(config)), config)
 
 
-def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv) -> None:
+def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv, config: TrainConfig) -> None:
     """Raises an InputError where a policy that is trained in a task could not act in it as it is evaluated."""
-    own, other = (
-        {**actions_of(each.control, each.params), "size of the observation": each.observation_size}
-        for each in (training, env)
-    )
-    for name, value in own.items():
-        if value != other[name]:
-            fail(f"train_env.{name}", value, f"that of env, {other[name]!r}, in which the policy is evaluated")
+    evaluated = needs_of(env, config).by_name()
+    for name, value in needs_of(training, config).by_name().items():
+        if value != evaluated[name]:
+            fail(f"train_env.{name}", value, f"that of env, {evaluated[name]!r}, in which the policy is evaluated")
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
@@ -268,9 +263,9 @@ def players(
 ) -> Players:
     """Returns what is evaluated, rendered and viewed; arguments and errors as `mqe_jax.evaluate`.
 
-    A run has its own task, parameters and policy. Without a policy, a task has its shipped one if its parameters are
-    the default ones, on both sides of a match; else its scripted one, or `forward`; where actions are not commands,
-    `random`.
+    A run has its own task, parameters and policy. Without a policy, a task has its shipped one if no parameters are
+    given, on both sides of a match; else its scripted one, or `forward`; where actions are not commands, `random`. A
+    task by its id has the parameters that trained policies need, such as their skill.
     """
     made, name, params = task, "", dict(env or {})
     if isinstance(made, QuadrupedEnv):
@@ -282,12 +277,12 @@ def players(
             config = run_config(name)
             made, params, policy = config.task or "", joined(config.env, params), policy or name
     shipped = name in zoo.names() and not params and policy is None
-    if isinstance(made, str) and not {"skill", "command_ranges"} & {*(env or ())}:
-        params |= meeting(made, params, [name if shipped else policy, opponent])
     walking = "scripted" if name in PLANNERS else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
-    task_env, batch = make_env(made, impl, params, num_envs)
     chosen = (name if shipped else default) if policy is None else policy
+    if isinstance(made, str):
+        params = joined(joined(params, parameters_for(made, chosen, opponent)), env or {})
+    task_env, batch = make_env(made, impl, params, num_envs)
     own = load_as("policy", chosen, task_env, deterministic=deterministic)
     match = len(task_env.teams) > 1
     other, against = (own, chosen) if shipped and match else (None, "idle")
@@ -302,34 +297,14 @@ def players(
     return Players(task_env, batch.with_groups(groups_of(everyone)), everyone, about)
 
 
-def meeting(task: str, params: Mapping[str, Any], sources: Sequence[Any]) -> dict[str, Any]:
-    """Returns the skills and ranges with which trained policies of a task can meet (`translated.together`).
-
-    Sources that are no such policies count nowhere.
-    """
-    trained = []
-    for source in sources:
-        with contextlib.suppress(InputError):  # of which the loading with the task tells
-            trained.append(source if isinstance(source, TrainedPolicy) else load_policy(source))
-    plain = {name: value for name, value in params.items() if name != "control"}
-    return together(override(TASKS[task].Params(), plain), trained) if task in TASKS and len(trained) > 1 else {}
-
-
-def run_config(target: str) -> Any:
-    """Returns the settings in a run folder or a policy file; InputError where there are none, or they name no task."""
-    if target.endswith(".safetensors"):
-        return load_policy(target).config
-    if not Path(target).is_dir():
-        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
-        raise InputError(f"run: {target!r} is {'not a' if Path(target).exists() else 'no'} folder; allowed: {allowed}")
-    if not (Path(target) / CONFIG_FILE).is_file():
-        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{CONFIG_FILE}"))
+def run_config(target: str) -> TrainConfig:
+    """Returns the settings of the policy in a run folder or a policy file; InputError if there is none."""
+    if not target.endswith(".safetensors") and not (Path(target) / POLICY_FILE).is_file():
+        runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{POLICY_FILE}"))
         hint = f"; did you mean {runs[0]}?" if runs else ""
-        raise InputError(f"run: {target!r} has no {CONFIG_FILE}; it is not a run folder{hint}")
-    config = load_run_config(target)
-    if config.task is None:
-        raise InputError(f"{target}: {CONFIG_FILE} has no 'task' entry")
-    return config
+        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
+        raise InputError(f"run: {target!r} has no {POLICY_FILE}{hint}; allowed: {allowed}")
+    return load_policy(target).config
 
 
 def settings_of(task: str | QuadrupedEnv, config: Config) -> TrainConfig:

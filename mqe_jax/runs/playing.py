@@ -51,7 +51,8 @@ def evaluate(
     Args:
         task: id, environment, or the run folder or policy file of a trained policy, which brings its task.
         policy: a policy, or what `load_policy` accepts. Default: the run's; of a task the shipped one, else the
-            scripted one, else `forward`, or `random` where actions are not commands.
+            scripted one, else `forward`, or `random` where actions are not commands. A task by its id gets the skill,
+            gait, command ranges, control mode and robot that a trained policy needs.
         opponent: policy of the other team of a match. Default: that of the first team if it is the shipped one by
             default, else `idle`.
         env: task parameters.

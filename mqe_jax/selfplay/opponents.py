@@ -29,8 +29,8 @@ from mqe_jax.core.types import (
 from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
-from mqe_jax.policies import check_policy, load_as
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.policies import load_as
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 
 
 @jax.tree_util.register_dataclass

@@ -20,7 +20,7 @@ from mqe_jax.core.files import check_file, make_folder, parse_json, parsing, wri
 from mqe_jax.core.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
-VERSION = 3
+VERSION = 4
 
 _LARGEST = {"policy": limits.POLICY_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")

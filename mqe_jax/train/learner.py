@@ -16,11 +16,10 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
 from mqe_jax.train.checks import check_divisible, check_environment, check_teacher
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.networks import EnvDims
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import (
     ValueStatistics,
     running_init,
@@ -63,20 +62,6 @@ class Learner(NamedTuple):
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
 
 
-def env_dims(env: VectorEnv, config: TrainConfig) -> EnvDims:
-    """Returns the sizes from which a network is built; InputError if the environment lacks the policy's group."""
-    sizes = {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
-    if config.group not in sizes:
-        fail("group", config.group, f"one of {env.name}: {', '.join(sizes)}")
-    return EnvDims(
-        agents=env.num_agents,
-        observation=sizes[config.group],
-        privileged=env.privileged_observation_size,
-        action=env.action_size,
-        values=1 if config.ppo.value == "joint" else env.num_agents,
-    )
-
-
 def make_learner(
     env: VectorEnv,
     config: TrainConfig,
@@ -101,7 +86,7 @@ def make_learner(
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)
-    dims = env_dims(env, config)
+    dims = needs_of(env, config).dims
     network = config.network.build(dims)
     check_divisible(config, network, processes)
     algorithm = stages(network, config)

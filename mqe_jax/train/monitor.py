@@ -26,7 +26,7 @@ from mqe_jax.core.types import Memory, Observations, VectorEnv
 from mqe_jax.train.checkpoint import files_by_step
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, Result
-from mqe_jax.train.learner import env_dims
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.policy import TrainedPolicy, policy_act, read_policy, save_policy
 
 EVALUATIONS_FILE = "evaluations.json"
@@ -57,7 +57,7 @@ class Monitor:
             raise InputError(
                 f"evaluation.episodes: {config.evaluation.episodes} must equal the env's num_envs, {env.num_envs}"
             )
-        dims = env_dims(env, config)
+        dims = needs_of(env, config).dims
         act_of = policy_act(dims, config.network, config.normalization.observations)
 
         def act(params: Any, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:

@@ -17,10 +17,11 @@ from mqe_jax.core.files import check_folder, check_locks
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, build, check, checked, fail, to_mapping
-from mqe_jax.core.types import Memory, Observations, Params, RandomKey
+from mqe_jax.core.types import AnyPolicy, Memory, Observations, Params, RandomKey, VectorEnv, teams_of
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
+from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.networks import EnvDims, NetworkSettings
 from mqe_jax.train.normalize import RunningStatistics, running_init, running_normalize
 
@@ -73,17 +74,17 @@ class TrainedPolicy:
     """Parameters as `Network.policy_params` returns them."""
     normalizer: RunningStatistics
     """Statistics of the observations."""
-    dims: EnvDims
-    """Sizes of the environment in which it was trained."""
+    needs: Needs
+    """What it needs of its environment."""
     config: TrainConfig
     """Settings with which it was trained."""
     metadata: Mapping[str, Any]
-    """Further entries of the file: task, env_steps."""
+    """Further entries of the file: env_steps, the card of a shipped policy."""
     deterministic: bool = False
     """Whether it acts with its mean actions; otherwise they are sampled."""
 
     def __post_init__(self) -> None:
-        for name, kind in {"dims": EnvDims, "config": TrainConfig, "metadata": Mapping}.items():
+        for name, kind in {"needs": Needs, "config": TrainConfig, "metadata": Mapping}.items():
             if not isinstance(value := getattr(self, name), kind):
                 fail(name, value, f"of the type {kind.__name__}")
         check("deterministic", self.deterministic, bool)
@@ -94,12 +95,17 @@ class TrainedPolicy:
 
     def __repr__(self) -> str:
         mode = "mean" if self.deterministic else "sampled"
-        return f"<TrainedPolicy of {self.task or 'no named task'}: {self.config.network.name}, {mode} actions>"
+        return f"<TrainedPolicy of {self.task}: {self.config.network.name}, {mode} actions>"
 
     @property
     def task(self) -> str:
-        """Id of the task; empty where the file does not name it."""
-        return self.metadata.get("task") or self.config.task or ""
+        """Id of the task."""
+        return self.needs.task
+
+    @property
+    def dims(self) -> EnvDims:
+        """Sizes of the environment in which it was trained."""
+        return self.needs.dims
 
     @property
     def agents(self) -> int:
@@ -109,7 +115,7 @@ class TrainedPolicy:
     @property
     def groups(self) -> tuple[str, ...]:
         """The group of observations that it sees."""
-        return (self.config.group,)
+        return (self.needs.group,)
 
     @property
     def arrays(self) -> PolicyArrays:
@@ -119,8 +125,8 @@ class TrainedPolicy:
     @property
     def architecture(self) -> Any:
         """Everything but the arrays; policies of equal architecture can be exchanged within compiled code."""
-        sizes = (self.task, self.config.group, self.dims.agents, self.dims.observation, self.dims.action)
-        return (*sizes, self.config.network, self.config.normalization.observations, self.deterministic)
+        settings = self.config.network, self.config.normalization.observations
+        return (self.needs.by_name(), *settings, self.deterministic)
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
@@ -145,7 +151,7 @@ class TrainedPolicy:
     ) -> tuple[jax.Array, Memory]:
         """Returns what a policy of the same architecture with other arrays does; see `act`."""
         seen = Observations.at(obs)
-        given = seen.group(self.config.group) if isinstance(obs, Observations) else obs
+        given = seen.group(self.needs.group) if isinstance(obs, Observations) else obs
         obs = check_obs(given, self.dims.agents, self.dims.observation)
         check("key", key, RandomKey | None)
         expected = jax.tree.structure(self.initial_memory())
@@ -206,10 +212,30 @@ def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
     return obs
 
 
-def policy_of(state: TrainState, dims: EnvDims, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
-    """Returns the policy of a learner state."""
-    policy_params = config.network.build(dims).policy_params(state.params)
-    return TrainedPolicy(policy_params, state.obs_normalizer.obs, dims, config, metadata)
+def policy_of(state: TrainState, env: VectorEnv, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
+    """Returns the policy of a learner state, which learns in an environment."""
+    needs = needs_of(env, config)
+    policy_params = config.network.build(needs.dims).policy_params(state.params)
+    return TrainedPolicy(policy_params, state.obs_normalizer.obs, needs, config, metadata)
+
+
+def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
+    """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, a trained one's `Needs`.
+
+    Raises:
+        InputError: naming what differs, with the values of both.
+    """
+    check("policy", policy, AnyPolicy)
+    needs = {"task": policy.task, "agents": policy.agents}
+    found: dict[str, Any] = {"task": env.name, "agents": len(teams_of(env)[0])}
+    if isinstance(policy, TrainedPolicy) and needs == found:
+        group, groups = policy.needs.group, {"policy", *getattr(env, "group_sizes", {})}
+        needs, found = {"group": group}, {"group": ", ".join(sorted(groups))}
+        if group in groups:
+            needs, found = policy.needs.by_name(), needs_of(env, policy.config).by_name()
+    for field, value in needs.items():
+        if value != found[field]:
+            raise InputError(f"policy: {name} needs {field} {value!r}; the environment has {found[field]!r}")
 
 
 NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
@@ -234,8 +260,8 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
         params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
     if wrong := nonfinite({"params": params, "normalizer": policy.normalizer}):
         raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
-    about = {"dims": policy.dims._asdict(), "config": to_mapping(policy.config), "deterministic": policy.deterministic}
-    metadata = {**policy.metadata, **about}
+    records = {"needs": to_mapping(policy.needs), "config": to_mapping(policy.config)}
+    metadata = {**policy.metadata, **records, "deterministic": policy.deterministic}
     check_locks(path)
     check_folder(path.parent)
     save_tree(path, {"params": params, "normalizer": policy.normalizer}, metadata, kind="policy")
@@ -254,12 +280,11 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         path = path / POLICY_FILE
     metadata = read_metadata(path, kind="policy")
     try:
-        dims = check("dims", EnvDims(**metadata.pop("dims")), EnvDims)
+        needs = build(Needs, metadata.pop("needs"))
         config = build(TrainConfig, metadata.pop("config"))
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
-        check("task", metadata.get("task"), str | None)
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
-    tree = load_tree(path, _template(dims, config.network), kind="policy", half=True).tree
-    return TrainedPolicy(tree["params"], tree["normalizer"], dims, config, metadata, deterministic)
+    tree = load_tree(path, _template(needs.dims, config.network), kind="policy", half=True).tree
+    return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)

@@ -21,7 +21,7 @@ from mqe_jax.train.checkpoint import checkpoint_step, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.finite import all_finite, check_finite, nonfinite_metrics
 from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
-from mqe_jax.train.learner import Learner, TrainState, env_dims
+from mqe_jax.train.learner import Learner, TrainState
 from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
@@ -148,7 +148,7 @@ class Training:
         self._config, self._processes, self._progress = configs[0], processes, progress
         self._seeds = seeds = Seeds(learner.init, len(configs))
         first = [
-            first_state(env.name, learner, processes, own, path, seeds.shared, league, progress.doing)
+            first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stacked(seeds.shared)
@@ -245,9 +245,8 @@ class Training:
 
     def policies(self) -> list[TrainedPolicy]:
         """Returns the newest policy of every seed."""
-        dims = env_dims(self._env, self._config)
         return [
-            policy_of(state, dims, config, task=self._env.name, env_steps=self.env_steps)
+            policy_of(state, self._env, config, env_steps=self.env_steps)
             for state, config in zip(self._own(), self._configs, strict=True)
         ]
 

@@ -20,7 +20,7 @@ from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
-from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, check_policy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -48,7 +48,7 @@ def own_learner(
 
 
 def first_state(
-    task: str,
+    env: VectorEnv,
     learner: Learner,
     processes: Processes,
     config: TrainConfig,
@@ -68,7 +68,7 @@ def first_state(
             return processes.own(start(key))
 
     if checkpoint is None:
-        policy = None if config.start is None else policy_to_start(task, processes.whole.params, config)
+        policy = None if config.start is None else policy_to_start(env, processes.whole.params, config)
         state = init(initial_key(config))
         if policy is not None:
             normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
@@ -77,8 +77,8 @@ def first_state(
                 state = league.seat(dataclasses.replace(state, extra=league.begin(state)))
         return state, 0.0
     metadata = read_metadata(checkpoint, kind="checkpoint")
-    if metadata.get("task") != task:
-        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {task}")
+    if metadata.get("task") != env.name:
+        raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
     if (theirs := metadata.get("generator", generator())) != generator():
         fail(
             "jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {checkpoint.parent.parent}"
@@ -107,10 +107,10 @@ def first_state(
     return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
-def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPolicy:
+def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> TrainedPolicy:
     """Returns the policy that `config.start` names.
 
-    InputError unless it fits the task, the parameters, given their shapes, and the settings of its mean actions.
+    InputError unless it fits the environment, the parameters, given their shapes, and the settings of its mean actions.
     """
     start = str(config.start)
     if start not in NAMED and not Path(start).exists():
@@ -120,10 +120,12 @@ def policy_to_start(task: str, params: Params, config: TrainConfig) -> TrainedPo
         fail("start", start, f"a run folder, a policy file, or {shipped}")
     policy = NAMED[start]() if start in NAMED else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
-    if shapes != jax.tree.map(jnp.shape, policy.params) or policy.task != task:
-        raise InputError(
-            f"start: {start} has a policy of {policy.task}; allowed: one of {task} with this run's network"
-        )
+    try:
+        check_policy(policy, env, start)
+    except InputError as error:
+        raise InputError(str(error).replace("policy:", "start:", 1)) from None
+    if shapes != jax.tree.map(jnp.shape, policy.params):
+        fail("start", start, "a policy with this run's network")
     theirs = dict(_leaves(to_mapping(policy.config)))
     for name, value in _leaves(to_mapping(config)):
         acts = name in ("action_scale", "normalization.observations") or name.startswith("network.")

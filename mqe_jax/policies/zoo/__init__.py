@@ -11,11 +11,9 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import NonNegative, PositiveInt
-from mqe_jax.core.settings import PathText, build, checked, override, record, to_mapping
-from mqe_jax.envs import TASKS, TaskParams
+from mqe_jax.core.limits import NonNegative
+from mqe_jax.core.settings import PathText, build, checked, record, to_mapping
 from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
 FOLDER = Path(__file__).parent
@@ -25,8 +23,6 @@ FOLDER = Path(__file__).parent
 class Card:
     """How a shipped policy was trained, and its results."""
 
-    version: PositiveInt
-    """Version of the task (`QuadrupedEnv.version`)."""
     mode: Literal["deterministic", "sampled"]
     """How it is meant to act."""
     command: str
@@ -60,24 +56,11 @@ def card(task: str) -> Card:
     """Returns the card of a task's shipped policy.
 
     Raises:
-        InputError: where there is none, or it was trained on another version of the task.
+        InputError: where there is none.
     """
     if task not in names():
         raise InputError(f"policy: none is shipped for {task!r}; shipped: {', '.join(names())}")
-    about = build(Card, read_metadata(file_of(task), kind="policy")["card"])
-    if about.version != TASKS[task].version:
-        raise InputError(
-            f"policy: the shipped one of {task} was trained on version {about.version} of the task, which has version "
-            f"{TASKS[task].version} now; train one: mqe train {task}"
-        )
-    return about
-
-
-def params(task: str) -> TaskParams:
-    """Returns the parameters with which a task's shipped policy was trained; errors as `card`."""
-    card(task)
-    config = build(TrainConfig, read_metadata(file_of(task), kind="policy")["config"])
-    return override(TASKS[task].Params(), {k: v for k, v in config.training_env.items() if k != "control"})
+    return build(Card, read_metadata(file_of(task), kind="policy")["card"])
 
 
 def load(task: str) -> TrainedPolicy:

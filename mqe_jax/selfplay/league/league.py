@@ -24,7 +24,8 @@ from mqe_jax.selfplay.league import pool
 from mqe_jax.selfplay.league.pool import Pool
 from mqe_jax.selfplay.opponents import Versus, exchange, versus
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import TrainState, env_dims
+from mqe_jax.train.learner import TrainState
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import PolicyArrays, TrainedPolicy
@@ -77,13 +78,13 @@ class League:
     @single
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig) -> None:
         """Creates the matches of a training run; `opponents` are those of `TrainConfig.opponents`."""
-        dims = env_dims(versus(matches, ["idle"]), config)
-        self._dims, self._config, self._roster = dims, config, Roster(opponents)
+        needs = needs_of(versus(matches, ["idle"]), config)
+        self._dims, self._config, self._roster = needs.dims, config, Roster(opponents)
         drawn = int(self._roster.members.sum())
         if drawn and config.league.members <= drawn:
             fail("league.members", config.league.members, f"more than the blocks that play members, {drawn}")
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
-        first = TrainedPolicy(params, running_init(dims.observation), dims, config, {"task": matches.name})
+        first = TrainedPolicy(params, running_init(needs.dims.observation), needs, config, {})
         load = lambda name: load_as("opponent", name, matches.env) if name in self._roster.fixed else first  # noqa: E731
         self.env = Versus(matches, list(map(load, opponents)), config.draw_reward)
         self._members = config.league.members if drawn else 1

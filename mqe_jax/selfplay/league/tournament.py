@@ -23,9 +23,8 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, checked, fail
 from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
 from mqe_jax.envs import VectorEnv
-from mqe_jax.policies import check_policy
 from mqe_jax.selfplay.opponents import Versus
-from mqe_jax.train.policy import Policy
+from mqe_jax.train.policy import Policy, check_policy
 
 Array = NDArray[np.float64]
 CSV, PICTURE = "tournament.csv", "tournament.png"

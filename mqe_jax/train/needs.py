@@ -1,0 +1,72 @@
+"""What a policy needs of its environment: its file holds it, and `mqe_jax.train.policy.check_policy` compares it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mqe_jax.core.limits import PositiveInt
+from mqe_jax.core.settings import FrozenMapping, Range, fail, record
+from mqe_jax.core.types import teams_of
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.networks import EnvDims
+
+ACTIONS = ("robot", "control", "skill", "gait", "commands", "command_ranges", "position_scale")
+"""What tells the meaning of actions, by the names of task parameters."""
+
+
+@record
+class Needs:
+    """What a policy needs of its environment; None for what the environment does not describe or its actions ignore."""
+
+    task: str
+    """Id of the task."""
+    version: PositiveInt | None = None
+    """Version of the task."""
+    robot: str | None = None
+    """Name of the robot."""
+    control: str | None = None
+    """Action mode."""
+    skill: str | tuple[str, ...] | None = None
+    """Skill that carries out the actions, or those between which they choose."""
+    gait: str | None = None
+    """Named default commands of the skill."""
+    commands: tuple[str, ...] | None = None
+    """Commands of the skill that the action sets, in order."""
+    command_ranges: Mapping[str, Range] = FrozenMapping()
+    """Lowest and highest value of these commands."""
+    position_scale: float | None = None
+    """Factor on the range of joint targets."""
+    group: str = "policy"
+    """Group of observations that the policy sees."""
+    layout: str | None = None
+    """Blocks of these observations in order, with their widths."""
+    dims: EnvDims
+    """Sizes; those that only the critic reads may differ."""
+
+    def by_name(self) -> dict[str, Any]:
+        """Returns what must be equal in an environment, by name."""
+        names = ("version", *ACTIONS, "group", "layout")
+        sizes = {"observation": self.dims.observation, "action": self.dims.action}
+        return {"task": self.task, "agents": self.dims.agents, **{x: getattr(self, x) for x in names}, **sizes}
+
+
+def needs_of(env: Any, config: TrainConfig) -> Needs:
+    """Returns the needs of a policy of one of an environment's teams, of a task or a batch of it.
+
+    Raises:
+        InputError: if the environment lacks the policy's group of observations.
+    """
+    sizes = {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
+    if config.group not in sizes:
+        fail("group", config.group, f"one of {env.name}: {', '.join(sizes)}")
+    task, agents = getattr(env, "env", env), len(teams_of(env)[0])
+    dims = EnvDims(
+        agents=agents,
+        observation=sizes[config.group],
+        privileged=env.privileged_observation_size,
+        action=env.action_size,
+        values=1 if config.ppo.value == "joint" else agents,
+    )
+    described = task.describe(config.group) if hasattr(task, "describe") else {}
+    return Needs(task=env.name, group=config.group, dims=dims, **described)
