@@ -49,7 +49,6 @@ def actions(seed: int, *shape: int) -> np.ndarray:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_environment_checker(task: str) -> None:
-    """check_env passes; it warns only about unbounded observations."""
     env: Any = gymnasium.make(f"mqe/{task}-v0", impl="c", **SHORT)
     assert isinstance(env.unwrapped, SingleEnv)
     with warnings.catch_warnings(record=True) as caught:
@@ -61,7 +60,6 @@ def test_environment_checker(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_single_environment_is_the_task(task: str) -> None:
-    """A seeded reset and a step equal those of the task."""
     env: Any = gymnasium.make(f"mqe/{task}-v0", impl="c", **SHORT).unwrapped
     obs, info = env.reset(seed=SEED)
     state = jax.jit(env.env.reset)(jax.random.PRNGKey(SEED))
@@ -79,7 +77,6 @@ def test_single_environment_is_the_task(task: str) -> None:
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=["same", "next"])
 @pytest.mark.parametrize("task", TASKS)
 def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMode) -> None:
-    """Every step, automatic resets included, equals that of SyncVectorEnv over single environments."""
     name = f"mqe/{task}-v0"
     ours: Any = gymnasium.make_vec(name, COUNT, impl="c", autoreset_mode=mode, **SHORT)
     theirs = gymnasium.make_vec(
@@ -110,19 +107,7 @@ def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMo
     assert resets >= 2 * COUNT - 1 and ended >= 2
 
 
-def test_environment_i_is_the_single_one_with_seed_s_plus_i() -> None:
-    """Also if only one seed of a list is not None."""
-    vector: Any = VectorEnv("go1gate", COUNT, impl="c", **SHORT)
-    single = SingleEnv("go1gate", impl="c", **SHORT)
-    obs, _ = vector.reset(seed=SEED)
-    for i in range(COUNT):
-        assert close(obs[i], single.reset(seed=SEED + i)[0])
-    again, _ = vector.reset(seed=[None, SEED, None])
-    assert close(again[1], obs[0]) and not close(again[0], obs[0])
-
-
 def test_disabled_autoreset_and_time_limit() -> None:
-    """max_episode_steps truncates; without automatic reset an ended environment must be reset before the next step."""
     vector: Any = gymnasium.make_vec(
         "mqe/go1gate-v0", COUNT, impl="c", autoreset_mode="Disabled", max_episode_steps=ENDS
     )
@@ -138,7 +123,6 @@ def test_disabled_autoreset_and_time_limit() -> None:
 
 
 def test_render_returns_images() -> None:
-    """One image for the single environment, one per environment for the vector; none without a render mode."""
     settings: dict[str, Any] = {"impl": "c", "render_size": (96, 64), **SHORT}
     single = SingleEnv("go1gate", render_mode="rgb_array", **settings)
     single.reset(seed=SEED)
@@ -163,13 +147,11 @@ def test_render_returns_images() -> None:
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, Any], told: str) -> None:
-    """The error lists the allowed values."""
     with pytest.raises(InputError, match=told):
         VectorEnv("go1gate", **{"num_envs": 2, "impl": "c", **settings})
 
 
 def test_bad_calls_are_named() -> None:
-    """Steps before a reset, actions of a wrong shape or not finite, seeds and masks of a wrong length."""
     vector: Any = VectorEnv("go1gate", COUNT, impl="c", **SHORT)
     action = np.zeros(vector.action_space.shape, np.float32)
     with pytest.raises(InputError, match="reset the environment first"):
@@ -189,7 +171,6 @@ def test_bad_calls_are_named() -> None:
 
 
 def test_every_task_is_registered() -> None:
-    """Once, however often the module registers; also through Gymnasium's module:id form in a fresh process."""
     register()
     assert {f"mqe/{task}-v0" for task in tasks()} <= set(gymnasium.registry)
     code = "import gymnasium; print(gymnasium.make('mqe_jax.adapters.gymnasium:mqe/go1gate-v0', impl='c'))"
@@ -238,7 +219,6 @@ def test_team_0_plays_the_same_match_and_sees_its_own_half() -> None:
 
 
 def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:
-    """With a leading axis of one environment; a step keeps the structure of the state."""
     env = mqe_jax.make("go1wrestling", impl="c")
     team = TeamEnv(env, "go1wrestling")
     shapes: Any = jax.eval_shape(team.reset, jax.random.PRNGKey(0))
@@ -248,7 +228,6 @@ def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:
 
 
 def test_every_adapter_takes_an_opponent() -> None:
-    """Sizes are those of one team."""
     settings: Any = {"opponent": "idle", "impl": "c", "control": "position"}
     vector: Any = gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1wrestling-v0", num_envs=2, **settings)
     assert vector.single_action_space.shape == (1, 12)

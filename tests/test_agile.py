@@ -34,7 +34,6 @@ def sensed(seed: int) -> Proprioception:
 
 
 def test_the_network_sees_frames_of_five_steps_the_commands_and_the_clock() -> None:
-    """Against a plain history: what was sensed, and the targets given in the step before, as an action."""
     assert sum(w.size for w in jax.tree.leaves(PARAMS)) <= 155_000
     act, memory, action = jax.jit(SKILL.targets), SKILL.init_memory(), np.zeros(12, np.float32)
     command, frames, gait = jnp.array([1.0, -0.5, 0.4]), [np.zeros(39)] * 8, 0.0
@@ -89,7 +88,6 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
 
 
 def test_the_trained_network_acts_as_the_skill() -> None:
-    """In the training environment, from its observations, over more steps than the history has."""
     env = WalkEnv(GO1, STILL, skill="agile", impl="c", num_envs=1)
     network = AgileNetwork().build(EnvDims(1, env.observation_size, env.privileged_observation_size, 12, 1))
     params = network.init(jax.random.PRNGKey(1))
@@ -144,7 +142,6 @@ def test_a_shove_acts_at_one_point_of_the_trunk_for_its_time() -> None:
 
 
 def test_errors_are_means_over_a_gait_cycle_a_second_after_a_change_of_command() -> None:
-    """An error that alternates within a cycle, a steady one, and large ones in the first second and after a fall."""
     steps, hertz = 200, 5.0  # cycles of ten steps
     errors = np.zeros((steps, 1, 3))
     errors[:, 0, 0] = np.where(np.arange(steps) % 10 < 5, 1.0, -1.0)

@@ -175,9 +175,7 @@ def test_errors_leave_no_folders(arguments: list[str], tmp_path: Path, capfd: py
     ],
     ids=str,
 )
-def test_wrong_flags_are_named_by_tyro(
-    arguments: list[str], said: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_flags_are_named_by_tyro(arguments: list[str], said: list[str], tmp_path: Path, capfd: Any) -> None:
     assert cli.main(arguments) == 2
     out, err = capfd.readouterr()
     shown = " ".join(err.replace("│", " ").split())
@@ -222,7 +220,6 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any)
     ids=["our own", "KeyError", "ZeroDivisionError"],
 )
 def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also a ValueError that code of the package raises, unless it is an InputError."""
     monkeypatch.setattr(build, "make_env", lambda *arguments: defect())
     with pytest.raises(error):
         cli.main(["bench", "fake"])

@@ -11,14 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.envs import TASKS, Moment, QuadrupedEnv, State, make
+from mqe_jax.envs import TASKS, Moment, QuadrupedEnv, State
 from mqe_jax.envs.reward import weigh
-from mqe_jax.physics import objects
-from mqe_jax.physics.objects import Seesaw
 from mqe_jax.physics.robots.index import RobotState
-from mqe_jax.physics.scene import Scene, compile_scene
-from mqe_jax.policies.scripted.cooperative import plan_seesaw
-from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.states import angles, ending, initial, made, moving, placed, robot_state, stepper, still
 
 
@@ -141,9 +136,6 @@ def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(t
 # -- Climb on Seesaw ---------------------------------------------------------------------------------------------------
 
 
-WEIGHT = 11.31 * objects.GRAVITY  # N, of a Go1
-
-
 @pytest.fixture(scope="module")
 def env() -> Any:
     return made("go1seesaw")
@@ -248,32 +240,6 @@ def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(env: Any, step: An
     assert low.terminated and float(low.metrics["collision"]) == 0 and float(low.metrics["reward/fall"]) == 0
 
 
-def plank() -> Any:
-    scene = compile_scene(
-        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects={"seesaw": Seesaw()})
-    )
-    return scene.model, scene.objects["seesaw"]
-
-
-@pytest.mark.parametrize("place", [-1.7, 0.5, 1.9])
-def test_a_weight_beyond_the_hinge_tips_the_plank_slowly(place: float) -> None:
-    """Damping 1000 N m s/rad: the weight of a Go1 1.9 m beyond the hinge turns it at 0.21 rad/s, which is its limit."""
-    model, index = plank()
-    data = mujoco.MjData(model)
-    data.qpos[index.qpos] = -0.25
-    speed = []
-    for _ in range(600):  # 3 s
-        lever = place * np.cos(data.qpos[index.qpos[0]])
-        data.xfrc_applied[index.body] = [0, 0, -WEIGHT, 0, WEIGHT * lever, 0]
-        mujoco.mj_step(model, data)
-        speed.append(data.qvel[index.qvel[0]])
-    if place < 0:
-        assert data.qpos[index.qpos[0]] == pytest.approx(-0.254, abs=2e-3)
-    else:
-        assert max(speed) == pytest.approx(WEIGHT * place / 1000, rel=0.05) and max(speed) < 0.22
-        assert data.qpos[index.qpos[0]] == pytest.approx(min(0.254, -0.25 + 3 * WEIGHT * place / 1000), abs=0.02)
-
-
 def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step: Any, fresh: State) -> None:
     def stand(first: Any, second: Any, pitch: Any) -> State:
         after = placed(env, [first, second], angles(pitch=pitch), state=fresh)
@@ -288,29 +254,3 @@ def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step:
     up = stand([8.0, 0.0, 1.31], SPAWN[1], (0.0, 0.0))
     assert float(up.outcome.success[0]) == 1 and angle(env, up) == pytest.approx(-0.25, abs=1e-3)
     assert float(env.read(up.data).position_w[0, 2]) == pytest.approx(1.3, abs=0.03)
-
-
-def test_the_planner_wins_with_a_partner_and_never_alone() -> None:
-    """Through the walk policy, in a few environments."""
-    env, count = make("go1seesaw", impl="c", num_envs=20), 10
-    partner = (jnp.arange(2 * count) < count)[:, None, None]
-    layout = env.observation_layout
-
-    def one_step(carry: Any, _: None) -> Any:
-        state, over, won = carry
-        blocks = layout.split(state.obs)
-        action = jax.vmap(plan_seesaw)(blocks)
-        action = jnp.where(partner, action, action.at[:, 1].set(0.0))
-        state = jax.vmap(env.step)(state, action)
-        ends = (state.terminated | state.truncated) & ~over
-        return (state, over | ends, won | (ends & (state.outcome.success[:, 0] > 0))), None
-
-    @jax.jit
-    def play(key: jax.Array) -> Any:
-        no = jnp.zeros(2 * count, bool)
-        state = jax.vmap(env.reset)(jax.random.split(key, 2 * count))
-        return jax.lax.scan(one_step, (state, no, no), None, env.max_steps)[0]
-
-    _, over, won = play(jax.random.PRNGKey(0))
-    assert np.asarray(over).all()
-    assert np.asarray(won)[:count].mean() >= 0.7 and not np.asarray(won)[count:].any()

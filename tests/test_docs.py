@@ -60,7 +60,6 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("page", [name for name in NAMES if blocks(read(name), "python")])
 def test_python_blocks_run(page: str) -> None:
-    """Blocks of one page run in order in one namespace."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
     tasks = {*TASKS}
     try:

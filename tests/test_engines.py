@@ -1,6 +1,6 @@
-"""Scenes and tasks agree on MuJoCo's C engine and MJX-JAX, and steps that drop contacts are counted.
+"""Tasks agree on MuJoCo's C engine and MJX-JAX, and steps that drop contacts are counted.
 
-One scene has every kind of object; the soak compares all tasks. `python -m tests.engines` compares all engines.
+The soak compares all tasks. `python -m tests.engines` compares all engines.
 """
 
 from __future__ import annotations
@@ -23,106 +23,18 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import TASKS, VectorEnv, make
-from mqe_jax.physics import engines
 from mqe_jax.physics.engines import Engine, private
 from mqe_jax.physics.engines.host_call import host_call
 from mqe_jax.physics.engines.mjx import WarpEngine
-from mqe_jax.physics.objects import Ball, Box, Cylinder, Door, Platform, Seesaw, Sheep
-from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.physics.robots.index import read_robots
-from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
-from mqe_jax.terrain import Gate, SpawnArea, Track
 from tests import engines as comparison
 from tests.states import made
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
-# Far apart, so that only the first robot touches them; the second one stands at x = 1.
-OBJECTS = {
-    "box": Box(), "ball": Ball(), "sheep": Sheep(), "cylinder": Cylinder(x=40.0), "door": Door(position=(50.0, 0.0)),
-    "seesaw": Seesaw(hinge=(60.0, 0.0, 0.545)), "platform": Platform(center=(70.0, 0.0, 0.3)),
-}  # fmt: skip
-PLACES = {"box": (10.0, 0.0, 0.5), "ball": (20.0, 0.0, 0.1), "sheep": (30.0, 0.0)}
-# What the robot meets, by the start of the geom's name: start of its trunk (x, y, z), and where it moves at 0.5 m/s.
-AHEAD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
-MEETINGS = {
-    "floor": ((4.0, 0.0, 0.5), DOWN), "robot1/": ((0.2, 0.1, 0.33), AHEAD), "wall/": ((2.3, 0.8, 0.33), AHEAD),
-    "object/box": ((9.0, 0.1, 0.33), AHEAD), "object/ball": ((19.3, 0.1, 0.33), AHEAD),
-    "object/sheep": ((29.2, 0.1, 0.33), AHEAD), "object/cylinder": ((38.2, 0.1, 0.33), AHEAD),
-    "object/door": ((49.4, 0.6, 0.33), AHEAD), "object/seesaw": ((61.0, 0.1, 1.1), DOWN),
-    "object/platform": ((70.0, 0.1, 0.8), DOWN),
-}  # fmt: skip
-
-
-def met(scene: CompiledScene, name: str) -> mujoco.MjData:
-    """The state in which the first robot, upside down over the floor, overlaps a geom by about 2 mm."""
-    model, index, data = scene.model, scene.index, mujoco.MjData(scene.model)
-    data.mocap_pos[:] = scene.wall_positions(jnp.asarray(scene.anchor_mean))
-    data.qpos[index.joint_qpos] = data.ctrl[index.actuator] = GO1.default_joints
-    for item, place in PLACES.items():
-        data.qpos[scene.objects[item].qpos[: len(place)]] = place
-    data.qpos[index.base_qpos[1, :3]] = [1.0, 0.0, GO1.stand_height]
-    if name == "floor":
-        data.qpos[index.base_qpos[0, 3:]] = [0.0, 1.0, 0.0, 0.0]
-    start, direction = (np.array(part) for part in MEETINGS[name])
-    for way in np.arange(0.0, 1.0, 1e-3):
-        data.qpos[index.base_qpos[0, :3]] = start + way * direction
-        mujoco.mj_forward(model, data)
-        if min((*data.contact.dist[touching(model, data, name)], 1.0)) < -2e-3:
-            break
-    data.qvel[index.base_qvel[0, :3]] = 0.5 * direction
-    return data
-
-
-def touching(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> list[int]:
-    """The contacts between the first robot and the geoms whose names begin with `name`."""
-    pairs = [[model.geom(geom).name for geom in pair] for pair in data.contact.geom]
-    return [
-        number
-        for number, pair in enumerate(pairs)
-        if any(one.startswith("robot0/") and two.startswith(name) for one, two in (pair, pair[::-1]))
-    ]
-
-
-@pytest.mark.soak
-def test_a_robot_meets_everything_alike_on_two_engines() -> None:
-    """The same forces on the trunk at first, and the same movement of all after one environment step."""
-    track = Track((SpawnArea(2.0), Gate(length=2.0, width=0.6)), walled=False)
-    scene = compile_scene(Scene(track, num_robots=2, objects=OBJECTS, max_contacts=64))
-    starts = [met(scene, name) for name in MEETINGS]
-    for name, data in zip(MEETINGS, starts, strict=True):
-        assert touching(scene.model, data, name), f"nothing touches {name}"
-    qpos, qvel, mocap_pos, ctrl = (
-        jnp.asarray(np.stack([getattr(data, field) for data in starts]))
-        for field in ("qpos", "qvel", "mocap_pos", "ctrl")
-    )
-    force, states = {}, {}
-    for impl in ("c", "jax"):
-        physics = engines.make(scene.model, impl=impl, num_substeps=1)
-        state = jax.vmap(physics.init)(qpos, qvel, mocap_pos, ctrl)
-        step = jax.jit(jax.vmap(lambda data, physics=physics: physics.step(data, data.ctrl)))
-        step = step.lower(state).compile(compiler_options=QUICK)
-        for substep in range(4):
-            state, overflow = step(state)
-            assert not np.asarray(overflow).any()
-            if substep == 0:
-                read = jax.vmap(lambda data: read_robots(scene.index, data.qpos, data.qvel, data.sensordata))
-                force[impl] = np.asarray(read(state).trunk_force)
-        states[impl] = state
-    for number, name in enumerate(MEETINGS):
-        for field, atol in (("qpos", 1e-3), ("qvel", 0.03)):
-            c, other = (np.asarray(getattr(states[impl], field)[number]) for impl in ("c", "jax"))
-            np.testing.assert_allclose(other, c, rtol=0.0, atol=atol, err_msg=f"{name}: {field}")
-    np.testing.assert_allclose(force["jax"], force["c"], rtol=0.01, atol=1.0)
-    meets = list(MEETINGS)
-    for name in ("floor", "robot1/", "wall/", "object/box", "object/sheep", "object/cylinder", "object/door"):
-        assert force["c"][meets.index(name), 0] > 100.0, f"{name}: not felt by the trunk"
-    assert np.abs(states["c"].qvel[meets.index("object/ball"), scene.objects["ball"].qvel[:2]]).max() > 0.05
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("task", list(TASKS))
 def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
-    """Standing robots and episodes in play under random joint targets: contacts make small differences grow."""
     figures = comparison.disagreement(task, "jax", comparison.record(task, num_envs=4))
     assert figures["standing/robots_1"] < 1e-3, figures
     assert figures["standing/robots_20"] < 0.02 and figures["standing/robots_20_max"] < 0.1, figures
@@ -152,7 +64,6 @@ def test_two_engines_return_the_same_shapes(task: str, monkeypatch: pytest.Monke
     ],
 )
 def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
-    """A robot with all feet on the ground, in the air, and on the ground in the first physics step only."""
     env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
 
     start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
@@ -268,7 +179,6 @@ FRICTION, PASSIVE = BIT.mjDSBL_FRICTIONLOSS, BIT.mjDSBL_SPRING | BIT.mjDSBL_DAMP
 def test_warp_computes_no_terms_that_are_zero(
     part: str, attribute: str, fields: tuple[str, ...], unused: int, warp: _Mjx
 ) -> None:
-    """Those that are zero in the model and in no field that environments override; the model itself stays as it is."""
     xml = """<mujoco><option/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
       <tendon><fixed><joint joint="j" coef="1"/></fixed></tendon><actuator><motor joint="j"/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml.replace(f"<{part}", f"<{part} {attribute}", 1))
@@ -278,25 +188,6 @@ def test_warp_computes_no_terms_that_are_zero(
     jax.eval_shape(lambda data: engine.step(data, data.ctrl, fields=values), engine.blank())
     assert set(warp.flags) == {unused, unused | BIT.mjDSBL_SENSOR}
     assert content(model) == before and engine.model is model
-
-
-@pytest.mark.parametrize(
-    ("option", "dofs", "expected"),
-    [("auto", 50, "dense"), ("auto", 51, "auto"), ("sparse", 2, "sparse"), ("dense", 51, "dense")],
-)
-def test_warp_takes_dense_jacobians_up_to_50_degrees_of_freedom(
-    option: str, dofs: int, expected: str, warp: _Mjx
-) -> None:
-    """Where the model leaves the choice; the same for model and data, and the model itself stays as it is."""
-    bodies = "<body><joint/><geom size='0.1' contype='0'/></body>" * dofs
-    model = mujoco.MjModel.from_xml_string(
-        f"<mujoco><option jacobian='{option}'/><worldbody>{bodies}</worldbody></mujoco>"
-    )
-    before = content(model)
-    WarpEngine(model).blank()
-    names = [mujoco.mjtJacobian(given.opt.jacobian).name for given in warp.models]
-    assert names == [f"mjJAC_{expected.upper()}"] * 2
-    assert content(model) == before
 
 
 def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change() -> None:
@@ -322,7 +213,6 @@ def test_what_a_host_function_raises_ends_the_program() -> None:
 
 
 def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """JAX still runs it when the caller has its result; the environment's buffers are freed."""
     monkeypatch.setattr("mqe_jax.physics.engines.host_call._owners", {})  # no other environment of this physics
     seen: list[Any] = []
 
@@ -348,18 +238,6 @@ def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> 
     assert not any(seen[1]._idle.values())
 
 
-def test_a_program_of_an_environment_long_gone_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mqe_jax.physics.engines.host_call._KEPT", 1)
-    owner, zeros = Owner(), jnp.zeros((1, 3))
-    program = called(lambda x, y: x + y, 3, owner).lower(zeros, zeros).compile()
-    del owner
-    gc.collect()
-    np.testing.assert_array_equal(program(zeros + 1.0, zeros), zeros + 1.0)
-    called(lambda x, y: x - y, 4, Owner())(zeros, zeros)
-    with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="no longer exists"):
-        program(zeros, zeros).block_until_ready()
-
-
 SECOND_START = """
 import jax, mqe_jax
 hits = []
@@ -373,7 +251,6 @@ print(hits.count("cache_hits"), hits.count("cache_misses"), float(state.data.qpo
 
 
 def test_a_second_process_compiles_no_step_of_the_c_engine(tmp_path: Path) -> None:
-    """It loads what the first one compiled, and computes the same."""
     keep = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     run = [sys.executable, "-c", SECOND_START]
     first, second = (
@@ -417,20 +294,3 @@ running = f(np.zeros((300, 300), np.float32))
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 0, ended.stderr
-
-
-def test_mjx_imports_what_meshes_need_when_a_model_has_one() -> None:
-    """A tetrahedron above a plane; in a process of its own, since imports stay."""
-    code = """
-import sys, mujoco, jax
-from mqe_jax.physics.engines.private import load_mjx
-mjx = load_mjx()
-print([name in sys.modules for name in ("trimesh", "scipy.spatial")])
-model = mujoco.MjModel.from_xml_string('''<mujoco><asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
-<worldbody><geom type="plane" size="9 9 9"/><body pos="0 0 1"><freejoint/><geom type="mesh" mesh="m"/></body>
-</worldbody></mujoco>''')
-data = jax.jit(mjx.forward)(mjx.put_model(model), mjx.make_data(model))
-print([name in sys.modules for name in ("trimesh", "scipy.spatial")])
-"""
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert ended.stdout.splitlines() == ["[False, False]", "[True, True]"], ended.stderr

@@ -284,21 +284,6 @@ def test_making_and_stepping_imports_no_foreign_library_and_no_other_task() -> N
 # -- actions, noise, layouts ------------------------------------------------------------------------------------------
 
 
-def test_a_captured_constant_action_is_stepped_in_compiled_code(gate: QuadrupedEnv, fresh: State) -> None:
-    state = fresh
-    action = jnp.zeros((2, 12))
-    after = jax.jit(lambda state: jax.lax.scan(lambda state, _: (gate.step(state, action), None), state, None, 2)[0])
-    assert int(after(state).step) == 2
-
-
-def test_every_one_hot_is_marked_as_categorical() -> None:
-    for task in TASKS:
-        layout = made(task).observation_layout
-        assert [block.name for block in layout.blocks if block.categorical] == [
-            name for name in layout.names if name == "one_hot"
-        ]
-
-
 def test_a_layout_slices_packs_and_splits() -> None:
     layout = ObservationLayout((Block("id", 1, categorical=True), Block("place", 2), Block("speed", 3)))
     values = {"id": jnp.ones((4, 1)), "place": jnp.full((4, 2), 2.0), "speed": jnp.full((4, 3), 3.0)}

@@ -62,7 +62,6 @@ def error_on_random_inputs(policy: TrainedPolicy, env: Any) -> float:
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
-    """The command compares the graph with JAX on episodes, and prints the largest error."""
     run, file = zoo.file_of("go1football-defender"), tmp_path / "football.onnx"
     assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
@@ -80,7 +79,6 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd:
 
 
 def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() -> None:
-    """Joint targets in onnxruntime, from sensor readings, equal the environment's actuator targets."""
     env = make("go1gate", impl="c", num_envs=1)
     policy = load_policy(GATE)
     session = onnxruntime.InferenceSession(to_onnx(policy, env).SerializeToString())
@@ -158,9 +156,7 @@ def test_the_graph_of_a_match_is_that_of_one_team() -> None:
     assert max(found.values()) < 1e-4
 
 
-def test_what_cannot_be_exported_is_refused_in_a_line(
-    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
     file = str(tmp_path / "a.onnx")
 
     def refused(*arguments: str) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import QuadrupedEnv, State, make
-from mqe_jax.policies.scripted import scripted_policy
 from tests.states import ending, made, moment, observation, placed, stepper, still, terms_of, with_object
 
 NO = jnp.array(False)
@@ -94,7 +93,6 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
 
 
 def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
-    """Rays at the height of the ball, from the field's middle outwards, end where the listed walls are."""
     model, data = duel.compiled.model, mujoco.MjData(duel.compiled.model)
     data.qpos[duel.index.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
     data.qpos[duel.index.base_qpos[:, 0]] = [3.0, 4.0]
@@ -196,7 +194,6 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
 
 
 def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
-    """A goal, a fall and the time limit end a match; play does not."""
     places = [(4, 0, 0), (10, 0, np.pi)]
     state = standing(duel, fresh[duel.name], places)
     play = duel_step(state, still(duel))
@@ -261,7 +258,6 @@ TOUCHES = {
     ],
 )
 def test_passes_and_goals_of_both(envs: dict[str, Any], fresh: Any, task: str, touching: tuple[int, ...]) -> None:
-    """A touch changes the velocity of the ball, which rolls on after it; at last it is in the goal."""
     env, state, speed = envs[task], fresh[task], 0.0
     corners = [(3, -4, 0), (3, 4, 0), (11, 4, 0), (11, -4, 0)][: len(env.kick_off)]
     for robot in (None, *(step for each in touching for step in (each, None)), "goal"):
@@ -292,20 +288,3 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
 
 
 # -- the whole --------------------------------------------------------------------------------------------------------
-
-
-def test_the_planner_dribbles_to_the_goal() -> None:
-    """Through the walk policy, for 8 s of a few matches; `mqe eval TASK --policy scripted` measures many."""
-    env = make("go1football-1vs1", impl="c", num_envs=4)
-    plan = jax.vmap(scripted_policy(env))
-
-    def step(state: State, _: None) -> tuple[State, jax.Array]:
-        state = jax.vmap(env.step)(state, plan(state.obs).at[:, 1].set(0.0))
-        return state, jax.vmap(env.object_pose, (0, None))(state.data, "ball")[:, 0]
-
-    @jax.jit
-    def play(key: jax.Array) -> jax.Array:
-        return jax.lax.scan(step, jax.vmap(env.reset)(jax.random.split(key, 4)), None, 400)[1]
-
-    furthest = np.asarray(play(jax.random.PRNGKey(0))).max(0)
-    assert np.median(furthest) > 11.0  # from 7.0, past the opponent at 10.0

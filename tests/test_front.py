@@ -63,7 +63,6 @@ def fake() -> Any:
 
 
 def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path: Path) -> None:
-    """The same policy and metrics; nothing is written without a folder."""
     assert run.finished and run.env_steps == 64 and list(Path.cwd().iterdir()) == []
     assert cli.main(["train", "fake", "--seed", "2", "--run-dir", "run", *SMALL]) == 0
     written = mqe_jax.load_run("run")
@@ -74,7 +73,6 @@ def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path:
 
 
 def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixture[str]) -> None:
-    """The command line takes its folder too; a folder that holds a run is left alone."""
     run.save("saved")
     again = mqe_jax.load_run("saved")
     assert_same(run.policy.arrays, again.policy.arrays)
@@ -99,10 +97,7 @@ def test_evaluations_come_with_the_run() -> None:
         assert (other.evaluations, other.absolute) == (alone.evaluations, alone.absolute)
 
 
-def test_an_interrupt_returns_the_run_so_far(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """With a folder the run is saved there and goes on; the command, called in Python, ends."""
+def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, capfd: Any) -> None:
     step = Training._step
 
     def interrupt(self: Training, files: Any) -> Any:
@@ -160,9 +155,7 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
         (fake(), {"config": {"opponents": ["idle"]}}, r"opponents: \('idle',\) .* left out for a batch"),
     ],
 )
-def test_what_cannot_be_trained_is_named(
-    task: Any, arguments: dict[str, Any], said: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], said: str, capfd: Any) -> None:
     with pytest.raises(InputError, match=said):
         mqe_jax.learn(task, **arguments)
     assert "".join(capfd.readouterr()) == ""
@@ -185,16 +178,13 @@ def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
         ("~/none", {}, "run: '/nowhere/none' is no folder"),
     ],
 )
-def test_what_cannot_be_evaluated_is_named(
-    task: Any, arguments: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any], said: str, monkeypatch: Any) -> None:
     monkeypatch.setenv("HOME", "/nowhere")
     with pytest.raises(InputError, match=said):
         mqe_jax.evaluate(task, "idle", **arguments)
 
 
 def test_an_environment_keeps_its_parameters() -> None:
-    """Those in which it differs from its task's are the run's."""
     env = mqe_jax.make("go1gate", impl="c", control="position", gate_width=0.7, rewards={"collision": -5.0})
     (config,), cast = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, {"robot": "go2"})
     assert config.env == {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}, "robot": "go2"}
@@ -215,7 +205,6 @@ def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float
 
 
 def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
-    """As text, in a notebook, and by the command, whose figures it has."""
     result = mqe_jax.evaluate("fake", "forward", episodes=4)
     assert result.success == Rate.of(1.0, 4) and result.win is None
     assert "success_rate                 100.0% (51.0 to 100.0%)" in str(result).splitlines()
@@ -237,7 +226,6 @@ def test_a_function_is_a_policy() -> None:
 
 
 def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If asked to: half of the episodes on each."""
     played: dict[str, Any] = {}
 
     result = mqe_jax.evaluate("fake", "forward", episodes=2)
@@ -262,8 +250,6 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_halves_of_the_environments_play_equally_many_episodes() -> None:
-    """Also where environments play unequally many."""
-
     class Halves(FakeVectorEnv):
         def step(self, state: Any, action: jax.Array) -> Any:
             after = super().step(state, action)

@@ -119,7 +119,6 @@ def test_bad_metrics(content: bytes, tmp_path: Path) -> None:
 
 
 def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
-    """The files have holes, and take no space."""
     before = peak()
     for read, limit in (
         (read_curve, limits.CSV_BYTES),
@@ -168,7 +167,6 @@ METADATA = [
 
 @pytest.mark.parametrize("metadata", METADATA)
 def test_policies_with_metadata_of_another_type(metadata: str, tmp_path: Path) -> None:
-    """Also where the checksum is right."""
     path = tmp_path / "policy.safetensors"
     arrays = {"a": np.zeros(1, np.float32)}
     header = {"kind": "policy", "version": str(checkpoint.VERSION), "metadata": metadata}
@@ -250,7 +248,6 @@ def test_a_small_archive_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["task", "impl", "num_envs", "control"])
 def test_a_recording_whose_parameters_are_none(name: str, tmp_path: Path) -> None:
-    """They would be arguments of `make`."""
     about = {"task": "go1plane", "params": {name: 1}, "impl": "c", "control": "position"}
     np.savez(tmp_path / "a.npz", about=json.dumps(about), actions=np.zeros((1, 1, 12)))
     with pytest.raises(InputError, match=name):

@@ -32,7 +32,6 @@ def imported(path: Path, names: set[str]) -> set[str]:
 
 
 def test_rooms_import_from_those_above() -> None:
-    """The table names every folder and every module at the top, each after those that it imports."""
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     cells = re.findall(r"^\| (`\w+(?:/|\.py)`[^|]*)\|", text, re.MULTILINE)
     rows = [re.findall(r"`(\w+)(?:/|\.py)`", cell) for cell in cells]

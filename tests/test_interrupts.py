@@ -72,7 +72,6 @@ def updates(run_dir: Path) -> int:
 
 @SIGNALS
 def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Path) -> None:
-    """As soon as it has handlers, in its first imports, and leaves nothing behind."""
     process = start([*GATE, "--run-dir", str(tmp_path / "run")])
     wait_for(lambda: handles(process, signal.SIGTERM), process)
     assert end(process, number, seconds=5) == [ENDS[number][1]]
@@ -81,7 +80,6 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
 
 @pytest.mark.usefixtures("shared_programs")
 def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stopped between its regular checkpoints, it equals an uninterrupted one bit for bit."""
     fake_env.install(monkeypatch)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])

@@ -148,7 +148,6 @@ def test_a_block_keeps_its_member_while_episodes_against_the_last_one_run(histor
 def test_a_winning_policy_joins_early_but_not_at_once(
     history: list[TrainState], win_rate: float, snapshots: list[int]
 ) -> None:
-    """A snapshot is due every eight updates, after two of them where the policy wins often: here half of its games."""
     league = {**SMALL, "snapshot_steps": 256, "snapshot_win_rate": win_rate}
     rules, state = League(matches(num_envs=8), SOURCES, config_of(league=league)), history[1]
     state = dataclasses.replace(state, extra=state.extra._replace(snapshot=jnp.int32(0)))
@@ -207,7 +206,6 @@ def training(steps: int, *more: str) -> list[str]:
 
 @pytest.mark.soak
 def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """Two seeds in one program; evaluations meet the fixed opponent."""
     evaluations = ["--evaluation.every", "4", "--evaluation.episodes", "2"]
     arguments = training(96, "--checkpoint.every", "2", "--num-seeds", "2", *evaluations)
     whole, halves = tmp_path / "whole", tmp_path / "halves"
@@ -253,8 +251,6 @@ def test_ratings_recover_the_strengths_behind_many_games() -> None:
 
 @pytest.mark.parametrize("policies", [2, 8])
 def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> None:
-    """The first policy wins all its games; the others are even."""
-
     def interval(games: int) -> tuple[float, float]:
         results = np.full((policies, policies, 3), [0, games, 0])
         results[0, 1:], results[1:, 0] = [games, 0, 0], [0, 0, games]
@@ -276,10 +272,7 @@ def test_where_the_scripted_policy_does_not_fit_the_anchor_is_an_idle_team(param
     )
 
 
-def test_a_tournament_meets_every_pair_on_both_sides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """One who walks ahead passes the door that nobody else passes in time; nobody beats itself more often than not."""
+def test_a_tournament_meets_every_pair_on_both_sides(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     assert setup.anchors(make("go1revolvingdoor", impl="c", num_envs=1)) == ["scripted", "idle", "random"]
     monkeypatch.setattr(setup, "anchors", lambda env: ["scripted", "idle"])
     capfd.readouterr()

@@ -32,7 +32,6 @@ class Seen(HTMLParser):
 
 
 def test_nothing_is_markup_in_html_and_markdown() -> None:
-    """Markdown as markdown-it reads it, as a paragraph and in the table of a report."""
     markdown_it = pytest.importorskip("markdown_it")
     read = markdown_it.MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     for page, tags in (
@@ -46,7 +45,6 @@ def test_nothing_is_markup_in_html_and_markdown() -> None:
 
 
 def test_names_are_no_formulas_in_pictures(tmp_path: Path) -> None:
-    """The picture of a tournament has the names of policies, that of a sweep those of its folders."""
     axes = figures._figure(3.0, 3.0).add_subplot()
     figures._style_axes(axes, "$\\bad$")
     figures._png(axes.figure)

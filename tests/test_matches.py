@@ -46,7 +46,6 @@ def test_teams_and_zero_sum(task: str) -> None:
 
 @pytest.mark.parametrize("task", MATCHES)
 def test_both_sides_observe_the_same_of_a_mirrored_state(task: str) -> None:
-    """Robots and objects half turned (or reflected) and the teams swapped: the observations are swapped."""
     env = made(task)
     random = np.random.default_rng(0)
     agents = env.num_agents

@@ -77,7 +77,6 @@ def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, coope
 
 
 def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
-    """The loss is at least two variances for independent agents, and one if the second is conditioned on the first."""
     log_std = -1.2
     fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
     env = Probe(probes.show_hidden, probes.pay_meeting, num_envs=32)
@@ -87,7 +86,6 @@ def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
-    """A name means the same as a preset and as the paper's file: the preset changes nothing in the file."""
     config = base_config("go1gate", None, algorithm)
     again = override(config, preset(algorithm))
     assert again == config, algorithm
@@ -153,7 +151,6 @@ def test_parallel_log_probabilities_equal_sequential_ones(agents: int, settings:
 
 
 def test_an_agent_that_takes_no_part_is_left_out_of_the_sequence() -> None:
-    """The others act, and are valued, as if it were not there."""
     network, params, obs = made(4, blocks=2, heads=2)
     there = np.array([0, 2, 3])
     active = jnp.zeros((4, 4), bool).at[:, there].set(True)

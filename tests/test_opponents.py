@@ -63,7 +63,6 @@ def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **se
 
 
 def test_teams_may_see_different_groups_of_observations() -> None:
-    """One team sees the match, the other what its robots' own sensors measure; it learns from that too."""
     task = matches("go1tug", 2).env
     plain = VectorEnv(task, 2)
     with pytest.raises(InputError, match="group: 'smell' is not allowed; it must be one of go1tug: policy, proprio"):
@@ -122,7 +121,6 @@ def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
 
 
 def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
-    """Not from the environments': their actions follow the state's key, which differs in every step."""
     env = versus(door, ["random", "random"])
     step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))
     state = env.reset(KEY)
@@ -195,7 +193,6 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
 
 @pytest.mark.parametrize("kind", ["versus", "mirror"])
 def test_the_trainer_sees_one_team(kind: str) -> None:
-    """One joint value and one ratio for the team; outcomes are among the metrics. `versus` is only traced."""
     inner = matches("go1football-2vs2", 2)
     env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)
     settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
@@ -266,26 +263,6 @@ def test_the_best_policy_of_a_match_is_the_one_that_wins_most() -> None:
     seldom = evaluation(win_rate=0.5, average_step_reward=0.2)
     assert score(often) > score(seldom) > score(evaluation(win_rate=0.5, average_step_reward=0.1))
     assert score(evaluation(average_step_reward=0.2)) > score(evaluation(average_step_reward=None))
-
-
-def even(task: str, episodes: int, num_envs: int) -> None:
-    """Random weights against themselves: wins minus losses are within 3 standard errors of 0.
-
-    They set joint targets, since random walk commands decide hardly any match.
-    """
-    scale = {"position_scale": 3.0}
-    env = matches(task, num_envs, episode_length=5.0, **scale)
-    policy = new_policy(versus(env, ["idle"]), 3, scale, network={"recurrent": False, "action_gain": 1.0})
-    fight: Versus = versus(env, [policy])
-    result = evaluate_batch(fight, policy, episodes, KEY)
-    win, loss = result.match["win_rate"], result.match["loss_rate"]
-    error = np.sqrt(max(win + loss - (win - loss) ** 2, 1 / episodes) / episodes)
-    print(f"{task}: {win:.3f} won, {loss:.3f} lost of {episodes}")
-    assert win + loss > 0.1 and abs(win - loss) < 3 * error
-
-
-def test_random_weights_win_as_often_as_they_lose() -> None:
-    even("go1revolvingdoor", 32, 16)
 
 
 # -- `mqe train MATCH --opponent`: team 0 is trained against fixed opponents ------------------------------------------

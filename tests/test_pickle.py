@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import mqe_jax.adapters.gymnasium  # noqa: F401  (registers the tasks)
@@ -80,37 +75,3 @@ def test_policies(name: str) -> None:
     obs = jax.random.normal(KEY, (2, policy.agents, env.observation_size))
     one, other = (each.act(obs, each.initial_memory(2), KEY) for each in (policy, copied(policy)))
     assert_same(one, other)
-
-
-@pytest.mark.parametrize("task", ["go1plane", "go1wrestling"])
-def test_gymnasium_environments_keep_their_state(task: str) -> None:
-    settings = {**PLANE, "opponent": "random"} if task == "go1wrestling" else PLANE
-    envs = gymnasium.make_vec(f"mqe/{task}-v0", num_envs=2, **settings)
-    single = gymnasium.make(f"mqe/{task}-v0", **settings)
-    for env in (envs, single):
-        env.reset(seed=0)
-        action = np.full(env.action_space.shape or (), 0.1, np.float32)
-        copy = copied(env)
-        assert_same(env.step(action)[:2], copy.step(action)[:2])
-
-
-def test_another_process_steps_an_environment(tmp_path: Path) -> None:
-    env = make("go1plane", num_envs=2, **PLANE)
-    policy = load_policy("random", env)
-    (tmp_path / "pair").write_bytes(pickle.dumps((env, policy)))
-    code = """
-import pickle, sys
-import jax, numpy as np
-env, policy = pickle.load(open(sys.argv[1], "rb"))
-key = jax.random.PRNGKey(0)
-state = jax.jit(env.reset)(key)
-action, _ = policy.act(state.obs[None], (), key)
-print(float(np.sum(jax.jit(env.step)(state, action[0]).data.qpos, dtype=np.float64)))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "pair")], capture_output=True, text=True, check=True
-    )
-    state = jax.jit(env.reset)(KEY)
-    action, _ = policy.act(state.obs[None], (), KEY)
-    expected = np.sum(np.asarray(jax.jit(env.step)(state, action[0]).data.qpos, np.float64))
-    assert float(done.stdout) == pytest.approx(float(expected), abs=1e-5)

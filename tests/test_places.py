@@ -64,7 +64,6 @@ def run(code: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[
 
 
 def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
-    """Training in one process, evaluation and rendering. A home folder is missing without HOME and `pwd`."""
     code = mqe(
         ["train", "fake", "--run-dir", "run", *SMALL],
         ["eval", "fake", "--policy", "run", "--episodes", "4"],
@@ -77,25 +76,21 @@ def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
     ) == 3
 
 
-@pytest.mark.parametrize("words", [["--help"], ["walk", "--help"], ["render", "--help"], ["walk", "train", "--help"]])
-def test_help_is_the_same_without_docstrings(words: list[str], tmp_path: Path) -> None:
-    code = f"import sys; from mqe_jax.cli import main; sys.argv = ['mqe', *{words!r}]; sys.exit(main())"
+def test_help_is_the_same_without_docstrings(tmp_path: Path) -> None:
+    code = "import sys; from mqe_jax.cli import main; sys.argv = ['mqe', 'walk', 'train', '--help']; sys.exit(main())"
     plain, optimized = (run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": level}).stdout for level in ("", "2"))
     assert optimized == plain
 
 
-@pytest.mark.parametrize(("gl", "bad"), [("osmesa", BAD), ("wrong", ["eval", "go1gate", "--policy", "nobody"])])
-def test_only_drawing_needs_a_gl_library(gl: str, bad: list[str], tmp_path: Path) -> None:
-    """Another library draws, or matplotlib from above, with one line."""
-    code = mqe(["tasks"], ["eval", "fake", "--policy", "idle", "--episodes", "2"], bad=bad)
+def test_only_drawing_needs_a_gl_library(tmp_path: Path) -> None:
+    code = mqe(["tasks"], ["eval", "fake", "--policy", "idle", "--episodes", "2"])
     code += "print('drawn', file=sys.stderr)" + mqe(["render", "fake", "-o", "clip.png", "--seconds", "0.1"])
-    before, after = run(code, tmp_path, env={**os.environ, "MUJOCO_GL": gl}).stderr.split("drawn\n")
+    before, after = run(code, tmp_path, env={**os.environ, "MUJOCO_GL": "osmesa"}).stderr.split("drawn\n")
     assert "GL" not in before and len([line for line in after.splitlines() if "GL" in line]) == 1
     assert (tmp_path / "clip.png").stat().st_size
 
 
 def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In flags, which a shell leaves as they are after `=`, in settings and in Python."""
     home, work = tmp_path / "home", tmp_path / "work"
     for folder in (home, work):
         folder.mkdir()

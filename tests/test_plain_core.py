@@ -260,7 +260,6 @@ def test_targets_are_scaled_actions_delayed_by_the_lag(mode: str) -> None:
 
 
 def test_rotations_are_those_of_matrices() -> None:
-    """Roll, pitch and yaw about x, y and z, in this order about fixed axes."""
     random = np.random.default_rng(0)
     euler = random.uniform([-3, -1.5, -3], [3, 1.5, 3], (20, 3))
     quaternion = rotation.euler_to_quaternion(jnp.asarray(euler, jnp.float32))

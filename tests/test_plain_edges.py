@@ -115,7 +115,6 @@ def test_a_league_without_games_has_metrics_and_no_change() -> None:
 
 
 def test_points_that_coincide_give_finite_numbers() -> None:
-    """A sheep in a robot's place; two sheep in one; a ball and a defender in the goal; a step without a gradient."""
     place, still = jnp.array([[1.0, 1.0], [1.0, 1.0]]), jnp.zeros((2, 2))
     law = lambda robots: flock(KEY, place, still, robots, restlessness=0.1, step=0.02)  # noqa: E731
     assert np.all(np.isfinite(law(jnp.ones((1, 2))))) and np.all(np.isfinite(slowed(still, 0.1)))

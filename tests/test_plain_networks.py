@@ -128,7 +128,6 @@ def test_layers_begin_with_their_gains_and_without_bias() -> None:
 
 @pytest.mark.parametrize("kind", ["actor_critic", "mat"])
 def test_actions_are_drawn_from_the_distribution_they_are_weighed_by(kind: str) -> None:
-    """Independent of each other, also between agents and environments."""
     dims, count = EnvDims(agents=2, observation=4, privileged=1, action=3, values=2), 4096
     plain = ActorCritic(recurrent=False, hidden_sizes=(4,), log_std_init=-0.4, log_std_min=-0.5)
     network = plain.build(dims) if kind == "actor_critic" else Mat(width=4).build(dims)

@@ -77,7 +77,6 @@ def test_motors_are_those_of_a_plain_implementation(name: str) -> None:
 
 
 def test_an_environment_step_of_the_c_engine_is_that_of_plain_mujoco() -> None:
-    """Two steps of robots from rest to far too fast, with forces from outside and other masses."""
     scene = compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1))
     model, motors, index, count = scene.model, scene.motors, scene.index, 8
     engine = engines.make(model, motors=motors, impl="c", num_envs=count)
@@ -124,7 +123,6 @@ def test_an_environment_step_of_the_c_engine_is_that_of_plain_mujoco() -> None:
 
 
 def test_a_step_that_the_engine_warns_of_is_made_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Robots at rest but for one that is far too fast: the same with and without steps free of limits, also again."""
     env: Any = make("go1plane", impl="c", control="position", num_agents=1, num_envs=3)
     start = jax.vmap(lambda _: initial(env).data)(jnp.arange(3))
     qvel = jnp.zeros_like(start.qvel).at[1, env.index.base_qvel[0, 0]].set(1e11)
@@ -246,7 +244,6 @@ def test_the_flock_is_that_of_a_plain_implementation() -> None:
 
 
 def test_objects_have_the_masses_and_inertias_of_their_shapes() -> None:
-    """A full box, a thin shell, an upright cylinder that slides along y with friction, and what stops where."""
     items = {
         "box": Box(size=(0.6, 0.8, 1.0), mass=6.0, friction=0.3),
         "ball": Ball(radius=0.2, mass=0.5, damping=0.2, angular_damping=0.01),

@@ -71,8 +71,6 @@ class Episode(NamedTuple):
 
 
 def test_a_rollout_is_that_of_a_plain_implementation() -> None:
-    """Two rollouts one after the other; the recurrent states count steps and add up what they see."""
-
     def act(params: Any, memory: Any, obs: Any, key: Any, active: Any) -> tuple[Any, Any, Any]:
         action = params["gain"] * obs[..., 2:3] + 0.1 * memory[:, None, None]
         return action, -action, memory + 1.0
@@ -148,7 +146,6 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
 
 
 def test_evaluations_are_those_of_a_plain_implementation() -> None:
-    """Two policies, nine episodes each over four environments: three of the first, two of the others."""
     env = rich(teams=((1,), (0,)))
 
     def act(params: Any, obs: Any, memory: Any, key: Any) -> tuple[Any, Any]:
@@ -202,7 +199,6 @@ class HalfState(probes.ProbeState):
 
 
 def test_results_are_those_of_the_agents_that_take_part() -> None:
-    """Both evaluations and rollouts leave the others' rewards out of an episode's return."""
     values: dict[str, Any] = {"num_envs": N, "features": 2, "max_episode_steps": 2, "odd_episode_steps": 2}
     env = Half(lambda hidden, step: jnp.stack([hidden, 0.5 * step], axis=-1), pay_differently, **values)
     act = lambda params, seen, memory, key: (seen.obs[..., 2:3], memory)  # noqa: E731
@@ -221,7 +217,6 @@ def test_results_are_those_of_the_agents_that_take_part() -> None:
 
 
 def test_a_league_counts_as_a_plain_implementation() -> None:
-    """Thirty updates with random results of blocks that play members, the scripted policy and others."""
     sources, members = ("newest", "older", "scripted", "uniform", "idle"), 4
     moving, scripted = np.isin(sources, ("older", "uniform")), np.isin(sources, ("scripted",))
     env: Any = object.__new__(league.League)
@@ -275,7 +270,6 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
 
 
 def test_blocks_draw_the_members_that_their_source_says() -> None:
-    """Of two members one is always beaten, the other never; a block that has not played enough keeps its member."""
     env: Any = object.__new__(league.League)
     env._roster = league.Roster(("older", "uniform", "older", "idle"))
     env._config = SimpleNamespace(league=SimpleNamespace(episodes=5))

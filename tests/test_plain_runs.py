@@ -133,7 +133,6 @@ def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> N
 
 
 def test_a_member_joins_with_the_learners_rating_and_weights() -> None:
-    """A snapshot is due every four updates, and a place in use by a block that plays members is kept."""
     env: Any = object.__new__(league.League)
     env._roster, env._members = league.Roster(("older", "idle")), 2
     settings = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=1.0)
@@ -174,7 +173,6 @@ class Matches:
 
 
 def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
-    """Opponents are met in turn: of two, the first has the even matches."""
     idle = SimplePolicy("match", 1, lambda obs, key: jnp.zeros((len(obs), 1, 1)))
     for count, expected in ((1, [[4, 4, 4]]), (2, [[2, 2, 2]] * 2), (3, [[4, 0, 0], [0, 4, 0], [0, 0, 4]])):
         matches: Any = Matches()

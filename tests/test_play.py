@@ -123,7 +123,6 @@ def test_graphs_of_every_task_agree_in_a_long_episode(task: str, tmp_path: Path)
 
 
 def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNamespace) -> None:
-    """The action of the driven robot alone is replaced, also in a match with mirrored frames."""
     functions = TaskFunctions(built.env)
     state = state_arrays(jax.jit(built.env.reset)(jax.random.PRNGKey(1)))
     drive = jnp.array([[0.5, 0.5, 0.5], [0.1, 0.2, 0.3]])
@@ -146,7 +145,6 @@ def test_initial_states_are_restored_from_the_columns_that_vary(built: SimpleNam
 
 
 def test_the_written_scene_is_the_tasks_physics(built: SimpleNamespace) -> None:
-    """Compiled again, the MJCF has the task's addresses, and steps to the same state."""
     import mujoco
 
     env, ours = built.env, built.env.compiled.model
@@ -167,7 +165,6 @@ def test_the_written_scene_is_the_tasks_physics(built: SimpleNamespace) -> None:
 
 
 def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
-    """Runs with the task's own parameters join the shipped policy; other parameters are another entry."""
     from mqe_jax.policies import zoo
 
     run = tmp_path / "mine.safetensors"
@@ -218,7 +215,6 @@ def page(built: SimpleNamespace) -> Path:
 
 
 def test_the_page_in_webassembly_agrees_with_the_environment(page: Path, built: SimpleNamespace) -> None:
-    """Graphs, motors and MuJoCo in Node replay an episode's actions and noise."""
     if shutil.which("node") is None:
         pytest.skip("no Node here (tools/install.sh npm installs Debian's)")
     report = play_agreement.measure(page, built.entry, count=1, episodes=0)

@@ -56,20 +56,6 @@ def test_success_is_settled_from_its_last_change_on(env: Any, episode: recording
     assert episode.cut(slice(2, None)).settled == episode.settled
 
 
-def test_the_legend_names_teams_and_scripted_robots() -> None:
-    env = made("go1football-defender")
-    (team, own), (other, scripted) = framing.entries(env)
-    assert (team, len(own), other, len(scripted)) == ("team", 2, "scripted", 1)
-    assert own[0][2] > 200 and own[1][1] > 150 and scripted[0][0] > 200  # blue, green and red
-    frame = np.zeros((360, 640, 3), np.uint8)
-    shown = framing.legend(env, (640, 360))(frame)
-    for color in (*own, *scripted):
-        found = np.argwhere((shown == color).all(axis=-1))
-        assert len(found) > 20 and found[:, 0].min() > 300 and found[:, 1].max() < 320  # lower left
-    assert not frame.any() and not shown[:300].any()
-    assert framing.legend(env, (40, 20))(frame[:20, :40]).shape == (20, 40, 3)  # larger than the frame
-
-
 def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: Any, episode: recording.Episode) -> None:
     assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
     drawn = geometry.rendering_model(env.mj_model, episode)
@@ -135,9 +121,7 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
     ("chosen", "tried"),
     [("", ["egl", "osmesa"]), ("glfw", ["egl", "osmesa"]), ("osmesa", ["osmesa", "egl"]), ("disable", []), ("off", [])],
 )
-def test_only_libraries_that_draw_without_a_window_are_tried(
-    chosen: str, tried: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_libraries_that_draw_without_a_window_are_tried(chosen: str, tried: list[str], monkeypatch: Any) -> None:
     found: list[str] = []
 
     def run(command: Any, *, env: dict[str, str], **options: Any) -> Any:
@@ -180,7 +164,6 @@ TWELVE = [task for task in TASKS if task != "go1plane"]
 
 @pytest.mark.parametrize("task", TASKS)
 def test_rendering_models_have_the_physics_models_bodies_and_contacts(task: str) -> None:
-    """Visual geoms have no contacts and no mass: all else, and every collision geom, is as in the physics model."""
     env = made(task)
     physics, drawn = env.compiled.model, env.mj_model
     assert drawn.ngeom > physics.ngeom and physics.nsite == physics.ntex == physics.nlight == 0
@@ -195,7 +178,6 @@ def test_rendering_models_have_the_physics_models_bodies_and_contacts(task: str)
 
 @pytest.mark.parametrize("task", TWELVE)
 def test_team_colours_are_those_of_the_agents(task: str) -> None:
-    """Robots of a match's first team are blue and green, of its second red and orange."""
     env = made(task)
     shown = [geometry.robot_color(env.mj_model, body)[:3] for body in geometry.robot_bases(env.mj_model)]
     warm = [red > blue for red, _, blue in shown]
@@ -245,7 +227,6 @@ def walking(task: str, path: Any, objects: Any = None, frames: int = 21, dt: flo
 
 @pytest.mark.parametrize("task", TWELVE)
 def test_the_cameras_of_every_task_show_all_from_the_start(task: str) -> None:
-    """Robots walk one metre ahead, to the first team's goal."""
     env = made(task)
     start = np.asarray(initial(env).data.qpos)[np.asarray(env.index.base_qpos)][:, :3]
     episode = walking(task, lambda t: start + t * np.array([1.0, 0.0, 0.0]), frames=6)

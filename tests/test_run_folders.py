@@ -51,7 +51,6 @@ LOST: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("how", LOST)
 def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> None:
-    """With one line; neither the old path nor the folder that is there now gets a file."""
     folder = tmp_path / "runs" / "run"
 
     def lose(state: object, row: dict[str, float]) -> None:
@@ -70,7 +69,6 @@ def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> N
 
 @pytest.mark.usefixtures("fake_tasks")
 def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixture[str]) -> None:
-    """Neither several seeds in a single run's folder, nor a run in the folder of several seeds; resumed or not."""
     for folder, inner, flags in (("single", "", ["--num-seeds", "2"]), ("seeds", "seed0", [])):
         checkpoint = Path(folder, inner, "checkpoints", "step_000000000032.safetensors")
         checkpoint.parent.mkdir(parents=True)
@@ -107,7 +105,6 @@ def test_temporary_files_that_nothing_changes_for_an_hour_go_when_a_run_starts(t
 
 @pytest.mark.parametrize("name", ["checkpoints", "best", "metrics.csv"])
 def test_a_training_writes_and_removes_nothing_through_links(name: str, tmp_path: Path) -> None:
-    """A run folder itself may be a link."""
     run, other = tmp_path / "run", tmp_path / "other"
     run.mkdir()
     other.mkdir()
@@ -134,7 +131,6 @@ def test_policies_of_others_beside_the_best_one_stay(tmp_path: Path) -> None:
 
 
 def test_temporary_files_are_new_and_unpredictable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A name that exists, such as a link that somebody has put there, is not written to."""
     with replacing(tmp_path / "a") as first, replacing(tmp_path / "a") as second:
         assert first != second and first.stat().st_mode & 0o777 == 0o666 & ~os.umask(os.umask(0o22))
     monkeypatch.setattr("secrets.token_hex", lambda size: 16 * "a")

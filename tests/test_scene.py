@@ -58,7 +58,6 @@ def test_mass_is_the_published_one(name: str, mass: float) -> None:
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))
 def test_legs_are_mirror_images(name: str) -> None:
-    """Centres of mass and full inertia tensors: y of the right legs is negated, x of the rear hips."""
     model = compiled(robots.get(name)).model
     for leg in LEGS:
         for link in ("hip", "thigh", "calf"):
@@ -95,7 +94,6 @@ def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
 
 @pytest.mark.parametrize("task", ["go1football-2vs2", "go1revolvingdoor", "go1seesaw", "go1pushbox"])
 def test_poses_of_all_bodies_are_where_mujoco_puts_them(task: str) -> None:
-    """With slides, hinges, ball joints, free joints, and walls that move."""
     env, random = made(task), np.random.default_rng(0)
     model = env.compiled.model
     data = mujoco.MjData(model)
@@ -111,7 +109,6 @@ def test_poses_of_all_bodies_are_where_mujoco_puts_them(task: str) -> None:
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))
 def test_stands_on_its_default_pose(name: str) -> None:
-    """Two seconds under PD control: upright, at rest, at its standing height, on four feet."""
     robot = robots.get(name)
     env = make("go1plane", impl="c", control="position", robot=name, spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0))
     state, step = env.reset(jax.random.PRNGKey(0)), jax.jit(env.step)
@@ -126,7 +123,6 @@ def test_stands_on_its_default_pose(name: str) -> None:
 
 
 def test_a_variant_of_ones_own_is_a_robot_of_every_task(lifted: Robot) -> None:
-    """Masses, gains, pose, limits and walk weights are those of the `Robot`."""
     env = make("go1gate", impl="c", robot="lifted")
     model = env.compiled.model
     assert env.robot is lifted
@@ -138,7 +134,6 @@ def test_a_variant_of_ones_own_is_a_robot_of_every_task(lifted: Robot) -> None:
 
 
 def test_collision_sets_are_swapped_as_data() -> None:
-    """Several collision shapes per link: collision bits, index tables and sensors cover all of them."""
     shapes = (
         CollisionShape("trunk", box((0.188, 0.047, 0.057)), name="body"),
         CollisionShape("trunk", sphere(0.05, (0.27, 0.0, 0.0)), name="head"),
@@ -224,7 +219,6 @@ def height_at(x: float, y: float) -> float:
     "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)]
 )
 def test_a_robot_stands_on_rough_ground(impl: str) -> None:
-    """At least three feet are on the height field where they stand, and the trunk stays upright."""
     scene = rough_scene()
     model, index = scene.model, scene.index
     physics = engines.make(model, impl=impl, num_envs=1)

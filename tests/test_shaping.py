@@ -133,7 +133,6 @@ def test_shaping_terms_of_football() -> None:
 
 
 def test_one_sided_shaping_of_a_football_match() -> None:
-    """The ball advances for a team where it is nearer to the goal than ever; both teams are paid for their chase."""
     env, states = resets(DUEL, 0.0)
     state = jax.tree.map(lambda x: x[0], states)
     ball = jnp.asarray(env.objects["ball"].qpos[:1])
@@ -264,7 +263,6 @@ def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> Non
 
 
 def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> None:
-    """All joints are bent by as many hundredths of their range as the episode has had steps."""
     env, runs = rollout
     demonstrations = runs["all"][0]
     step, ctrl = np.asarray(demonstrations["step"]), np.asarray(demonstrations["data"]["ctrl"])
@@ -274,6 +272,5 @@ def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> N
 
 
 def test_a_demonstrator_needs_assistance() -> None:
-    """A demonstrator that would never be used is refused."""
     with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
         build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})

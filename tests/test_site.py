@@ -53,10 +53,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_site_is_built_without_a_warning(site: Path) -> None:
-    """Every task has a page with its clip, observation and rewards; formulas and links need no other host.
-
-    All links lead somewhere and all pictures have an alternative text, with and without the page of `mqe play-site`.
-    """
     assert not faults(site)
     first = (site / "index.html").read_text(encoding="utf-8")
     overview = (site / "tasks" / "index.html").read_text(encoding="utf-8")

@@ -110,7 +110,6 @@ def test_single_seeds_without_evaluation_are_reported(tmp_path: Path) -> None:
 
 
 def test_evaluations_take_the_place_of_training_rewards() -> None:
-    """Which may include shaping."""
     cells = group(
         [made_up(Cell("go1gate", "mat", "tuned"), 0), made_up(Cell("go1gate", "mat"), 0, evaluated=False)], REFERENCE
     )
@@ -137,18 +136,6 @@ PACKAGE: dict[str, Any] = {
         0.3333333333333333, 0.3333333333333333, 0.3333333333333333], "iqm_interval": [-1.17, 1.74],
         "improvement_interval": [0.0, 0.75], "profile_interval": [[0.0, 1.0], [0.0, 1.0], [0.0, 1.0], [0.0, 1.0],
         [0.0, 1.0]]},
-        {"x": [[1.32, 0.63], [-2.2, 0.05], [0.68, 1.0], [-0.62, 1.82], [-1.32, -0.66], [0.94, 0.05], [2.0, 0.19],
-        [-0.63, -0.38], [-1.09, -1.28], [0.63, 0.58]], "y": [[1.32, 0.63], [1.99, 0.01], [1.87, -0.13], [-0.44, 0.55],
-        [1.33, 0.46], [-0.29, -1.04], [-1.1, 0.8]], "iqm": 0.118, "probability_of_improvement": 0.41428571428571426,
-        "profile": [0.8, 0.6, 0.6, 0.45, 0.1], "iqm_interval": [-0.3534499999999998, 0.617525],
-        "improvement_interval": [0.2266964285714286, 0.5964285714285714], "profile_interval": [[0.6, 0.95], [0.4,
-        0.8], [0.4, 0.8], [0.25, 0.65], [0.0, 0.25]]},
-        {"x": [[0.99, -0.16, -1.07]], "y": [[0.99, -0.16, -1.07], [0.92, -1.95, 0.69]], "iqm": -0.08,
-        "probability_of_improvement": 0.5833333333333334, "profile": [0.6666666666666666, 0.6666666666666666,
-        0.3333333333333333, 0.3333333333333333, 0.0], "iqm_interval": [-0.08, -0.08], "improvement_interval":
-        [0.4166666666666667, 0.75], "profile_interval": [[0.6666666666666666, 0.6666666666666666],
-        [0.6666666666666666, 0.6666666666666666], [0.3333333333333333, 0.3333333333333333], [0.3333333333333333,
-        0.3333333333333333], [0.0, 0.0]]},
     ],
 }  # fmt: skip
 CASES = pytest.mark.parametrize("case", PACKAGE["cases"], ids=lambda case: str(np.shape(case["x"])))

@@ -61,7 +61,6 @@ def load(tmp_path: Path, text: str = FILE) -> Sweep:
 
 
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
-    """A run locked by another process is skipped; one that it has finished since is not trained again."""
     sweep, folder = load(tmp_path), tmp_path / "study"
     jobs = sweeps.plan(sweep, folder, config_of)
     trained: list[str] = []
@@ -80,7 +79,6 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
 
 
 def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) -> None:
-    """Stopped before the third update."""
     sweep, folder, there = load(tmp_path), tmp_path / "study", tmp_path / "there"
     sweep = override(sweep, {"algorithms": ("mappo",), "settings.checkpoint": {"every": 9}})
     sweeps.prepare(sweep, folder)
@@ -194,7 +192,6 @@ def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, 
 def test_folders_are_checked_before_the_first_cell_trains(
     make: Callable[[Path], object], message: str | None, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Also by --dry-run."""
     load(tmp_path)
     (tmp_path / "study").mkdir()
     make(tmp_path / "study")
@@ -212,9 +209,7 @@ def test_the_shipped_policies_can_be_planned_on_a_gpu(monkeypatch: pytest.Monkey
         assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
 
 
-def test_a_cell_that_fails_is_named_and_the_others_are_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cell_that_fails_is_named_and_the_others_are_trained(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     load(tmp_path)
     trained: list[str] = []
 
@@ -255,9 +250,7 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
         sweeps.prepare(override(sweep, {"settings": {"total_steps": 9}}), tmp_path / "study")
 
 
-def test_the_commands_say_what_is_left_and_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_commands_say_what_is_left_and_report(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     load(tmp_path)
     monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
     arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]

@@ -48,7 +48,6 @@ def events(folder: Path) -> list[tuple[int, str, float]]:
 
 
 def test_csv(tmp_path: Path) -> None:
-    """One row per update, NaN where a number is missing; a resumed log drops what comes after its step."""
     write(logs.CsvLog(tmp_path, 0))
     write(logs.CsvLog(tmp_path, 100), [{"env_steps": 200, "average_step_reward": 1.0, "success": 1.0}])
     with (tmp_path / logs.CSV_FILE).open() as file:
@@ -60,7 +59,6 @@ def test_csv(tmp_path: Path) -> None:
 
 
 def test_tensorboard(tmp_path: Path) -> None:
-    """Finite numbers at their steps."""
     pytest.importorskip("tensorboardX", reason="needs the extra log")
     write(logs.LOGGERS["tensorboard"](tmp_path, 0))
     assert events(tmp_path / "tensorboard") == [
@@ -71,7 +69,6 @@ def test_tensorboard(tmp_path: Path) -> None:
 
 
 def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run on disk, without a network or an account, with the numbers; a resumed one has the same id."""
     wandb = pytest.importorskip("wandb", reason="needs the extra log")
     monkeypatch.delenv("WANDB_MODE", raising=False)
     first = tmp_path / "run"
@@ -103,7 +100,6 @@ def test_progress_shows_what_is_known(row: dict[str, float], said: str, capsys: 
 
 
 def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Which is updated in place; standard error stays empty."""
     display = pytest.importorskip("IPython.display", reason="needs the extra notebook")
     shown: list[str] = []
 
@@ -123,7 +119,6 @@ def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before training begins."""
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name))
     with pytest.raises(InputError, match=r"'wandb' needs the package wandb; pip install 'mqe-jax\[log\]'"):

@@ -121,7 +121,6 @@ def one_pass() -> OnePass:
 
 
 def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
-    """The first gradient step reproduces the rollout's log-densities, recurrent states and resets included."""
     for metrics in one_pass.metrics:
         assert abs(float(metrics["approx_kl"])) < 1e-6
         assert float(metrics["clip_fraction"]) == 0.0
@@ -199,7 +198,6 @@ def test_a_policy_of_another_task_is_not_evaluated() -> None:
 
 
 def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
-    """Also those of different blocks, and of different evaluations in one program."""
     env, seen = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6), []
 
     def see(action: Any) -> Any:

@@ -7,7 +7,6 @@ import csv
 import dataclasses
 import resource
 import shutil
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,9 +27,9 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.monitor import Monitor, read_evaluations, score
+from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
-from mqe_jax.train.runner import open_training, train
+from mqe_jax.train.runner import train
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.training import Probe, assert_same
@@ -98,22 +97,6 @@ def test_a_killed_training_resumes_as_if_never_stopped(
             k: v for k, v in expected_row.items() if k not in timed
         }
     assert [int(row["env_steps"]) for row in rows(run_dir)] == [16, 32, 48, 64, 80]
-
-
-def test_a_training_without_a_folder_learns_the_same_and_writes_nothing(
-    straight: tuple[Path, TrainState], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    config = settings(evaluation={"every": 2, "episodes": 4}, loggers=("wandb",))
-    with open_training(PROBE, [config], [None], eval_env=PROBE) as training:
-        assert_same(training.run(None, lambda: False)[0], straight[1])
-    (log,), (history,) = training.evaluations, training.rows
-    assert [e["env_steps"] for e in log.evaluations] == [32, 64, 80] and log.absolute is not None
-    assert log.absolute["env_steps"] == log.best_policy()[1] == max(log.evaluations, key=score)["env_steps"]
-    assert [f"{row['loss/value']:.8g}" for row in history] == [row["loss/value"] for row in rows(straight[0])]
-    assert list(tmp_path.iterdir()) == []
-    with pytest.raises(InputError, match="resume: True is not allowed; it must be false without a run_dir"):
-        train(PROBE, settings(), None, resume=True)
 
 
 def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:
@@ -193,28 +176,7 @@ def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path
     assert len(rows(tmp_path)) == 5
 
 
-@pytest.mark.usefixtures("sigint")
-def test_an_interrupt_saves_the_last_complete_update(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
-    """SIGINT or a KeyboardInterrupt in a program or notebook that calls `train`."""
-    wanted = [1, 3]
-
-    def interrupt(state: TrainState, row: dict[str, float]) -> None:
-        if row["updates"] in wanted:
-            wanted.remove(int(row["updates"]))
-            if row["updates"] == 3:
-                raise KeyboardInterrupt
-            signal.raise_signal(signal.SIGINT)
-
-    for saved in ("step_000000000016.safetensors", "step_000000000048.safetensors"):
-        with pytest.raises(KeyboardInterrupt):
-            train(PROBE, settings(), tmp_path, resume=True, on_update=interrupt)
-        assert list_checkpoints(tmp_path)[-1].name == saved
-    assert_same(train(PROBE, settings(), tmp_path, resume=True), straight[1])
-
-
-def test_an_interrupted_evaluation_is_made_when_the_run_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_evaluation_is_made_when_the_run_resumes(tmp_path: Path, monkeypatch: Any) -> None:
     config = settings(evaluation={"every": 2, "episodes": 4})
 
     def interrupt(*arguments: Any) -> None:

@@ -171,7 +171,6 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
 
 
 def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
-    """Widgets and keys of the last session are gone; overlays can be switched on and off in the new one."""
     pytest.importorskip("mjviser")
     from mqe_jax.view.menu import Choice, Menu
     from mqe_jax.view.viewer import Viewer

@@ -103,7 +103,6 @@ def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(shown: SimpleN
 
 
 def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> None:
-    """The state, the bars and the observation are those of the chosen step; running on returns to the present."""
     run, panel = shown.session, shown.panel
     run.drive.env, run.drive.robot = 0, 0
     for step in range(4):

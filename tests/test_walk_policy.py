@@ -265,7 +265,6 @@ def test_phases_are_warped_by_the_duration() -> None:
     [(("yaw_rate", "vx", "vy"), 1344), (("vx", "pitch", "gait_frequency", "stance_width"), 1376), (("phase",), 1376)],
 )
 def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, ...], size: int) -> None:
-    """From the zeros after a reset until the history is full, and beyond, with all weights random."""
     params, command = walk_policy.init_params(jax.random.PRNGKey(0)), np.array(SKILL.default_commands("pace"))
     short: Any = SKILL.restricted(varied, "pace")
     policies = {SKILL: params, short: short.folded(params)}
@@ -282,7 +281,6 @@ def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, 
 
 
 def test_environments_store_what_actions_can_change() -> None:
-    """All of an observation where a task may give NPC robots any commands."""
     gate, defender = (make(task, impl="c", num_envs=1) for task in ("go1gate", "go1football-defender"))
     leaning = type("Leaning", (type(defender),), {"npc_varied": ()})(impl="c")
     histories = [jax.eval_shape(env.controller.reset).skill.history.shape for env in (gate, defender, leaning)]

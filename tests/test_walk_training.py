@@ -81,7 +81,6 @@ def history() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
 
 
 def test_a_chunk_repeats_the_rollout(history: Any) -> None:
-    """The first gradient step reproduces the rollout's log-densities: histories, chunks and resets are the same."""
     for metrics in history[1]:
         assert abs(float(metrics["approx_kl"])) < 1e-5 and float(metrics["clip_fraction"]) == 0.0
     assert history[0][-1].rollout.memory.actor.shape == (4, 29, 70)
@@ -158,7 +157,6 @@ def observation(joints: np.ndarray, gravity: np.ndarray, commands: np.ndarray, g
 
 
 def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
-    """Hand-mirrored inputs; trot and pace: the other side's feet are half a cycle apart."""
     random = np.random.default_rng(0)
     joints, gravity = random.normal(size=12), np.array([0.1, 0.3, -0.9])
     mirrored = np.array([joints[JOINT_NAMES.index(("FR" if n[:2] == "FL" else "FL" if n[:2] == "FR" else
