@@ -1,7 +1,5 @@
 """How fast joints in the air start from rest: `python -m tests.driving [--robot go1]` prints it."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

@@ -5,8 +5,6 @@
 `record`: `--num-envs N` environments of standing robots and as many in play, `--seed S`, `--solver-iterations I`.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import itertools

@@ -4,8 +4,6 @@
 damaged files may be accepted where they happen to be valid.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct

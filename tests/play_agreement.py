@@ -6,8 +6,6 @@ WebAssembly with its graphs. Reported are the largest differences of the states 
 the page plays episodes of its own; their mean outcomes are reported.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

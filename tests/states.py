@@ -1,7 +1,5 @@
 """Environments shared by tests, and hand-built states: robots and objects at given positions, at rest."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence

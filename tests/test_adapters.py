@@ -1,7 +1,5 @@
 """The Gymnasium adapter against Gymnasium's own checks and vector environment; matches against an opponent."""
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import sys

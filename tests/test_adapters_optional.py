@@ -1,7 +1,5 @@
 """The adapters of Brax, JaxMARL and PettingZoo: conventions, resets, names of tasks, and the libraries' own tests."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import pickle

@@ -1,7 +1,5 @@
 """The agile skill at run time and in training: inputs, gait, symmetry, commands, shoves, errors over a gait cycle."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Narrow Gate and Climb on Seesaw on states made by hand; endings of every task."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

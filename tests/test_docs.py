@@ -1,13 +1,13 @@
 """The documentation's pages: their code, notebooks and examples run, their commands are parsed by the program."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import json
+import os
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -127,6 +127,18 @@ def check_commands(text: str) -> None:
 @pytest.mark.parametrize("page", NAMES)
 def test_commands_on_pages_exist(page: str) -> None:
     check_commands(read(page))
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocstrings")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "JAX_PLATFORMS": "cpu"}
+    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert built.returncode == 0 and "WARNING" not in built.stderr, built.stderr[-3000:]
+    for name, task in TASKS.items():
+        page = (tmp_path / "tasks" / f"{name}.html").read_text(encoding="utf-8")
+        assert all(f"<code>{term}</code>" in page for term in vars(task.Params().rewards))
 
 
 class Begun(Exception):

@@ -3,8 +3,6 @@
 The soak compares all tasks. `python -m tests.engines` compares all engines.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import gc
 import os

@@ -1,7 +1,5 @@
 """The tasks' contract, and what all environments share: parameters, actions, observations and recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Football: field, mirrored observations, rewards and endings on states made by hand, and the defender's play."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

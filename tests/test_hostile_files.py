@@ -1,16 +1,12 @@
 """Hostile files: YAML, JSON, CSV, safetensors, policies, archives. Each is refused in one line, within the limits."""
 
-from __future__ import annotations
-
 import functools
-import io
 import json
 import math
 import os
 import resource
 import shutil
 import struct
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,6 +31,7 @@ from mqe_jax.train.runner import train
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 from tests import training as probes
+from tests.archives import module, named, tensor, zipped
 from tests.test_train_run import settings as run_settings
 from tests.training import Probe
 
@@ -176,34 +173,8 @@ def test_policies_with_metadata_of_another_type(metadata: str, tmp_path: Path) -
         read_policy(path)
 
 
-# A pickle by its opcodes: a module with the attributes that follow on the stack as a dict.
-def module(*attributes: bytes, kind: str = "x\nM") -> bytes:
-    return f"c__torch__.torch.nn.modules.{kind}\n".encode() + b")\x81}(" + b"".join(attributes) + b"ub"
-
-
-def named(name: str, value: bytes) -> bytes:
-    return b"X" + struct.pack("<I", len(name)) + name.encode() + value
-
-
-def tensor(size: tuple[int, ...], stride: tuple[int, ...]) -> bytes:
-    storage = b"(" + named("storage", b"ctorch\nFloatStorage\n") + named("0", named("cpu", b"K\x01t")) + b"Q"
-    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\x00" + _tuple(size) + _tuple(stride) + b"tR"
-
-
-def _tuple(values: tuple[int, ...]) -> bytes:
-    return b"(" + b"".join(b"J" + struct.pack("<i", value) for value in values) + b"t"
-
-
 def archived(data: bytes, storage: bytes = bytes(4)) -> bytes:
-    return zipped(b"\x80\x02" + data + b".", storage)
-
-
-def zipped(pickle: bytes, storage: bytes = bytes(4)) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("net/data.pkl", pickle)
-        archive.writestr("net/data/0", storage)
-    return file.getvalue()
+    return zipped(b"\x80\x02" + data + b".", {"0": storage})
 
 
 def encrypted(content: bytes) -> bytes:
@@ -235,13 +206,15 @@ ARCHIVES: dict[str, Callable[[], bytes]] = {
     "encrypted": lambda: encrypted(archived(module(LINEAR))),
     "no archive": lambda: b"hello",
     "the start of an archive": lambda: b"PK\x03\x04",
-    **{f"pickle {i}": functools.partial(zipped, text) for i, text in enumerate(inputs.PICKLES)},
+    **{f"pickle {i}": functools.partial(zipped, text, {"0": bytes(4)}) for i, text in enumerate(inputs.PICKLES)},
 }
 
 
 def test_a_small_archive_is_read(tmp_path: Path) -> None:
     """The opcodes of the cases below are right."""
-    layers = module(named("0", module(LINEAR, kind="linear\nLinear")), kind="container\nSequential")
+    layers = module(
+        named("0", module(LINEAR, kind="torch.nn.modules.linear.Linear")), kind="torch.nn.modules.container.Sequential"
+    )
     (tmp_path / "good.jit").write_bytes(archived(layers, struct.pack("<f", 3.0)))
     assert read_torchscript(tmp_path / "good.jit") == {"0.weight": np.array([3.0], np.float32)}
 

@@ -1,7 +1,5 @@
 """Rooms import only from those above them in the table of docs/architecture.md."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 import re

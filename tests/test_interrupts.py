@@ -1,7 +1,5 @@
 """SIGINT and SIGTERM: one line, exit code 130 or 143; SIGKILL too leaves a run that resumes exactly."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Leagues: the pool of earlier policies, who plays whom in training, and runs with a pool that are resumed."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

@@ -1,7 +1,5 @@
 """The matches: mirrored views, zero-sum rewards, results and endings on states made by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

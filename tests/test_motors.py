@@ -1,7 +1,5 @@
 """Motors: joint targets, torque-speed curves, joint speeds and limits on every engine; randomised physics and noise."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

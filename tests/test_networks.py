@@ -1,7 +1,5 @@
 """Algorithms and networks: their settings, the multi-agent transformer, and every network in every use."""
 
-from __future__ import annotations
-
 import functools
 import math
 import shutil

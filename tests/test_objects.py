@@ -1,7 +1,5 @@
 """Objects and NPCs: motion of boxes, balls, sheep and the defender, and the tasks with objects and sheep."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
 """Matches as environments of one team, against opponents that may change; policies by name; training with opponents."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path

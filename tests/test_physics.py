@@ -1,7 +1,5 @@
 """Physics on three engines: constants of the compiled robot, agreement with MuJoCo, finite states, crowds."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Pickled environments, adapters and policies, as a spawned process gets them: the copy acts as the original."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from typing import Any

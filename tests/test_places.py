@@ -1,7 +1,5 @@
 """Machines that lack what a Linux workstation has: POSIX, a home folder, a GL library, docstrings."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Edges: values exactly at a bound, floors of divisions, and nothing to divide by."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Networks and policies against plain numpy: layers, initial gains, drawn actions."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

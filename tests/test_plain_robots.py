@@ -1,7 +1,5 @@
 """Robots, motors, the C engine, tracks and the flock against plain numpy and MuJoCo."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

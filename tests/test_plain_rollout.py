@@ -1,7 +1,5 @@
 """Rollouts, evaluations, leagues and opponents against plain implementations: loops over steps, episodes and games."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 from typing import Any, NamedTuple

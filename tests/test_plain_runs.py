@@ -1,7 +1,5 @@
 """What a run begins with and keeps: staggered episodes, assistance, evaluations, members of a league, results."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

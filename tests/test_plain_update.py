@@ -1,7 +1,5 @@
 """One update of the learner against a plain implementation: loops over steps, agents and samples."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

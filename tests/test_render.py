@@ -1,7 +1,5 @@
 """Rendering: frames and files; what rendering models add to the physics models, and what the cameras of clips show."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import sys

@@ -1,7 +1,5 @@
 """Run folders that are lost or replaced while a training writes; files written whole; several seeds in one program."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -1,7 +1,5 @@
 """Robots and terrain: compiled models, robots as data, tracks, rough ground on the engines."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Records of settings: accepted values, and one-line errors with path, value and bounds; files of training settings."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Help in training alone: shaping terms and head starts, which are off by default, and demonstrated first states."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -4,8 +4,6 @@ The statistics are compared with the package `rliable` 1.2.0 on random matrices 
 bootstrap from numpy's global state, seeded before each interval.
 """
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from pathlib import Path

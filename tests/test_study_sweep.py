@@ -1,7 +1,5 @@
 """Sweeps on a probe: what is left, stops at any moment, complete run folders and a report at the end."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

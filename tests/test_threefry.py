@@ -1,7 +1,5 @@
 """Random numbers on a CPU."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

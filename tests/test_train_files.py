@@ -1,7 +1,5 @@
 """Files of a training: loggers, whose files can be read back, and checkpoints."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import math

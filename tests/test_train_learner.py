@@ -1,7 +1,5 @@
 """The learner and evaluations on probe environments with known solutions."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from typing import Any, NamedTuple

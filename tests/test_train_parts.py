@@ -1,7 +1,5 @@
 """The learner's parts against values computed by hand."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """A complete training run: run folder, resuming, failures to write, evaluation, loaded policies."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import dataclasses

@@ -1,14 +1,11 @@
 """The walk policy's network, recurrent state, conversion and evaluation environment."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
 import pathlib
 import pickle
 import re
-import zipfile
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,6 +25,8 @@ from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES
+from tests import archives
+from tests.archives import module, named
 
 DOWN = jnp.array([0.0, 0.0, -1.0])
 SKILL = skills.make("walk", GO1)
@@ -54,54 +53,6 @@ def apply(layers: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
     return x
 
 
-class _Global:
-    """Pickles as a reference to a class that does not exist here."""
-
-    def __init__(self, module: str, name: str) -> None:
-        self.module, self.name = module, name
-
-
-_PurePickler: Any = vars(pickle)["_Pickler"]  # the one in Python, whose opcodes can be written by hand
-
-
-class _Pickler(_PurePickler):
-    """Writes the opcodes of a TorchScript archive: module objects and tensors kept in other files."""
-
-    def save(self, obj: Any, save_persistent_id: bool = True) -> None:
-        if isinstance(obj, _Global):
-            self.write(pickle.GLOBAL + f"{obj.module}\n{obj.name}\n".encode())
-        elif isinstance(obj, _Made):
-            self.save(obj.made)
-            self.save(())
-            self.write(pickle.NEWOBJ)
-            self.save(obj.state)
-            self.write(pickle.BUILD)
-        elif isinstance(obj, _Called):
-            self.save(obj.function)
-            self.save(obj.arguments)
-            self.write(pickle.REDUCE)
-        elif isinstance(obj, _Stored):
-            self.save(("storage", _Global("torch", "FloatStorage"), obj.key, "cpu", obj.count))
-            self.write(pickle.BINPERSID)
-        else:
-            super().save(obj, save_persistent_id)
-
-
-class _Made:
-    def __init__(self, made: _Global, state: dict[str, Any]) -> None:
-        self.made, self.state = made, state
-
-
-class _Called:
-    def __init__(self, function: _Global, arguments: tuple[Any, ...]) -> None:
-        self.function, self.arguments = function, arguments
-
-
-class _Stored:
-    def __init__(self, key: str, count: int) -> None:
-        self.key, self.count = key, count
-
-
 def write_torchscript(
     path: pathlib.Path,
     layers: dict[str, np.ndarray],
@@ -114,34 +65,27 @@ def write_torchscript(
     """Writes an archive laid out as torch.jit.save lays out a Sequential of Linear and ELU."""
     files: dict[str, bytes] = {}
 
-    def tensor(value: np.ndarray) -> _Called:
-        key = str(len(files))
-        files[key] = value.tobytes()
+    def tensor(value: np.ndarray) -> bytes:
+        files[key := str(len(files))] = value.tobytes()
         stride = tuple(int(np.prod(value.shape[i + 1 :])) for i in range(value.ndim))
-        rebuild = _Global("torch._utils", "_rebuild_tensor_v2")
-        return _Called(rebuild, (_Stored(key, value.size), 0, value.shape, stride, False, {}))
+        return archives.tensor(value.shape, stride, key, value.size)
 
-    def module(name: str, state: dict[str, Any]) -> _Made:
-        return _Made(_Global(*f"__torch__.{name}".rsplit(".", 1)), {"training": True, **state})
+    def child(value: Any) -> bytes:
+        if isinstance(value, str):
+            return module(named("training", b"\x88"), kind=value)
+        return tensor(value) if isinstance(value, np.ndarray) else pickle.dumps(value, 0)[:-1]
 
-    children: dict[str, Any] = {}
+    children: dict[str, bytes] = {}
     for name in sorted({name.split(".")[0] for name in layers}, key=int):
         if children:
-            children[str(int(name) - 1)] = module(f"torch.nn.modules.activation.___torch_mangle_3.{activation}", {})
-        linear = {kind: tensor(layers[f"{name}.{kind}"]) for kind in ("weight", "bias")}
-        children[name] = module("torch.nn.modules.linear.Linear", linear)
-    for name, value in (further or {}).items():
-        children[name] = tensor(value) if isinstance(value, np.ndarray) else value
-        if isinstance(value, str):
-            children[name] = module(value, {})
+            children[str(int(name) - 1)] = child(f"torch.nn.modules.activation.___torch_mangle_3.{activation}")
+        linear = (named(kind, tensor(layers[f"{name}.{kind}"])) for kind in ("weight", "bias"))
+        children[name] = module(*linear, kind="torch.nn.modules.linear.Linear")
+    children |= {name: child(value) for name, value in (further or {}).items()}
     source = f"    _0 = __torch__.torch.nn.functional.elu(input, {alpha}, False, )\n    return _0\n"
-    with zipfile.ZipFile(path, "w") as archive:
-        with archive.open("net/data.pkl", "w") as file:
-            _Pickler(file, 2).dump(module(root, children))
-        for key, content in files.items():
-            archive.writestr(f"net/data/{key}", content)
-        archive.writestr("net/code/__torch__/torch/nn/modules/activation/___torch_mangle_3.py", source)
-        archive.writestr("net/version", "3\n")
+    code = {"__torch__/torch/nn/modules/activation/___torch_mangle_3.py": source}
+    whole = module(*(named(name, value) for name, value in children.items()), kind=root)
+    path.write_bytes(archives.zipped(b"\x80\x02" + whole + b".", files, code))
 
 
 def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.Path) -> None:

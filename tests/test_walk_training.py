@@ -1,7 +1,5 @@
 """The walk policy as a network of the trainer: windows, rollout and update, settings, a run; left-right symmetry."""
 
-from __future__ import annotations
-
 import itertools
 import pathlib
 from typing import Any
