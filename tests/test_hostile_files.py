@@ -18,7 +18,7 @@ from safetensors.numpy import save
 from mqe_jax.cli.options import parse_overrides
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import linear_layers, parse_json, parse_yaml, read_rows, read_tensors
+from mqe_jax.core.files import parse_json, parse_yaml, read_rows, read_tensors
 from mqe_jax.core.settings import build, override
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.selfplay.league import pool

@@ -113,17 +113,6 @@ def test_a_long_computation_in_c_delays_nothing(number: signal.Signals, tmp_path
     assert end(run(body, tmp_path, tmp_path / "ready"), number, seconds=5) == [ENDS[number][1]]
 
 
-def test_unfinished_files_go(tmp_path: Path) -> None:
-    body = """
-with files.replacing(folder / "clip.mp4") as temporary:
-    temporary.write_text("half")
-    (folder / "ready").touch()
-    time.sleep(1000)
-"""
-    end(run(body, tmp_path, tmp_path / "ready"), signal.SIGTERM)
-    assert [path.name for path in tmp_path.iterdir()] == ["ready"]
-
-
 SAVING = """
 with interrupts.deferred() as signalled:
     (folder / "ready").touch()

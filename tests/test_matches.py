@@ -10,7 +10,6 @@ import pytest
 
 from mqe_jax.envs import TASKS, QuadrupedEnv, make
 from mqe_jax.envs.match import Match
-from mqe_jax.envs.state import Moment
 from tests.states import initial, made, observation, placed, stepper, still, terms_of
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
@@ -115,12 +114,6 @@ def test_tug_observation_and_rewards() -> None:
     for y in (0.1, -0.1):
         rest = tug_state(env, y)
         np.testing.assert_allclose(terms_of(env, rest, rest)[0]["push"], [y, -y], atol=1e-6)
-
-
-def test_tug_shows_where_the_cylinder_was_before_the_step() -> None:
-    env = made("go1tug")
-    moments = [Moment(state, env.read(state.data)) for state in (tug_state(env, 0.1), tug_state(env, 0.13))]
-    assert float(env.step_task(*moments).previous_y) == pytest.approx(0.1)
 
 
 def test_tug_result_and_end() -> None:

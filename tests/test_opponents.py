@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import cli
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import observations
@@ -261,28 +259,3 @@ def test_the_best_policy_of_a_match_is_the_one_that_wins_most() -> None:
     seldom = evaluation(win_rate=0.5, average_step_reward=0.2)
     assert score(often) > score(seldom) > score(evaluation(win_rate=0.5, average_step_reward=0.1))
     assert score(evaluation(average_step_reward=0.2)) > score(evaluation(average_step_reward=None))
-
-
-# -- `mqe train MATCH --opponent`: team 0 is trained against fixed opponents ------------------------------------------
-
-TINY = ["train", "go1tug", "--impl", "c", "--set", "control=position", "--set", "episode_length=0.1", "--num-envs", "4"]
-TINY += ["--rollout-steps", "4", "--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "8"]
-TINY += ["--checkpoint.every", "2", "--total-steps", "64", "--config", "paper/mappo"]
-AGAINST = ["--opponent", "idle", "--opponent", "random"]
-
-
-WRONG: dict[str, tuple[list[str], list[str]]] = {
-    "one team": (["train", "go1gate", "--opponent", "idle"], ["opponents", "go1gate"]),
-    "unknown": ([*TINY, "--opponent", "idel"], ["opponent", "'idel'", "idle"]),
-    "shares": ([*TINY, *AGAINST, "--opponent", "idle"], ["num_envs: 4", "3"]),
-    "another task's": ([*TINY, "--opponent", "go1gate"], ["opponent", "go1gate", "go1tug"]),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_opponents_are_named_before_anything_is_written(name: str, tmp_path: Path, capsys: Any) -> None:
-    arguments, words = WRONG[name]
-    assert cli.main([*arguments, "--impl", "c", "--run-dir", str(tmp_path / "run")]) == 2
-    message = capsys.readouterr().err
-    assert [word for word in words if word not in message] == [], message
-    assert not (tmp_path / "run").exists()

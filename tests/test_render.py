@@ -116,22 +116,6 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
 
 
 @pytest.mark.parametrize(
-    ("chosen", "tried"),
-    [("", ["egl", "osmesa"]), ("glfw", ["egl", "osmesa"]), ("osmesa", ["osmesa", "egl"]), ("disable", []), ("off", [])],
-)
-def test_only_libraries_that_draw_without_a_window_are_tried(chosen: str, tried: list[str], monkeypatch: Any) -> None:
-    found: list[str] = []
-
-    def run(command: Any, *, env: dict[str, str], **options: Any) -> Any:
-        found.append(env["MUJOCO_GL"])
-        raise OSError
-
-    monkeypatch.setattr(render.subprocess, "run", run)
-    monkeypatch.setenv("MUJOCO_GL", chosen)
-    assert render._working_backend.__wrapped__() is None and found == tried
-
-
-@pytest.mark.parametrize(
     ("name", "said"),
     [
         ("clip.avi", r"clip\.avi.*\.mp4, \.webp, \.gif, \.png"),

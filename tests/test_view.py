@@ -103,25 +103,6 @@ def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: A
     np.testing.assert_allclose(away[1, 1], 0.0, atol=1e-6)
 
 
-def test_walls_end_at_their_own_track_and_a_followed_body_stays_at_the_origin(stage: Any) -> None:
-    scene = stage.stage
-    solid = [scene._model.geom(geom).name.startswith("wall/") for geom in scene._walls]
-    walls = [wall for wall, is_wall in zip(scene._wall_handles, solid, strict=True) if is_wall]
-    assert len(walls) == 2
-    centre = np.stack([wall.batched_positions for wall in walls]) - scene.offset
-    half = np.stack([wall.batched_scales for wall in walls])
-    assert np.all(np.abs(centre[..., 1]) + half[..., 1] < 1.55)
-    widths = 3.0 - 2 * half[..., 1].sum(0)
-    np.testing.assert_allclose(widths, 0.6, atol=0.1)
-    trunk = scene.bodies["robot 2"]
-    places = stage.frame.qpos[2, stage.env.index.base_qpos[:, :2]] + scene.offset[2, :2]
-    for bodies, want in (([trunk], places[1]), ([scene.bodies["robot 1"], trunk], places.mean(axis=0))):
-        scene.draw(stage.frame, (2, bodies))
-        np.testing.assert_allclose(np.asarray(scene._root.position)[:2], -want, atol=1e-5)
-    scene.release()
-    np.testing.assert_allclose(scene._root.position, 0.0)
-
-
 def test_contact_forces_carry_the_robots() -> None:
     """Of two Go1s that stand on their feet; robots are named by colour."""
     pytest.importorskip("mjviser")

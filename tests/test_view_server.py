@@ -1,8 +1,13 @@
 """The viewer's server: which requests it answers, and what its panel does."""
 
 import http.client
+import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,8 +43,8 @@ def said(capfd: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
     return lambda: capfd.readouterr().err.splitlines()
 
 
-def until(condition: Callable[[], Any]) -> None:
-    end = time.monotonic() + 30.0
+def until(condition: Callable[[], Any], seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -163,6 +168,38 @@ def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(InputError, match=r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)"):
         open_server("127.0.0.1", free_port(), "test")
     assert stopped == [True]
+
+
+def listening(port: int) -> set[str]:
+    """Local addresses, as the kernel writes them, on which a port is listened to."""
+    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
+    places = [row[1].rsplit(":", 1) for row in rows if row[3] == "0A"]
+    return {address for address, number in places if int(number, 16) == port}
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net/tcp to read the sockets from")
+def test_the_command_listens_on_this_machine_only_plays_and_ends_with_130() -> None:
+    port = free_port()
+    # A shell starts background jobs with SIGINT ignored, which children inherit.
+    program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    program += "from mqe_jax.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "view", "go1gate", "--policy", "idle", "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert f"http://127.0.0.1:{port}" in next(line for line in process.stdout if "open http" in line)
+            threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop the viewer
+            assert listening(port) == {"0100007F"}
+
+            def plays() -> bool:
+                with Client(port) as client:
+                    return " at " in client.panel().values.get("state", "")
+
+            until(plays, 240.0)  # without compiled programs
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 130
+        finally:
+            process.kill()
 
 
 EVIL = "<iframe srcdoc=\"<script>top.ran = 'iframe'</script>\"></iframe><img src=x onerror=\"ran = 'img'\">![](a.png)"
