@@ -81,6 +81,14 @@ def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None
     np.testing.assert_array_equal(call(), expected)
 
 
+def test_the_clamp_keeps_angle_and_speed_consistent() -> None:
+    motors = motors_of("go1")
+    velocity = np.where(np.arange(12) == 2, 3.0, 0.5) * motors.speed
+    position, clamped = motors.clamp(np.zeros(12), velocity)
+    assert clamped[2] == pytest.approx(1.09 * motors.speed[2]) and np.all(np.delete(clamped == velocity, 2))
+    assert position[2] == pytest.approx(-0.005 * (3.0 - 1.09) * motors.speed[2]) and np.count_nonzero(position) == 1
+
+
 def test_the_response_is_that_of_a_leg() -> None:
     response = leg_response(robots.get("go1"))
     assert response.shape == (3, 3) and np.all(np.diff(np.diag(response)[1:]) > 0) and response[1, 2] > 20.0
