@@ -260,7 +260,12 @@ def check(outputs: list[dict[str, Any]], name: str) -> None:
         assert any("image/png" in data for data in outputs)
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+# The tour does what the quickstart and the README do, for half a minute.
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=pytest.mark.soak if path.stem == "tour" else ()) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_notebooks_run_at_small_size(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MQE_NOTEBOOK_SMALL", "1")
     monkeypatch.chdir(tmp_path)
