@@ -185,10 +185,12 @@ def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any],
 
 
 def test_an_environment_keeps_its_parameters() -> None:
-    env = mqe_jax.make("go1gate", impl="c", control="position", gate_width=0.7, rewards={"collision": -5.0})
-    (config,), cast = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, {"robot": "go2"})
-    assert config.env == {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}, "robot": "go2"}
-    assert to_mapping(cast.eval_env.env.params) == to_mapping(env.params) | {"robot": "go2"}
+    own: dict[str, Any] = {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}}
+    env = mqe_jax.make("go1gate", impl="c", episode_length=8.0, **own)
+    changes = {"robot": "go2", "episode_length": 5.0}
+    (config,), cast = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, changes)
+    assert config.env == own | changes
+    assert to_mapping(cast.eval_env.env.params) == to_mapping(env.params) | changes
     assert cast.env.env.params.gate_width == 0.7 and cast.env.env.control == "position"
     assert build.players(env, "idle").env.params == env.params
 

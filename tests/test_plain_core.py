@@ -300,7 +300,7 @@ def test_an_ended_episode_is_replaced_whole_and_another_one_left_alone() -> None
                     np.testing.assert_array_equal(getattr(after.data, name), getattr(expected, name), err_msg=name)
             elif field.name != "key":
                 jax.tree.map(np.testing.assert_array_equal, getattr(after, field.name), expected)
-        assert after.key.tolist() != now.key.tolist()
+        assert after.key.tolist() != now.key.tolist() and float(after.assistance) == float(now.assistance)
 
 
 def test_other_agents_rows_follow_in_order() -> None:

@@ -18,7 +18,7 @@ from mqe_jax import cli
 from mqe_jax.cli import programs
 from mqe_jax.core import files, interrupts
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import remove_temporaries, replacing
+from mqe_jax.core.files import locked, remove_temporaries, replacing, write_atomically
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -63,6 +63,18 @@ def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> N
         assert [path.name for path in list_checkpoints(moved)] == ["step_000000000000.safetensors"]
         assert len((moved / "metrics.csv").read_text().splitlines()) == (3 if how == "replaced" else 2)
     assert [path.name for path in tmp_path.rglob(".*")] == [files.LOCK] * (how != "removed")  # not through the old path
+
+
+def test_a_folder_that_is_lost_while_a_file_is_written_gets_none(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with locked(folder):
+        with pytest.raises(InputError, match="run_dir"), replacing(folder / "file"):
+            replace(folder)
+        with pytest.raises(InputError, match="run_dir"):
+            write_atomically(folder / "file", b"1")
+    write_atomically(folder / "file", b"2")  # the lock has ended
+    assert (folder / "file").read_bytes() == b"2"
 
 
 @pytest.mark.usefixtures("fake_tasks")
