@@ -348,12 +348,6 @@ def test_a_policy_of_impossible_metadata(metadata: dict[str, Any], said: str, tr
         read_policy(path)
 
 
-def test_weights_that_no_network_has(tmp_path: Path) -> None:
-    layers = {"0.weight": np.full((32, 6), 1e20, np.float32), "0.bias": np.zeros(32, np.float32)}
-    with pytest.raises(InputError, match=r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed"):
-        linear_layers("weights", layers, {"0": (6, 32)})
-
-
 @pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])
 def test_steps_that_do_not_increase(steps: str, tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("env_steps,average_step_reward\n" + steps.replace("\n", ",1\n") + ",1\n")

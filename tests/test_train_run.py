@@ -22,6 +22,7 @@ from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner, start
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
