@@ -21,10 +21,14 @@ if TYPE_CHECKING:
     from mqe_jax.policies import load_policy
     from mqe_jax.runs.build import make_learner
     from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
-    from mqe_jax.runs.playing import Clip, evaluate, render
+    from mqe_jax.runs.playing import Clip, evaluate, render, tournament
+    from mqe_jax.runs.sweeping import sweep
+    from mqe_jax.runs.throughput import bench
     from mqe_jax.selfplay.opponents import versus
     from mqe_jax.train.config import TrainConfig
     from mqe_jax.train.evaluate import Result
+    from mqe_jax.walk.evaluation import evaluate_skill
+    from mqe_jax.walk.training import train_skill
 
 __version__ = "0.2.0"
 __all__ = [
@@ -36,7 +40,9 @@ __all__ = [
     "State",
     "TrainConfig",
     "VectorEnv",
+    "bench",
     "evaluate",
+    "evaluate_skill",
     "learn",
     "learn_seeds",
     "load_policy",
@@ -44,18 +50,25 @@ __all__ = [
     "make",
     "make_learner",
     "render",
+    "sweep",
     "tasks",
+    "tournament",
+    "train_skill",
     "versus",
 ]
 _LEARNING = dict.fromkeys(("Run", "learn", "learn_seeds", "load_run"), "runs.learning")
-_PLAYING = dict.fromkeys(("Clip", "evaluate", "render"), "runs.playing")
+_PLAYING = dict.fromkeys(("Clip", "evaluate", "render", "tournament"), "runs.playing")
 _HOMES = {
     **_LEARNING,
     **_PLAYING,
     "Result": "train.evaluate",
     "TrainConfig": "train.config",
+    "bench": "runs.throughput",
+    "evaluate_skill": "walk.evaluation",
     "load_policy": "policies",
     "make_learner": "runs.build",
+    "sweep": "runs.sweeping",
+    "train_skill": "walk.training",
     "versus": "selfplay.opponents",
 }
 """Modules of the names; those of the others are in `envs`."""

@@ -71,7 +71,9 @@ def test_python_blocks_run(page: str) -> None:
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("name", ["learn", "learn_seeds", "evaluate", "render", "make_learner", "load_run"])
+@pytest.mark.parametrize(
+    "name", ["bench", "evaluate", "learn", "learn_seeds", "load_run", "make_learner", "render", "sweep", "tournament"]
+)
 def test_examples_of_docstrings_run(name: str) -> None:
     text = re.sub("^    ", "", inspect.getdoc(getattr(mqe_jax, name)) or "", flags=re.MULTILINE)
     (example,) = blocks(text, "python")

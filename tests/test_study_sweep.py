@@ -154,7 +154,7 @@ def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) ->
         ("variants: {a: {env: {task: go1tug}}}\n", r"^variants\.a\.env\.task: is not a task parameter"),
         ("settings: {self: 3}\n", r"^settings\.self: unknown name"),
         ("settings: {start: none.safetensors}\n", r"^go1gate/mappo: .*none\.safetensors"),
-        (f"settings: {{start: {zoo.file_of('go1tug')}}}\n", r"^go1gate/mappo: start: .* has a policy of go1tug"),
+        (f"settings: {{start: {zoo.file_of('go1tug')}}}\n", r"^go1gate/mappo: start: .* needs task 'go1tug'"),
         (f"settings: {{start: {zoo.file_of('go1gate')}}}\n", r"^go1gate/mappo: .* with this run's network"),
         ("settings: {num_envs: 7, ppo: {minibatches: 1000}}\n", r"^go1gate/mappo: ppo\.minibatches: 1000"),
         ("settings: {opponents: [idle]}\n", r"^go1gate/mappo: opponents"),

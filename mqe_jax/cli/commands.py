@@ -202,14 +202,10 @@ class Bench(TaskOptions):
 
     def run(self) -> dict[str, Any]:
         """Measures throughput; prints a table, or returns the object for `--json`."""
-        import jax
+        from mqe_jax.runs.throughput import bench
 
-        from mqe_jax.cli import bench
-        from mqe_jax.runs import build
-
-        env, vector_env = build.make_env(self.task, self.impl, self.overrides(), self.num_envs)
-        key = jax.random.PRNGKey(self.seed)
-        result = bench.bench(env, vector_env, key, steps=self.steps, repeats=self.repeats)
+        options = {name: getattr(self, name) for name in ("impl", "num_envs", "steps", "repeats", "seed")}
+        result = bench(self.task, env=self.overrides(), **options)
         if not self.json:
             print_table(result)
         return result

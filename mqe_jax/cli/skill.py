@@ -36,25 +36,13 @@ class SkillEval:
 
     def run(self) -> dict[str, Any]:
         """Evaluates the skill; prints a table, or returns the object for `--json`."""
-
-        from mqe_jax.physics import robots
-        from mqe_jax.walk import trainees
         from mqe_jax.walk.evaluation import evaluate_skill
 
         def report(name: str, figures: Mapping[str, float]) -> None:
             echo(f"{self.skill}: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
 
-        robot = robots.get(self.robot)
-        result = evaluate_skill(
-            self.skill,
-            robot,
-            trainees.make(self.skill, robot).skill.load_params(self.weights),
-            impl=self.impl,
-            episodes=self.episodes,
-            seed=self.seed,
-            scenarios=self.scenario or None,
-            report=report,
-        )
+        options = {name: getattr(self, name) for name in ("robot", "impl", "episodes", "seed")}
+        result = evaluate_skill(self.skill, self.weights, **options, scenarios=self.scenario or None, report=report)
         if not self.json:
             print_table({name: value for name, value in result.items() if name != "scenarios"})
         return result

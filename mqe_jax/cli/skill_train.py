@@ -14,10 +14,8 @@ from mqe_jax.cli.options import Impl, Robot
 from mqe_jax.cli.train import HINT, MARKERS
 from mqe_jax.core import interrupts
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import fail, override, record
-from mqe_jax.physics import robots
+from mqe_jax.core.settings import fail, record
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.walk.network import HistorySettings
 from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import SETTINGS, train_skill
 
@@ -43,13 +41,10 @@ class SkillTrain:
 
     def run(self) -> None:
         """Trains the skill into the run folder."""
-        robot, config, run_dir = robots.get(self.robot), self.settings, self.run_dir or Path("runs") / self.skill
-        assert isinstance(config.network, HistorySettings)
-        if self.weights is not None:
-            config.network.form().networks.load(robot, self.weights)
-            config = override(config, {"network.weights": str(self.weights.resolve())})
+        run_dir = self.run_dir or Path("runs") / self.skill
+        options = {name: getattr(self, name) for name in ("robot", "weights", "impl", "resume")}
         try:
-            train_skill(self.skill, robot, run_dir, config, self.task, impl=self.impl, resume=self.resume)
+            train_skill(self.skill, run_dir, self.settings, self.task, **options)
         except KeyboardInterrupt:
             raise interrupts.Interrupted(HINT.format(run_dir)) from None
         if jax.process_index() == 0:

@@ -6,20 +6,24 @@ import base64
 import dataclasses
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
+from annotated_types import MinLen
 
 from mqe_jax.core.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
-from mqe_jax.core.settings import PathText, checked, fail
+from mqe_jax.core.settings import PathText, checked, fail, joined
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.runs import build
-from mqe_jax.runs.build import Player
+from mqe_jax.runs.build import Player, parameters_of
 from mqe_jax.runs.divergence import guard
+from mqe_jax.selfplay.league import tournament as league
 from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.selfplay.league.tournament import Standings
 from mqe_jax.train.evaluate import Result, evaluate_batch
 
 View = Literal["follow", "near", "scene", "side"]
@@ -80,6 +84,48 @@ def evaluate(
     with guard(batch, dump_diverged) as guarded:
         result = evaluate_batch(guarded, playing.policy, episodes, jax.random.PRNGKey(seed))
     return dataclasses.replace(result, about={**about, "seed": seed})
+
+
+@checked(policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed)
+def tournament(
+    task: str | QuadrupedEnv,
+    policies: Sequence[str],
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    episodes: int = 64,
+    deterministic: bool = False,
+    seed: int = 0,
+) -> Standings:
+    """Plays policies of a match against each other and rates them, as `mqe tournament`.
+
+    Example:
+        ```python
+        standings = mqe_jax.tournament("go1tug", ["go1tug", "forward"], episodes=2)
+        standings.save("runs/tournament")
+        ```
+
+    Args:
+        task: as `evaluate`, and so are env, impl, deterministic and seed.
+        policies: what `load_policy` accepts; scripted, idle and random play too. Ratings are relative to scripted, or
+            idle without it.
+        episodes: episodes of each pair on each side.
+
+    Raises:
+        InputError: as `evaluate`, and for a task of one team.
+    """
+    params = joined(parameters_of(task), env or {})
+    if isinstance(task, str):
+        params = joined(parameters_for(task, *policies), params)
+    match, _ = build.make_env(task, impl, params, 1)
+    if len(match.teams) < 2:
+        fail("task", match.name, "a match: it has one team")
+    fixed = build.anchors(match)
+    names = tuple(dict.fromkeys([*policies, *fixed]))
+    _, matches = build.make_env(task, impl, params, len(names) * episodes)
+    teams = {name: load_policy(name, matches.env, deterministic=deterministic) for name in names}
+    results = league.round_robin(matches, teams, jax.random.PRNGKey(seed))
+    return league.Standings(match.name, names, results, league.rate(results, names.index(fixed[0])))
 
 
 @checked(

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,7 +17,8 @@ from mqe_jax import walk_policy
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.limits import Environments, Seed
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import PathText, checked
+from mqe_jax.physics import robots
 from mqe_jax.physics.robots.index import Proprioception, foot_positions
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.rotation import rotate, rotate_inverse
@@ -233,19 +235,42 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
-@checked(robot=Robot, params=dict, impl=str, episodes=Environments, seed=Seed, scenarios=Sequence[str] | None)
+@checked(
+    skill=str,
+    weights=PathText | None,
+    robot=str,
+    impl=str,
+    episodes=Environments,
+    seed=Seed,
+    scenarios=Sequence[str] | None,
+)
 def evaluate_skill(
     skill: str,
-    robot: Robot,
-    params: Params,
+    weights: str | Path | None = None,
     *,
+    robot: str = "go1",
     impl: str = "auto",
     episodes: int = 1000,
     seed: int = 0,
     scenarios: Sequence[str] | None = None,
     report: Callable[[str, dict[str, float]], None] | None = None,
 ) -> dict[str, Any]:
-    """Evaluates a robot's skill in the named scenarios (all of `SCENARIOS` that fit it if None).
+    """Evaluates a skill: command tracking, disturbances, falls, energy; as `mqe skill eval`.
+
+    Example:
+        ```python
+        mqe_jax.evaluate_skill("walk", episodes=16, scenarios=["flat"])["rms_vx"]
+        ```
+
+    Args:
+        skill: name of the skill: walk or agile.
+        weights: file of the weights. Default: the shipped ones.
+        robot: name of the robot.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        episodes: episodes of each scenario, run in parallel.
+        seed: random seed.
+        scenarios: names in `SCENARIOS`. Default: all that fit the skill.
+        report: receives the name and the metrics of each scenario.
 
     Returns:
         rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under `scenarios`.
@@ -253,12 +278,14 @@ def evaluate_skill(
     Raises:
         InputError: for an unknown scenario, or an argument of another kind.
     """
+    body = robots.get(robot)
+    params = trainees.make(skill, body).skill.load_params(weights)
     known = [name for name, scenario in SCENARIOS.items() if skill in scenario.skills]
     names = known if scenarios is None else list(scenarios)
     for name in names:
         if name not in known:
             raise InputError(f"scenario: unknown name {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
-    env = make_env(skill, robot, impl, episodes)
+    env = make_env(skill, body, impl, episodes)
     results = {}
     for name in names:
         results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
@@ -268,7 +295,7 @@ def evaluate_skill(
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
         "skill": skill,
-        "robot": robot.name,
+        "robot": body.name,
         "impl": env.impl,
         "episodes": episodes,
         **{key: top[key] for key in keys if key in top},

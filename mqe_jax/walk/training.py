@@ -6,9 +6,9 @@ from pathlib import Path
 
 import jax
 
-from mqe_jax.core.settings import fail, override, to_mapping
+from mqe_jax.core.settings import PathText, checked, fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
-from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics import robots
 from mqe_jax.train.config import PPO, Checkpointing, Curriculum, Normalization, OptimizerSettings, TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.runner import train
@@ -54,26 +54,60 @@ SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {"walk": (WALK, WalkTask()),
 """Settings and task of each skill that can be trained."""
 
 
+@checked(
+    skill=str,
+    run_dir=PathText,
+    config=TrainConfig | None,
+    task=WalkTask | None,
+    robot=str,
+    weights=PathText | None,
+    impl=str,
+    resume=bool,
+)
 def train_skill(
     skill: str,
-    robot: Robot,
-    run_dir: Path,
-    config: TrainConfig,
+    run_dir: str | Path,
+    config: TrainConfig | None = None,
     task: WalkTask | None = None,
     *,
-    impl: str,
-    resume: bool,
+    robot: str = "go1",
+    weights: str | Path | None = None,
+    impl: str = "auto",
+    resume: bool = False,
 ) -> TrainState:
-    """Trains a skill's weights and writes them to SKILL.safetensors (float16) in the run folder, at every checkpoint.
+    """Trains a skill's weights, as `mqe skill train`; returns the learner's last state.
 
-    `config` and `task` are like those of `SETTINGS`; run folder, resuming and errors are those of
-    `mqe_jax.train.runner.train`.
+    Example:
+        ```python
+        mqe_jax.train_skill("agile", "runs/agile", robot="go2")
+        ```
+
+    Args:
+        skill: one of `SETTINGS`.
+        run_dir: run folder, of which SKILL.safetensors (float16) is written at every checkpoint.
+        config: settings. Default: those of `SETTINGS`.
+        task: parameters of the walking task. Default: those of `SETTINGS`.
+        robot: name of the robot.
+        weights: weights to start from; may be those of another robot. Default: from scratch.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        resume: whether to continue from the newest checkpoint in the folder, with environments reset.
+
+    Raises:
+        InputError: for a skill, settings, weights or a run folder that are not allowed.
+        NonFiniteError: as `mqe_jax.learn`.
     """
+    if skill not in SETTINGS:
+        fail("skill", skill, " or ".join(SETTINGS))
+    body, run_dir, config = robots.get(robot), Path(run_dir), config or SETTINGS[skill][0]
     if config.opponents:
         fail("opponents", list(config.opponents), "empty: walking is not a match")
     network = config.network
-    assert isinstance(network, HistorySettings)
-    env = WalkEnv(robot, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs)
+    if not isinstance(network, HistorySettings):
+        fail("network.name", network.name, SETTINGS[skill][0].network.name)
+    if weights is not None:
+        network.form().networks.load(body, weights)
+        config = override(config, {"network.weights": str(Path(weights).resolve())})
+    env = WalkEnv(body, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs)
     config = override(config, {"env": {"control": env.control, **to_mapping(env.params)}})
 
     def save(state: TrainState, row: dict[str, float]) -> None:
@@ -81,8 +115,8 @@ def train_skill(
         if jax.process_index() > 0:
             return
         if updates % config.checkpoint.every == 0 or updates == config.num_updates:
-            about = {"robot": robot.name, "env_steps": int(row["env_steps"])}
-            weights = run_dir / f"{skill}.safetensors"
-            network.form().networks.save(state.params["policy"], weights, about, half=True)
+            about = {"robot": body.name, "env_steps": int(row["env_steps"])}
+            file = run_dir / f"{skill}.safetensors"
+            network.form().networks.save(state.params["policy"], file, about, half=True)
 
     return train(VectorEnv(env, config.num_envs), config, run_dir, resume, on_update=save)

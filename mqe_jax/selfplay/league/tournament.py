@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import itertools
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from mqe_jax.core.files import replacing, write_atomically
 from mqe_jax.core.limits import NonNegativeInt
-from mqe_jax.core.literal import to_label
+from mqe_jax.core.literal import line, to_label
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, checked, fail
 from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
@@ -128,22 +129,51 @@ def _strengths(points: Array, anchor: int) -> Array:
     return _POINTS * np.log(strength)
 
 
-@checked(folder=PathText, names=Sequence[str], results=Results)
-def save(folder: Path, names: Sequence[str], results: NDArray[np.int64], ratings: Ratings) -> None:
-    """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
-    if not isinstance(ratings, Ratings):
-        fail("ratings", ratings, "those of rate")
-    if [np.shape(values) for values in ratings] != [(len(results),)] * 3:
-        fail("ratings", ratings, f"those of the {len(results)} policies")
-    if len(names) != len(results):
-        fail("names", names, f"one for each of the {len(results)} policies")
-    folder, text = Path(folder), io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("team0", "team1", *RESULTS, "rating_of_team0", "low", "high"))
-    for i, j in itertools.product(range(len(names)), repeat=2):
-        writer.writerow((names[i], names[j], *results[i, j], *(f"{x[i]:.1f}" for x in ratings)))
-    write_atomically(folder / CSV, text.getvalue().encode())
-    _draw(names, results, folder / PICTURE)
+@dataclasses.dataclass(frozen=True, repr=False)
+class Standings:
+    """The results of a tournament of P policies; as text, a table with the strongest first."""
+
+    task: str
+    """Id of the match."""
+    policies: tuple[str, ...]
+    """Names of the policies."""
+    results: NDArray[np.int64]
+    """Outcomes of each policy as team 0 against each (P, P, 3), as of `round_robin`."""
+    ratings: Ratings
+    """Ratings, relative to one of them."""
+
+    def __repr__(self) -> str:
+        points, games = scores(self.results), np.maximum(self.results.sum(axis=-1) + self.results.sum(axis=-1).T, 1)
+        lines = [f"{'policy':<32} rating (95% interval); points of 100 games against each, in the same order"]
+        for i in self._order:
+            row = " ".join(f"{100 * points[i, j] / games[i, j]:4.0f}" if i != j else "    " for j in self._order)
+            low, value, high = (x[i] for x in (self.ratings.low, self.ratings.value, self.ratings.high))
+            lines.append(f"{line(self.policies[i]):<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the results as JSON can represent them, ratings with the strongest first."""
+        rows = [
+            {"policy": self.policies[i], **{name: float(x[i]) for name, x in self.ratings._asdict().items()}}
+            for i in self._order
+        ]
+        return {"task": self.task, "ratings": rows, "policies": [*self.policies], "results": self.results.tolist()}
+
+    @checked(folder=PathText)
+    def save(self, folder: str | Path) -> None:
+        """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
+        folder, text = Path(folder), io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(("team0", "team1", *RESULTS, "rating_of_team0", "low", "high"))
+        for i, j in itertools.product(range(len(self.policies)), repeat=2):
+            names = self.policies[i], self.policies[j]
+            writer.writerow((*names, *self.results[i, j], *(f"{x[i]:.1f}" for x in self.ratings)))
+        write_atomically(folder / CSV, text.getvalue().encode())
+        _draw(self.policies, self.results, folder / PICTURE)
+
+    @property
+    def _order(self) -> list[int]:
+        return np.argsort(-self.ratings.value, kind="stable").tolist()
 
 
 def _draw(names: Sequence[str], results: NDArray[np.int64], path: Path) -> None:

@@ -1,17 +1,20 @@
-"""Throughput in environment steps per second: with walk policy and resets, and for physics alone."""
+"""Throughput in environment steps per second: of whole steps with skill and resets, and of physics alone."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from statistics import median
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core.limits import Environments, Horizon, Seed
+from mqe_jax.core.settings import checked, joined
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
+from mqe_jax.runs import build
 
 WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
 
@@ -55,31 +58,58 @@ def programs(
     )
 
 
+@checked(num_envs=Environments, steps=Horizon, repeats=Horizon, seed=Seed)
 def bench(
-    env: QuadrupedEnv, vector_env: VectorEnv, key: jax.Array, *, steps: int = 50, repeats: int = 10
+    task: str | QuadrupedEnv,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    num_envs: int = 256,
+    steps: int = 50,
+    repeats: int = 10,
+    seed: int = 0,
 ) -> dict[str, str | int | float]:
-    """Measures one task on one engine.
+    """Measures throughput in environment steps per second, as `mqe bench`.
 
-    An environment step is one step of one environment. `env_steps_per_s` includes everything: control, walk policy,
-    physics steps, observations, rewards and automatic resets, under random actions sampled inside the same scan.
-    `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without policy, reward
-    and resets. Both are medians of `repeats` calls after `WARM_UP` ones; `slowest` and `fastest` are the range of the
-    former. `compile_s` is the first call minus the median call. `overflow` counts the environment steps of one call
-    in which the engine may have dropped contacts or constraints.
+    An environment step is one step of one environment. `env_steps_per_s` includes everything: control, skill, physics
+    steps, observations, rewards and automatic resets, under random actions sampled inside the same scan.
+    `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without skill, reward
+    and resets. Both are medians; `slowest` and `fastest` are the range of the former. `compile_s` is the first call
+    minus the median call. `overflow` counts the environment steps of one call in which the engine may have dropped
+    contacts or constraints.
+
+    Example:
+        ```python
+        mqe_jax.bench("go1gate", num_envs=64, repeats=3)["env_steps_per_s"]
+        ```
+
+    Args:
+        task: id, or environment.
+        env: task parameters.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        num_envs: environments in parallel.
+        steps: environment steps of each timed call.
+        repeats: timed calls, after `WARM_UP` more.
+        seed: random seed.
+
+    Raises:
+        InputError: for a task or parameters that are not allowed.
     """
-    whole, bare = programs(env, vector_env, steps, lambda state: jnp.sum(state.metrics["overflow"]))
-    count, state = vector_env.num_envs, jax.block_until_ready(jax.jit(vector_env.reset)(key))
+    made, batch = build.make_env(task, impl, joined(build.parameters_of(task), env or {}), num_envs)
+    whole, bare = programs(made, batch, steps, lambda state: jnp.sum(state.metrics["overflow"]))
+    key = jax.random.PRNGKey(seed)
+    state = jax.block_until_ready(jax.jit(batch.reset)(key))
     walk = jax.jit(lambda carry: whole(carry[0]))
     first, full_s, (_, overflow) = timed(walk, ((state, key), jnp.zeros(steps)), repeats)
     _, bare_s, _ = timed(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
-    full_rate, bare_rate = count * steps / median(full_s), count * steps / median(bare_s)
+    full_rate, bare_rate = num_envs * steps / median(full_s), num_envs * steps / median(bare_s)
     return {
-        "task": vector_env.name,
-        "impl": env.physics.impl,
-        "num_envs": count,
+        "task": batch.name,
+        "impl": made.physics.impl,
+        "num_envs": num_envs,
         "env_steps_per_s": round(full_rate, 1),
-        "slowest": round(count * steps / max(full_s), 1),
-        "fastest": round(count * steps / min(full_s), 1),
+        "slowest": round(num_envs * steps / max(full_s), 1),
+        "fastest": round(num_envs * steps / min(full_s), 1),
         "bare_env_steps_per_s": round(bare_rate, 1),
         "ratio": round(full_rate / bare_rate, 4),
         "compile_s": round(max(first - median(full_s), 0.0), 2),

@@ -1,0 +1,133 @@
+"""A sweep by one call: many trainings in one folder, and their report."""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mqe_jax.core.errors import InputError, NonFiniteError, one_line
+from mqe_jax.core.limits import Positive, Seed
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import PathText, checked
+from mqe_jax.envs.registry import task_id
+from mqe_jax.runs import build
+from mqe_jax.runs.presets import base_config
+from mqe_jax.study import report as reports
+from mqe_jax.study import sweep as sweeps
+from mqe_jax.study.sweep import Job, load_sweep
+from mqe_jax.train.config import TrainConfig
+
+
+@checked(
+    file=PathText,
+    folder=PathText,
+    part=str | None,
+    cells=Sequence[str],
+    seeds=Sequence[Seed],
+    time_limit=Positive | None,
+    impl=str,
+    dry_run=bool,
+)
+def sweep(
+    file: str | Path,
+    folder: str | Path,
+    *,
+    part: str | None = None,
+    cells: Sequence[str] = (),
+    seeds: Sequence[int] = (),
+    time_limit: float | None = None,
+    impl: str = "auto",
+    dry_run: bool = False,
+) -> dict[str, Any]:
+    """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe sweep`.
+
+    Another call resumes what was interrupted.
+
+    Example:
+        ```python
+        from pathlib import Path
+
+        Path("gate.yaml").write_text("{tasks: [go1gate], seeds: [0, 1]}")
+        left = mqe_jax.sweep("gate.yaml", "runs/gates", dry_run=True)["left"]
+        ```
+
+    Args:
+        file: YAML file with the fields of `mqe_jax.study.sweep.Sweep`.
+        folder: folder of the sweep; runs go into runs/, the report into report/.
+        part: name of one sweep in a file that maps names to sweeps.
+        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT]. Default: all.
+        seeds: seeds to train. Default: all.
+        time_limit: time after which the training in progress is saved and the sweep ends, min. Default: none.
+        impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
+        dry_run: whether nothing is trained.
+
+    Returns:
+        `left`: the remaining trainings, `jobs`, and their `steps_left` and estimated `seconds`; `report`: files.
+
+    Raises:
+        InputError: for a file, a cell, a seed or a folder that is not allowed, or after all if trainings failed.
+        NonFiniteError: after all, if the first that failed became non-finite.
+    """
+    settings, folder, began = load_sweep(Path(file), part), Path(folder), time.monotonic()
+    for task in settings.tasks:
+        task_id(task)
+
+    def config_of(task: str, algorithm: str) -> TrainConfig:
+        name = settings.config and settings.config.replace("{task}", task)
+        return build.for_task(base_config(task, name, None if algorithm == "default" else algorithm), task)
+
+    def stop() -> bool:
+        return time_limit is not None and time.monotonic() - began > 60.0 * time_limit
+
+    sweeps.prepare(settings, folder, write=False)
+    check = functools.partial(build.check_start, impl=impl)
+    jobs = sweeps.plan(settings, folder, config_of, cells, seeds, check)
+    if dry_run:
+        return {"left": _estimate(folder, jobs), "report": []}
+    sweeps.prepare(settings, folder)
+    make = functools.partial(build.environments, impl)
+    others, failed = sweeps.run(folder, jobs, make, on_failure=_report_failure, stop=stop)
+    if others:
+        echo(f"mqe: skipped, in use by other processes: {_names(others)}")
+    if stop():
+        echo(f"mqe: time limit of {time_limit:g} min; the same command resumes")
+    left = sweeps.plan(settings, folder, config_of, cells, seeds)
+    files = reports.report(folder) if not jobs or len(left) < len(jobs) else []
+    if files:
+        echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
+    if failed:
+        kind = NonFiniteError if isinstance(failed[0][1], NonFiniteError) else InputError
+        names = _names([job for job, _ in failed])
+        raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {names}")
+    return {"left": _estimate(folder, left), "report": [str(file) for file in files]}
+
+
+def _names(jobs: Sequence[Job]) -> str:
+    return ", ".join(job.cell.path.as_posix() for job in jobs)
+
+
+def _report_failure(job: Job, error: Exception) -> None:
+    echo(f"mqe: {_names([job])} failed: {one_line(error)}")
+
+
+def _estimate(folder: Path, jobs: Sequence[Job]) -> dict[str, Any]:
+    """Returns the remaining jobs of a sweep and their estimated times, one row per job, plus totals."""
+    seconds = sweeps.estimate(folder, jobs)
+    rows = [
+        {
+            "task": job.cell.task,
+            "algorithm": job.cell.algorithm,
+            "variant": job.cell.variant,
+            "seeds": [config.seed for config in job.configs],
+            "steps_left": job.steps_left,
+            "seconds": None if math.isnan(s) else round(s),
+        }
+        for job, s in zip(jobs, seconds, strict=True)
+    ]
+    total = sum(seconds)
+    steps = sum(job.steps_left for job in jobs)
+    return {"jobs": rows, "steps_left": steps, "seconds": None if math.isnan(total) else round(total)}
