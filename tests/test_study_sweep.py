@@ -69,9 +69,9 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
 
     jobs[0].folders[1].mkdir(parents=True)
     with locked(jobs[0].folders[1]):
-        assert sweeps.run(folder, jobs, environments) == (jobs[:1], [])
+        assert sweeps.run(jobs, environments) == (jobs[:1], [])
     assert trained == ["joint"]
-    assert sweeps.run(folder, jobs, environments) == ([], [])
+    assert sweeps.run(jobs, environments) == ([], [])
     assert trained == ["joint", "dimension"]
     assert sweeps.plan(sweep, folder, config_of) == []
 
@@ -82,11 +82,11 @@ def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) ->
     sweeps.prepare(sweep, folder)
     asked = iter([False, False, False, True, True])
     jobs = sweeps.plan(sweep, folder, config_of)
-    assert sweeps.run(folder, jobs, lambda config, seeds: Cast(PROBE, PROBE), stop=lambda: next(asked)) == ([], [])
+    assert sweeps.run(jobs, lambda config, seeds: Cast(PROBE, PROBE), stop=lambda: next(asked)) == ([], [])
     shutil.copytree(folder, there)
     left = sweeps.plan(sweep, there, config_of)
     assert [job.steps_left for job in left] == [32]
-    assert sweeps.run(there, left, lambda config, seeds: Cast(PROBE, PROBE)) == ([], [])
+    assert sweeps.run(left, lambda config, seeds: Cast(PROBE, PROBE)) == ([], [])
     for run in read_runs(there):
         assert list(run.curve["env_steps"]) == [16, 32, 48] and len(run.evaluations) == 2
 

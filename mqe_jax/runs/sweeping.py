@@ -90,7 +90,7 @@ def sweep(
         return {"left": _estimate(folder, jobs), "report": []}
     sweeps.prepare(settings, folder)
     make = functools.partial(build.environments, impl)
-    others, failed = sweeps.run(folder, jobs, make, on_failure=_report_failure, stop=stop)
+    others, failed = sweeps.run(jobs, make, on_failure=_report_failure, stop=stop)
     if others:
         echo(f"mqe: skipped, in use by other processes: {_names(others)}")
     if stop():

@@ -29,7 +29,7 @@ from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_folders
-from mqe_jax.train.runner import OnUpdate, train_seeds
+from mqe_jax.train.runner import train_seeds
 
 SWEEP_FILE = "sweep.yaml"
 
@@ -245,10 +245,8 @@ class Outcome(NamedTuple):
 
 
 def run(
-    folder: Path,
     jobs: Sequence[Job],
     environments: Environments,
-    on_update: OnUpdate | None = None,
     on_failure: Callable[[Job, Exception], object] = lambda job, error: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Outcome:
@@ -265,7 +263,7 @@ def run(
         if stop():
             break
         try:
-            _train(job, environments, on_update, stop)
+            _train(job, environments, stop)
         except InUseError:
             outcome.others.append(job)
         except (InputError, OSError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
@@ -274,7 +272,7 @@ def run(
     return outcome
 
 
-def _train(job: Job, environments: Environments, on_update: OnUpdate | None, stop: Callable[[], bool]) -> None:
+def _train(job: Job, environments: Environments, stop: Callable[[], bool]) -> None:
     """Trains a job, if no other process has finished it since the jobs were planned."""
     if all(map(finished, job.folders)):
         return
@@ -283,6 +281,4 @@ def _train(job: Job, environments: Environments, on_update: OnUpdate | None, sto
             locks.enter_context(making(run_dir))
             locks.enter_context(locked(run_dir))
     cast = environments(job.configs[0], len(job.configs))
-    train_seeds(
-        configs=job.configs, run_dirs=job.folders, resume=True, on_update=on_update, stop=stop, **cast._asdict()
-    )
+    train_seeds(configs=job.configs, run_dirs=job.folders, resume=True, stop=stop, **cast._asdict())
