@@ -77,18 +77,51 @@ def test_brax_wrap_names_what_it_does_not_take() -> None:
         brax.wrap(type("Foreign", (), {"unwrapped": object()})())  # type: ignore[arg-type]
 
 
-def test_brax_action_of_another_size_is_named() -> None:
-    env = adapter("brax").Env(task_env("go1gate"))
-    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    with pytest.raises(InputError, match=rf"action: shape \(3,\); expected \({env.action_size},\)"):
-        jax.eval_shape(env.step, state, jnp.zeros(3))
+def test_brax_names_wrong_arguments() -> None:
+    brax, key = adapter("brax"), jax.random.PRNGKey(0)
+    env = brax.Env(task_env("go1gate"))
+    wrapped, state = brax.wrap(env), jax.eval_shape(env.reset, key)
+    states = jax.eval_shape(wrapped.reset, jax.random.split(key, COUNT))
+    for name, call in {
+        rf"action: shape \(3,\); expected \({env.action_size},\)": lambda: jax.eval_shape(
+            env.step, state, jnp.zeros(3)
+        ),
+        "rng: 3 is not allowed": lambda: wrapped.reset(3),
+        "rng: .* a random key for each environment": lambda: wrapped.reset(key),
+        "state: None is not allowed": lambda: wrapped.step(None, jnp.zeros((COUNT, 6))),
+        r"action: shape \(6,\); expected \(3, 6\)": lambda: jax.eval_shape(wrapped.step, states, jnp.zeros(6)),
+    }.items():
+        with pytest.raises(InputError, match=name):
+            call()
 
 
-def test_jaxmarl_missing_agent_is_named() -> None:
-    env = adapter("jaxmarl").Env(task_env("go1gate"))
-    _, state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    with pytest.raises(InputError, match=GIVEN):
-        jax.eval_shape(env.step, jax.random.PRNGKey(1), state, {"robot_0": jnp.zeros(3)})
+def test_jaxmarl_names_wrong_arguments() -> None:
+    """Also a batch in place of one state, and integers that are no discrete action."""
+    jaxmarl, key = adapter("jaxmarl"), jax.random.PRNGKey(0)
+    env, discrete = (jaxmarl.Env(task_env("go1gate"), discrete=wanted) for wanted in (False, True))
+    _, state = env.reset(key)
+    batch: Any = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    some = {"robot_0": jnp.zeros(3), "robot_1": jnp.zeros(3)}
+    for name, call in {
+        "key: 3": lambda: env.reset(3),
+        "key: None": lambda: env.step(None, state, some),
+        "state: of type int": lambda: env.step(key, 3, some),
+        r"state: one with qpos \(2, 38\)": lambda: env.step(key, state, some, batch),
+        "actions: 3": lambda: env.step(key, state, 3),
+        GIVEN: lambda: env.step(key, state, {"robot_0": jnp.zeros(3)}),
+        "actions.robot_1: None .* 3 numbers": lambda: env.step(key, state, {**some, "robot_1": None}),
+        r"actions.robot_0: .* 3 numbers": lambda: env.step_env(key, state, {**some, "robot_0": jnp.zeros(4)}),
+        "actions.robot_1: 7 .* an integer below 7": lambda: discrete.step(key, state, {"robot_0": 0, "robot_1": 7}),
+        "actions.robot_0: -1 ": lambda: discrete.step(key, state, {"robot_0": -1, "robot_1": 0}),
+        "actions.robot_1: 0.5 ": lambda: discrete.step(key, state, {"robot_0": 0, "robot_1": 0.5}),
+        "state: of type NoneType": lambda: env.get_obs(None),
+        "state: one with qpos": lambda: env.get_world_state(batch),
+        "state: 3": lambda: env.get_avail_actions(3),
+        "agent: 'robot_2'": lambda: env.action_space("robot_2"),
+        r"agent: \[\]": lambda: env.observation_space([]),
+    }.items():
+        with pytest.raises(InputError, match=name):
+            call()
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import mqe_jax
-from mqe_jax import load_policy
+from mqe_jax import load_policy, skills
 from mqe_jax.adapters import gymnasium
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.arguments import parse
@@ -30,6 +31,7 @@ from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
+from mqe_jax.policies import all_agents
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league import tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
@@ -38,7 +40,10 @@ from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
+from mqe_jax.train.learner import make_learner
+from mqe_jax.train.needs import needs_of
+from mqe_jax.train.networks import register_network
+from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy, save_policy
 from mqe_jax.train.runner import train
 from mqe_jax.viz import clips, curves, recording, render
 from mqe_jax.walk.torchscript import read_torchscript
@@ -66,7 +71,7 @@ def made() -> dict[str, Any]:
         "task": task, "state": state, "match": match, "fake": fake, "batch": fake_env.FakeVectorEnv(fake, 2),
         "config": config, "matches": matches, "team": team, "states": jax.eval_shape(matches.reset, KEY),
         "other": jax.eval_shape(match.reset, KEY), "teams": jax.eval_shape(team.reset, KEY),
-        "episode": recording.Episode(*poses, dt=0.02),
+        "episode": recording.Episode(*poses, dt=0.02), "idle": load_policy("idle", match),
         "gif": Path("a.gif"), "long": recording.Episode(*(np.zeros((99, *pose.shape[1:])) for pose in poses), dt=0.02),
         "act": lambda obs, memory, key: (jnp.zeros((*obs.shape[:2], 3)), memory),
     }  # fmt: skip
@@ -86,7 +91,12 @@ def _render(x: Any, **options: Any) -> Any:
     )
 
 
-READERS = (load_yaml, read_torchscript, load_recording)
+def _save(**options: Any) -> None:
+    save_tree(**{"path": "a", "tree": {}, "metadata": {}, "kind": "policy", **options})
+
+
+READERS = (load_yaml, read_torchscript)
+FILES = ((load_policy, "/dev/zero"), *product((*READERS, load_recording), ("/", "/dev/zero")))
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("task: ", lambda x, v: make(v), (3, [], None)),
     ("impl: ", lambda x, v: make("go1gate", impl=v), (3, [])),
@@ -113,9 +123,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
     ("source: ", lambda x, v: mqe_jax.load_policy(v), (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)),
     ("env: ", lambda x, v: mqe_jax.load_policy("scripted", v), ("go1gate",)),
-    ("not a regular file", lambda x, v: mqe_jax.load_policy("/dev/zero"), (None,)),
-    ("opponents", lambda x, v: versus(x["matches"], v), ([], 3, [3], None, [dict], ["idle", fake_env])),
-    ("opponents", lambda x, v: versus(x["matches"], v), ({"idle"},)),
+    ("opponents", lambda x, v: versus(x["matches"], v), ([], 3, [3], None, [dict], ["idle", fake_env], {"idle"})),
     ("key: ", lambda x, v: x["team"].reset(v), (3, None)),
     ("state: ", lambda x, v: x["team"].step(x.get(v, v), np.zeros((2, 1, 12))), (None, 3, "state", "states")),
     ("state: ", lambda x, v: x["team"].change(x.get(v, v), 0, v), (None, 3, "state", "states")),
@@ -130,6 +138,10 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("num_envs: ", lambda x, v: x["task"].with_num_envs(v), (0, None, True, "x")),
     ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
     ("obs: ", lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY), (None, "x", np.zeros((2, 1, 9)), 3)),
+    ("obs: ", lambda x, v: all_agents(x["match"], x["idle"]).act(v, ((), ()), KEY), (None, np.zeros((2, 1, 10)))),
+    ("key: ", lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), ((), ()), v), (None, 3)),
+    ("memory: ", lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), v, KEY), (None, ())),
+    ("num_envs: ", lambda x, v: x["idle"].initial_memory(v), (0, NAN, "x")),
     ("key: ", lambda x, v: load_policy("random", x["match"]).act(jnp.zeros((2, 1, 10)), (), v), (None, 3, "x")),
     ("needs: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), needs=v), (None, (1, 2, 3))),
     ("config: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), config=v), (None, {})),
@@ -164,6 +176,8 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("cells", lambda x, v: mqe_jax.sweep("a.yaml", "runs/a", cells=v), (None, 3, [3])),
     ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones((2, 2)), np.full((2, 2, 3), NAN))),
     ("match: ", lambda x, v: TeamEnv(x.get(v, v), "idle"), (None, 3, "matches")),
+    ("key: ", lambda x, v: TeamEnv(x["match"], "idle").reset(v), (None, 3)),
+    ("assistance: ", lambda x, v: TeamEnv(x["match"], "idle").reset(KEY, v), LEVELS),
     ("state: ", lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))), (None, "state")),
     ("env: ", lambda x, v: recording.record(x.get(v, v), x["act"], KEY), (None, 3, "matches")),
     ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
@@ -178,8 +192,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("episodes: ", lambda x, v: _record(x, episodes=v), (0, NAN, 1.5, 10**8)),
     ("seconds: ", lambda x, v: _record(x, seconds=v), (0, NAN, math.inf, -1, 1e-9, "x")),
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
-    ("key: ", lambda x, v: _record(x, key=7), (None,)),
-    ("policy: ", lambda x, v: _record(x, act=3), (None,)),
+    ("key: ", lambda x, v: _record(x, v), (None, 7)),
     ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (v, memory)), (None, np.zeros((1, 2, 4)))),
     ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (np.zeros((1, 2, 3)), v)), (3, None, [])),
     ("episodes: ", lambda x, v: recording.best([]), (None,)),
@@ -208,10 +221,21 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([v]), 25), ("x", KEY, np.zeros((0, 8, 3), np.uint8))),
     ("frames: ", lambda x, v: clips.write_clip(x["gif"], v, 25), (None, 3, [FRAME, FRAME[:8]])),
     ("fps: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32, 3), np.uint8)]), 0), (None,)),
+    ("env: ", lambda x, v: needs_of(v, x["config"]), (None, "task")),
+    ("processes: ", lambda x, v: make_learner(x["batch"], x["config"], processes=v), (None, 0, "x")),
+    ("key: ", lambda x, v: make_learner(x["batch"], x["config"]).init(v), (None, 3)),
+    ("state: ", lambda x, v: make_learner(x["batch"], x["config"]).update(v), (None, 3)),
+    ("state: ", lambda x, v: policy_of(v, x["batch"], x["config"]), (None, {})),
+    ("name: ", lambda x, v: register_network(v), (None, 3)),
+    ("network: ", lambda x, v: register_network("x")(v), (None, 3, dict)),
+    ("skill: ", lambda x, v: skills.register(x.get(v, v)), (None, Path, "task")),
+    *((name, lambda x, v, name=name: _save(**{name: v}), ([], {"a": KEY})) for name in ("path", "metadata", "kind")),
+    ("tree: ", lambda x, v: _save(tree={"a": v}), ("x", object(), [b"a"])),
+    ("kind: ", lambda x, v: load_tree("a", {}, kind=v), (None, "x", [])),
+    ("autoreset_mode: ", lambda x, v: gymnasium.VectorEnv("go1plane", autoreset_mode=v), ("x", None, np.zeros((9, 2)))),
     ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
-    ("path: ", lambda x, v: load_config(v), (None, 3)),
     ("TrainConfig: ", lambda x, v: build(TrainConfig, v), (None, [1], "x")),
     ("policy: ", lambda x, v: read_policy(v), (None, 3, "\0")),
     ("num_envs: ", lambda x, v: gymnasium.VectorEnv("go1plane", v, impl="c"), (0, NAN, 1.5, True, None, 10**12)),
@@ -222,11 +246,10 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("unknown name", lambda x, v: build(TrainConfig, {v: 1}), ("", 3, b"a", "a" * 100, "\0")),
     ("ppo: ", lambda x, v: override(TrainConfig(), {"ppo": v}), (3, "x", [], None)),
     ("unknown name", lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}), ("self", "__dataclass_self__", "init")),
-    ("path: ", lambda x, v: load_yaml(v), (None, 3, "", "\0", [])),
-    ("path: ", lambda x, v: read_torchscript(v), (None, 3, {}, [])),
+    ("path: ", lambda x, v: v[0](v[1]), tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0")))),
     ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
     ("name: ", lambda x, v: robots.get(v), (None, 3, {}, [])),
-    *(("not a regular file", lambda x, v, read=read: read(v), ("/", "/dev/zero")) for read in READERS),
+    ("not a regular file", lambda x, v: v[0](v[1]), FILES),
 ]  # fmt: skip
 
 
@@ -276,8 +299,7 @@ def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeyp
         train(batch, config, "run")
 
 
-LONGEST = 1200
-"""Characters of a message: what is allowed may be a list of names."""
+LONGEST = 1200  # characters of a message: what is allowed may be a list of names
 
 
 @contextlib.contextmanager

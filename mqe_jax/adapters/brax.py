@@ -24,6 +24,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, checked
+from mqe_jax.core.types import RandomKeys
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
@@ -121,6 +122,7 @@ class AutoReset(Wrapper):
     """
 
     @single
+    @checked(rng=RandomKeys)
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode in each environment."""
         return self.env.reset(rng)
@@ -128,6 +130,11 @@ class AutoReset(Wrapper):
     @single
     def step(self, state: State, action: jax.Array) -> State:
         """Steps the batch, then resets the environments whose episodes ended."""
+        shape = (*jnp.shape(check("state", state, State).done), self.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(
+                f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents * action size)"
+            )
         info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}
         cleared = state.replace(done=jnp.zeros_like(state.done), info=info)  # pyright: ignore[reportAttributeAccessIssue]
         after = self.env.step(cleared, action)

@@ -115,9 +115,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            allowed = ", ".join(mode.value for mode in AutoresetMode)
-            raise InputError(f"autoreset_mode: {autoreset_mode!r}; allowed: {allowed}") from None
+        except Exception:  # also of the `repr` of a value, which Gymnasium writes
+            fail("autoreset_mode", autoreset_mode, f"one of {', '.join(mode.value for mode in AutoresetMode)}")
         self.render_mode = render_mode
         num_envs = check("num_envs", num_envs, Environments)
         if not isinstance(task, QuadrupedEnv):

@@ -5,10 +5,11 @@ Importing this module adds every task, under its id, to `jaxmarl.make` and `jaxm
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError, shown
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
@@ -95,16 +96,18 @@ class Env(MultiAgentEnv):
         """Agents of each team."""
         return {f"team_{i}": [self.agents[j] for j in team] for i, team in enumerate(self.env.teams)}
 
+    @checked(key=RandomKey)
     @functools.partial(jax.jit, static_argnums=0)
     @single
-    def reset(self, key: jax.Array) -> tuple[Arrays, State]:
+    def reset(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self, key: jax.Array
+    ) -> tuple[Arrays, State]:
         """Starts an episode."""
         state = self.env.reset(key)
         return self.get_obs(state), state
 
-    @functools.partial(jax.jit, static_argnums=0)
-    @single
-    def step(  # pyright: ignore[reportIncompatibleMethodOverride]
+    @checked(key=RandomKey, actions=Mapping)
+    def step(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None = None
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step and resets an ended environment, to `reset_state` where it is given.
@@ -112,6 +115,14 @@ class Env(MultiAgentEnv):
         Replaces the base class's step, which selects between whole states: Warp's contact buffers are shared by all
         environments and cannot be selected.
         """
+        for one in (state, reset_state):
+            if one is not None:
+                self.env.check_state(one)
+        return self._step(key, state, self._checked(actions), reset_state)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    @single
+    def _step(self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None) -> Any:
         _, after, rewards, dones, infos = self.step_env(key, state, actions)
         task: Any = self.env
         if reset_state is None:
@@ -126,9 +137,7 @@ class Env(MultiAgentEnv):
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step without a reset; the key replaces the state's own random key."""
-        if not set(self.agents) <= set(actions):
-            raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
-        action = jnp.stack([self._continuous(actions[agent]) for agent in self.agents])
+        action = jnp.stack([self._continuous(action) for action in self._checked(actions).values()])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated
         values = {"truncation": after.truncated.astype(jnp.float32), **info_of(after)}
@@ -138,21 +147,51 @@ class Env(MultiAgentEnv):
 
     def get_obs(self, state: State) -> Arrays:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Returns the agents' observations (O,)."""
+        self.env.check_state(state)
         return {agent: state.obs[i] for i, agent in enumerate(self.agents)}
 
+    @checked(state=State)
     @functools.partial(jax.jit, static_argnums=0)
-    def get_avail_actions(self, state: State) -> Arrays:
+    def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self, state: State
+    ) -> Arrays:
         """Returns all true, (action_size,) bool or one per discrete action: all are always available."""
         size = self.env.action_size if self.action_table is None else len(self.action_table)
         return {agent: jnp.ones(size, bool) for agent in self.agents}
 
     def get_world_state(self, state: State) -> jax.Array:
         """Returns the privileged observation (P,), for centralised critics."""
+        self.env.check_state(state)
         return state.privileged_obs
 
     def world_state_size(self) -> int:
         """Returns its length P."""
         return self.env.privileged_observation_size
+
+    def observation_space(self, agent: str) -> Box:
+        """Returns the space of an agent's observation (O,)."""
+        return self.observation_spaces[check("agent", agent, Literal[tuple(self.agents)])]
+
+    def action_space(self, agent: str) -> Any:
+        """Returns the space of an agent's action."""
+        return self.action_spaces[check("agent", agent, Literal[tuple(self.agents)])]
+
+    def _checked(self, actions: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the agents' actions in their order; InputError if one is missing or of another kind."""
+        if not set(self.agents) <= set(actions):
+            raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
+        count, size = len(self.action_table) if self.action_table is not None else 0, self.env.action_size
+        shapes, kind = ([(), (1,)], jnp.integer) if count else ([(size,)], jnp.number)
+        arrays = {}
+        for agent in self.agents:
+            with contextlib.suppress(TypeError, ValueError, OverflowError):
+                arrays[agent] = action = jnp.asarray(actions[agent])
+                known = isinstance(actions[agent], int | np.integer | np.ndarray)  # without waiting for a device
+                outside = count and known and not 0 <= int(actions[agent]) < count
+                if action.shape in shapes and jnp.issubdtype(action.dtype, kind) and not outside:
+                    continue
+            fail(f"actions.{agent}", actions[agent], f"an integer below {count}" if count else f"{size} numbers")
+        return arrays
 
     def _continuous(self, action: jax.Array) -> jax.Array:
         """Returns the action (action_size,) of an integer () or (1,), or a continuous action unchanged."""

@@ -16,7 +16,7 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, checked
-from mqe_jax.core.types import AnySingle, Memory
+from mqe_jax.core.types import AnySingle, Level, Memory, RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.state import with_final
 from mqe_jax.policies import SimplePolicy, load_as
@@ -107,6 +107,7 @@ class TeamEnv:
         return larger
 
     @single
+    @checked(key=RandomKey, assistance=Level)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
         """Returns a randomised initial state; see `QuadrupedEnv.reset`."""
         return with_final(self.observed(self.begin(key, assistance)))

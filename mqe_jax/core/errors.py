@@ -23,6 +23,9 @@ class InputError(ValueError):
     Any other exception is a defect of the program and keeps its traceback.
     """
 
+    def __init__(self, message: object) -> None:
+        super().__init__(line(message))
+
 
 class InUseError(InputError):
     """A folder that another process has locked."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -31,6 +32,14 @@ def _key(value: Any) -> Any:
             f"a random key, such as jax.random.PRNGKey(0); a raw one of {generator()} is {raw.shape} uint32"
         )
     return value
+
+
+def _keys(value: Any) -> Any:
+    with contextlib.suppress(ValueError, IndexError):
+        if isinstance(value, jax.Array | np.ndarray):
+            _key(value[0])
+            return value
+    raise ValueError("a random key for each environment, such as jax.random.split(key, 64)")
 
 
 def generator() -> str:
@@ -86,6 +95,8 @@ def _policy(value: Any) -> Any:
 
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
 """Kind of an argument that is a random key (see `mqe_jax.core.settings.checked`)."""
+RandomKeys = Annotated[Any, pydantic.AfterValidator(_keys)]
+"""Kind of an argument that holds a random key for each environment of a batch."""
 Level = Annotated[Any, pydantic.AfterValidator(_level)]
 """Kind of an argument that is a curriculum level, a number or an array () in [0, 1]."""
 AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]

@@ -256,7 +256,7 @@ class QuadrupedEnv(Task[S, P]):
     @jax.named_scope("task")
     def advance(self, state: State[S], action: jax.Array) -> State[S]:
         """Returns the state of `step` with the observations from before it."""
-        self._check_state(state)
+        self.check_state(state)
         action = self.controller.checked(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
@@ -370,7 +370,7 @@ class QuadrupedEnv(Task[S, P]):
         agent = jax.random.randint(agent_key, (), 0, self.num_agents)
         return jnp.where(jnp.arange(self.num_agents) == agent, steps, 0.0).astype(jnp.int32)
 
-    def _check_state(self, state: State[S]) -> None:
+    def check_state(self, state: State[S]) -> None:
         """Raises an InputError for anything but a state of one environment of this task."""
         names, size = {f"reward/{field.name}" for field in dataclasses.fields(self.weights)}, self.compiled.model.nq
         if isinstance(state, State):

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check, checked
+from mqe_jax.core.settings import PathText, check, checked, fail
 from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS, TASKS
@@ -47,7 +48,8 @@ class SimplePolicy:
     name: str = ""
     """The name by which `load_policy` knows it; empty for another one."""
 
-    def initial_memory(self, num_envs: int) -> Memory:
+    @checked(num_envs=PositiveInt | None)
+    def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns an empty recurrent state."""
         return ()
 
@@ -88,7 +90,11 @@ class BothTeams:
 
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions of all agents; see `Policy`."""
-        keys, size, seen = jax.random.split(key), self.first.agents, Observations.at(obs)
+        seen, size = Observations.at(obs), self.first.agents
+        check_obs(seen.obs, self.agents)
+        if not isinstance(memory, tuple) or len(memory) != 2:
+            fail("memory", memory, "that of `initial_memory`, one for each team")
+        keys = jax.random.split(check("key", key, RandomKey))
         first, first_memory = self.first.act(seen.of(slice(size)).to(self.first), memory[0], keys[0])
         others = seen.of(slice(size, None)).to(self.second)
         second, second_memory = self.second.act(others, memory[1], keys[1])

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import checked, fail
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 
@@ -205,8 +205,10 @@ def register(skill: type[S]) -> type[S]:
     """Registers a class under its `name`, for `make(task, skill=name)`, and returns it.
 
     Raises:
-        InputError: if another class is registered under it.
+        InputError: for anything else, or if another class is registered under it.
     """
+    if not (isinstance(skill, type) and issubclass(skill, Skill) and isinstance(getattr(skill, "name", None), str)):
+        fail("skill", skill, "a class derived from Skill, with a name")
     if SKILLS.setdefault(skill.name, skill) is not skill:
         raise InputError(f"skill: the name {skill.name!r} is already registered")
     return skill

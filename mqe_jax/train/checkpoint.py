@@ -7,16 +7,17 @@ import re
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief
 from mqe_jax.core.files import check_file, make_folder, parse_json, parsing, write_atomically
+from mqe_jax.core.settings import PathText, checked, fail
 from mqe_jax.core.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
@@ -37,6 +38,10 @@ _RANGES: tuple[tuple[str, float, float], ...] = (
 """Lowest and highest value of arrays by patterns of their names; of others any finite number."""
 _ANY = re.compile(r"/env_state/(?!.*(arrays|before)/)(?!.*(obs|qpos|qvel)$)")
 """Names of arrays in which NaN may be meant."""
+
+
+Kind = Literal["policy", "checkpoint"]
+"""Kinds of files."""
 
 
 class Checkpoint(NamedTuple):
@@ -62,18 +67,26 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
     return str(total)
 
 
+@checked(path=PathText, metadata=Mapping[str, Any], kind=Kind)
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
     """Writes a pytree of arrays with JSON metadata; `kind` is the kind of file that `load_tree` checks.
 
     The same content gives the same bytes: safetensors writes several entries of metadata in random order, so that
     there is one.
     """
-    named, _ = _flatten(jax.device_get(raw_keys(tree)))
-    # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
-    arrays = {name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()}
-    text = json.dumps(dict(metadata), sort_keys=True)
-    header = {"kind": kind, "version": str(VERSION), "checksum": _checksum(arrays, text), "metadata": text}
-    write_atomically(Path(path), save(arrays, {FORMAT: json.dumps(header)}))
+    try:
+        text = json.dumps(dict(metadata), sort_keys=True)
+    except (TypeError, ValueError):
+        fail("metadata", metadata, "a mapping of names to what JSON has")
+    try:
+        named, _ = _flatten(jax.device_get(raw_keys(tree)))
+        # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
+        arrays = {name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()}
+        header = {"kind": kind, "version": str(VERSION), "checksum": _checksum(arrays, text), "metadata": text}
+        content = save(arrays, {FORMAT: json.dumps(header)})
+    except (SafetensorError, TypeError, ValueError):
+        fail("tree", tree, "a pytree of arrays")
+    write_atomically(Path(path), content)
 
 
 def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -116,11 +129,13 @@ def _older(path: Path) -> str:
     return f"; without this file the run resumes from {older[-1].name}"
 
 
+@checked(path=PathText, kind=Kind)
 def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
     """Returns the metadata of a file, after checking the file."""
     return _read(Path(path), kind)[1]
 
 
+@checked(path=PathText, kind=Kind, half=bool, part=str)
 def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = "") -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 

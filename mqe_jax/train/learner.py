@@ -15,8 +15,20 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core import devices
+from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.types import Batch, Matchmaker, Params, PyTree, Transition, VectorEnv, replace_fields
+from mqe_jax.core.settings import checked
+from mqe_jax.core.types import (
+    AnyBatch,
+    Batch,
+    Matchmaker,
+    Params,
+    PyTree,
+    RandomKey,
+    Transition,
+    VectorEnv,
+    replace_fields,
+)
 from mqe_jax.train.checks import check_divisible, check_environment, check_teacher
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
@@ -62,6 +74,7 @@ class Learner(NamedTuple):
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
 
 
+@checked(env=AnyBatch, config=TrainConfig, processes=PositiveInt)
 def make_learner(
     env: VectorEnv,
     config: TrainConfig,
@@ -92,6 +105,7 @@ def make_learner(
     algorithm = stages(network, config)
 
     @single
+    @checked(key=RandomKey)
     def init(key: jax.Array) -> TrainState:
         params_key, env_key, stagger_key, key = jax.random.split(key, 4)
         env_state = env.reset(env_key)
@@ -119,6 +133,7 @@ def make_learner(
         return state if league is None else league.seat(dataclasses.replace(state, extra=league.begin(state)))
 
     @single
+    @checked(state=TrainState)
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
         now = scheduled(config, state.updates)

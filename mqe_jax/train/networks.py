@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 
 from mqe_jax.core.errors import nearest
 from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
-from mqe_jax.core.settings import build, fail, record
+from mqe_jax.core.settings import build, check, fail, record
 
 if TYPE_CHECKING:
     import jax
@@ -136,8 +136,11 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
 
     The functions of its network compute in single precision.
     """
+    check("name", name, str)
 
     def register(cls: type[Any]) -> type[Any]:
+        if not isinstance(cls, type) or not callable(getattr(cls, "build", None)):
+            fail("network", cls, "a class of settings with a method build(dims)")
         build_own = cls.build
 
         @functools.wraps(build_own)

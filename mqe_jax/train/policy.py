@@ -17,7 +17,7 @@ from mqe_jax.core.files import check_folder, check_locks
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, build, check, checked, fail, to_mapping
-from mqe_jax.core.types import AnyPolicy, Memory, Observations, Params, RandomKey, VectorEnv, teams_of
+from mqe_jax.core.types import AnyEnvironment, AnyPolicy, Memory, Observations, Params, RandomKey, VectorEnv, teams_of
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
@@ -212,6 +212,7 @@ def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
     return obs
 
 
+@checked(state=TrainState, env=AnyEnvironment, config=TrainConfig)
 def policy_of(state: TrainState, env: VectorEnv, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
     """Returns the policy of a learner state, which learns in an environment."""
     needs = needs_of(env, config)
