@@ -357,6 +357,27 @@ def test_on_one_host_nobody_else_can_join() -> None:
         assert process.stdout.readline().decode().split() == ["True", "False"]
 
 
+@pytest.mark.parametrize("foreign", ["127.0.0.1", "0.0.0.0", "::"])
+def test_a_port_of_slurm_that_another_program_uses(foreign: str) -> None:
+    """It accepts and says nothing; process 0 and process 1 of two both end and name the address."""
+    family = socket.AF_INET6 if ":" in foreign else socket.AF_INET
+    said = []
+    with contextlib.ExitStack() as stack:
+        listener = socket.create_server((foreign, 0), family=family, dualstack_ipv6=":" in foreign)
+        port = str(stack.enter_context(listener).getsockname()[1])
+        job = {"SLURM_JOB_ID": "4242", "SLURM_STEP_NODELIST": "127.0.0.1", "SLURM_NTASKS": "2", launch.MEMBER: "auto"}
+        environment = {**os.environ, **job, "JAX_COORDINATOR_PORT": port}
+        words = [sys.executable, "-c", "from mqe_jax.cli import launch; launch.LIMIT = 1.0; launch.join()"]
+        ranks = [{"SLURM_PROCID": index, "SLURM_LOCALID": index} for index in "01"]
+        both = [started(words, env={**environment, **rank}, stdin=subprocess.PIPE) for rank in ranks]
+        for process in [stack.enter_context(one) for one in both]:
+            assert process.stderr is not None
+            said.append(process.stderr.read())
+            assert process.wait() > 0, "killed by a signal"
+    assert f"coordinator: 127.0.0.1:{port} cannot be used (Address already in use); set JAX_COORDINATOR_PORT" in said[0]
+    assert said[1].startswith(f"mqe: coordinator: the other processes did not come to 127.0.0.1:{port} within 1 s")
+
+
 def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which devices processes have, and how they find each other."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,6")

@@ -44,6 +44,7 @@ _RANKS = {"SLURM_PROCID": "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK": "OMPI_COMM_WO
 """Variables of srun and mpirun: a process's index among all, and among those of its host."""
 _MEMBER = re.compile(r"(\d+)/(\d+)@(\d+)")
 _GRACE = 10.0  # s, in which the others end after one has ended
+_PORT = "set JAX_COORDINATOR_PORT to a free port in all processes"
 _RESUME = "the same command with --resume goes on"
 _REPEAT = "the same command goes on"  # a sweep
 _NOISE = re.compile(
@@ -162,28 +163,59 @@ def join() -> None:
         return
     import jax
 
-    alone = threading.Timer(LIMIT, _end_alone)
+    jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
+    address, count, index = (f"127.0.0.1:{match[3]}", int(match[2]), int(match[1])) if match else _job()
+    own = address if match else None  # Otherwise JAX listens on all addresses of the machine.
+    if index == 0:
+        _check_free(own or f":{address.rpartition(':')[2]}", address)
+    alone = threading.Timer(LIMIT, _end_alone, [address])
     alone.daemon = True
     alone.start()
-
-    jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
     timeouts: Any = {"heartbeat_timeout_seconds": HEARTBEAT, "shutdown_timeout_seconds": HEARTBEAT}
     try:
-        if match is None:
-            jax.distributed.initialize(**timeouts)
-        else:
-            index, count, address = int(match[1]), int(match[2]), f"127.0.0.1:{match[3]}"
-            # Without the bind address JAX listens on all addresses of the machine.
-            jax.distributed.initialize(address, count, index, coordinator_bind_address=address, **timeouts)
-    except Exception as error:  # of JAX's readers of SLURM's and MPI's variables too
-        raise InputError(f"coordinator: the other processes cannot be reached ({error})") from None
+        jax.distributed.initialize(address, count, index, coordinator_bind_address=own, **timeouts)
+    except Exception as error:
+        raise InputError(f"coordinator: the other processes cannot be reached at {address} ({error})") from None
     finally:
         alone.cancel()
 
 
-def _end_alone() -> None:
+def _job() -> tuple[str, int, int]:
+    """Returns the address of process 0, the number of processes and this one's index, as SLURM or MPI tells JAX."""
+    from jax._src.clusters import ClusterEnv  # without a public name
+
+    try:
+        known = os.environ.get("JAX_COORDINATOR_ADDRESS")
+        address, count, index, _ = ClusterEnv.auto_detect_unset_distributed_params(
+            known, None, None, None, None, int(LIMIT)
+        )
+    except Exception as error:  # of variables that are not theirs
+        raise InputError(f"coordinator: variables of srun or mpirun cannot be read ({error})") from None
+    if address is None or count is None or index is None:
+        raise InputError("coordinator: variables are missing that srun, or mpirun of Open MPI 4, sets")
+    return address, count, index
+
+
+def _check_free(own: str, address: str) -> None:
+    """Raises an InputError if process 0 cannot listen at its address: JAX could end with SIGSEGV."""
+    host, _, port = own.rpartition(":")
+    both = not host and socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if both else socket.AF_INET
+    try:
+        socket.create_server((host, int(port)), family=family, dualstack_ipv6=both).close()
+    except (OSError, ValueError, OverflowError) as error:
+        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
+        raise InputError(f"coordinator: {address} cannot be used ({reason}); {_PORT}") from None
+
+
+def _end_alone(address: str) -> None:
     """Ends this process, which JAX keeps waiting for others."""
-    print(f"mqe: coordinator: the other processes did not come within {LIMIT:g} s", file=sys.stderr, flush=True)
+    print(
+        f"mqe: coordinator: the other processes did not come to {address} within {LIMIT:g} s; start all of them, "
+        f"and if another program uses the port: {_PORT}",
+        file=sys.stderr,
+        flush=True,
+    )
     os._exit(2)
 
 
