@@ -184,6 +184,15 @@ def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any],
         mqe_jax.evaluate(task, "idle", **arguments)
 
 
+def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:
+    tables: list[Any] = [{"a": np.zeros((2, 2))}, {"a": np.zeros(2), "b": np.zeros(3)}]
+    wrong = {"policy": [{}], "metrics": [[], *tables], "evaluations": [{}, [3]], "absolute": [[]]}
+    for name, values in wrong.items():
+        for value in (*values, 3, "idle"):
+            with pytest.raises(InputError, match=f"^{name}.*: "):
+                dataclasses.replace(run, **{name: value})
+
+
 def test_an_environment_keeps_its_parameters() -> None:
     own: dict[str, Any] = {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}}
     env = mqe_jax.make("go1gate", impl="c", episode_length=8.0, **own)
@@ -208,6 +217,10 @@ def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float
 
 def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     result = mqe_jax.evaluate("fake", "forward", episodes=4)
+    wrong: Any = ((None, 4), ("x", 4), (0.5, 0), (0.5, 1.5))
+    for value, episodes in wrong:
+        with pytest.raises(InputError, match=r"^(value|episodes): "):
+            Rate.of(value, episodes)
     assert result.success == Rate.of(1.0, 4) and result.win is None
     assert "success_rate                 100.0% (51.0 to 100.0%)" in str(result).splitlines()
     assert "<tr><td>success_rate</td><td>100.0% (51.0 to 100.0%)</td></tr>" in result._repr_html_()
@@ -270,3 +283,9 @@ def test_a_clip_shows_itself_and_is_saved(monkeypatch: pytest.MonkeyPatch) -> No
     assert page.startswith(("<video", "<img")) and ";base64," in page
     with pytest.raises(InputError, match=r"clip.avi.*\.mp4, \.webp, \.gif, \.png"):
         clip.save("clip.avi")
+    for name in ("env", "episodes", "about", "look"):
+        for value in (None, 3, [], [3]):
+            with pytest.raises(InputError, match=f"^{name}.*: "):
+                dataclasses.replace(clip, **{name: value})
+    with pytest.raises(InputError, match=r"^look"):
+        dataclasses.replace(clip, look={"speeds": 1.0})

@@ -99,8 +99,7 @@ READERS = (load_yaml, read_torchscript)
 FILES = ((load_policy, "/dev/zero"), *product((*READERS, load_recording), ("/", "/dev/zero")))
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("task: ", lambda x, v: make(v), (3, [], None)),
-    ("impl: ", lambda x, v: make("go1gate", impl=v), (3, [])),
-    ("control: ", lambda x, v: make("go1gate", control=v), ([], 3)),
+    *((name, lambda x, v, name=name: make("go1gate", **{name: v}), (3, [])) for name in ("impl", "control")),
     ("num_envs: ", lambda x, v: make("go1gate", num_envs=v), (NAN, 1.5, 0, True, 10**9, None, [])),
     ("robot: ", lambda x, v: make("go1gate", robot=[]), (None,)),
     ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300)),
@@ -138,6 +137,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("num_envs: ", lambda x, v: x["task"].with_num_envs(v), (0, None, True, "x")),
     ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
     ("obs: ", lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY), (None, "x", np.zeros((2, 1, 9)), 3)),
+    ("data: ", lambda x, v: x["match"].object_pose(v, "cylinder"), (None, 3, KEY)),
     ("obs: ", lambda x, v: all_agents(x["match"], x["idle"]).act(v, ((), ()), KEY), (None, np.zeros((2, 1, 10)))),
     ("key: ", lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), ((), ()), v), (None, 3)),
     ("memory: ", lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), v, KEY), (None, ())),

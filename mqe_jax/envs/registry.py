@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, MutableMapping
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import checked, fail
 
 if TYPE_CHECKING:
     import jax
@@ -129,6 +129,7 @@ def register_planner(task: str, name: str, planner: Planner | str) -> None:
         raise InputError(f"planner: the name {name!r} is already registered for {task}")
 
 
+@checked(planner=Callable | str | None)
 def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
@@ -138,7 +139,7 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None
     from mqe_jax.envs.base import QuadrupedEnv
 
     if not (isinstance(task, type) and issubclass(task, QuadrupedEnv)):
-        raise InputError(f"task: {task!r} is not allowed; it must be a class derived from QuadrupedEnv")
+        fail("task", task, "a class derived from QuadrupedEnv")
     if not task.name:
         raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
     known = TASKS.get(task.name)

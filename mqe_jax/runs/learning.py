@@ -15,7 +15,7 @@ from mqe_jax.core import interrupts, limits
 from mqe_jax.core.files import check_folder
 from mqe_jax.core.limits import Seed, Seeds
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check, checked
+from mqe_jax.core.settings import PathText, check, checked, fail
 from mqe_jax.core.types import Cast
 from mqe_jax.runs.build import Config, Task, prepare
 from mqe_jax.runs.divergence import guard
@@ -42,6 +42,14 @@ class Run:
     """Evaluations during training: `env_steps`, `episodes`, and results under `sampled` and `deterministic` actions."""
     absolute: dict[str, Any] | None = None
     """The absolute metric: an evaluation of the best policy over more episodes; None unless a training has ended."""
+
+    def __post_init__(self) -> None:
+        check("policy", self.policy, TrainedPolicy)
+        shapes = {np.shape(column) for column in check("metrics", self.metrics, dict[str, np.ndarray]).values()}
+        if len(shapes) > 1 or any(len(shape) != 1 for shape in shapes):
+            fail("metrics", self.metrics, "columns of one length")
+        check("evaluations", self.evaluations, list[dict[str, Any]])
+        check("absolute", self.absolute, dict[str, Any] | None)
 
     @property
     def config(self) -> TrainConfig:

@@ -15,7 +15,8 @@ import jax
 from annotated_types import MinLen
 
 from mqe_jax.core.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
-from mqe_jax.core.settings import PathText, checked, fail, joined
+from mqe_jax.core.settings import PathText, check, checked, fail, joined
+from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.runs import build
@@ -199,6 +200,15 @@ class Clip:
     look: dict[str, Any]
     """Options of `mqe_jax.viz.render.render_episode`: view, size, fps, speed."""
 
+    def __post_init__(self) -> None:
+        from mqe_jax.viz.recording import Episode
+
+        check("env", self.env, AnySingle)
+        if not check("episodes", self.episodes, list[Any]) or not all(isinstance(x, Episode) for x in self.episodes):
+            fail("episodes", self.episodes, "a list of episodes")
+        check("about", self.about, dict[str, Any])
+        check("look", self.look, dict[Literal["view", "size", "fps", "speed"], Any])
+
     @property
     def best(self) -> int:
         """Index of the best episode."""
@@ -229,7 +239,7 @@ class Clip:
     def _repr_html_(self) -> str:
         """Returns a video (H.264 with imageio-ffmpeg, of the extra `render`), else a GIF, within the page."""
         kind = "mp4" if find_spec("imageio_ffmpeg") is not None else "gif"
-        small = {**self.look, "size": self.look["size"] or (480, 270)}
+        small = {**self.look, "size": self.look.get("size") or (480, 270)}
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"clip.{kind}"
             dataclasses.replace(self, look=small).save(file)

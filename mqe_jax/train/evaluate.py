@@ -56,6 +56,7 @@ class Rate(NamedTuple):
         return f"{100 * self.value:.1f}% ({100 * self.low:.1f} to {100 * self.high:.1f}%)"
 
     @classmethod
+    @checked(value=float, episodes=PositiveInt)
     def of(cls, value: float, episodes: int) -> Rate:
         """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is conservative."""
         spread = _NORMAL**2 / episodes
