@@ -282,6 +282,13 @@ def test_making_and_stepping_imports_no_foreign_library_and_no_other_task() -> N
 # -- actions, noise, layouts ------------------------------------------------------------------------------------------
 
 
+def test_captured_constants_are_arguments_in_compiled_code(gate: QuadrupedEnv, fresh: State) -> None:
+    action, assistance = jnp.zeros((2, 12)), jnp.float32(0.5)
+    after = jax.jit(lambda state: jax.lax.scan(lambda state, _: (gate.step(state, action), None), state, None, 2)[0])
+    assert int(after(fresh).step) == 2
+    assert jax.eval_shape(lambda key: gate.reset(key, assistance), jax.random.PRNGKey(0)).assistance.shape == ()
+
+
 def test_a_layout_slices_packs_and_splits() -> None:
     layout = ObservationLayout((Block("id", 1, categorical=True), Block("place", 2), Block("speed", 3)))
     values = {"id": jnp.ones((4, 1)), "place": jnp.full((4, 2), 2.0), "speed": jnp.full((4, 3), 3.0)}

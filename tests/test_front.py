@@ -175,7 +175,7 @@ def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
         (None, {}, "task: None is not allowed"),
         ("fake", {"env": "x"}, "env: 'x' is not allowed"),
         ("fake", {"env": 5}, "env: 5 is not allowed"),
-        ("~/none", {}, "run: '/nowhere/none' is no folder"),
+        ("~/none", {}, "run: '/nowhere/none' has no policy"),
     ],
 )
 def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any], said: str, monkeypatch: Any) -> None:

@@ -56,7 +56,9 @@ def _raw_key(implementation: str) -> Any:
 def _level(value: Any) -> Any:
     traced, dtype = isinstance(value, Tracer), getattr(value, "dtype", None)
     number = isinstance(value, int | float) if dtype is None else jnp.issubdtype(dtype, jnp.number)
-    if isinstance(value, bool) or not number or np.shape(value) or not (traced or 0 <= float(value) <= 1):
+    # As a Python number: under jit comparisons are traced even where an array is a captured constant.
+    known = value if dtype is None else 0 if traced or np.shape(value) else value.item()
+    if isinstance(value, bool) or not number or np.shape(value) or not 0 <= known <= 1:
         raise ValueError("a number in [0, 1]")
     return value
 

@@ -340,7 +340,8 @@ class QuadrupedEnv(Task[S, P]):
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
         """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame; InputError for no object."""
         check("name", name, Literal[tuple(self.objects)])
-        if jnp.shape(getattr(data, "qpos", None))[-1:] != (self.compiled.model.nq,):
+        qpos: Any = getattr(data, "qpos", None)
+        if np.shape(qpos)[-1:] != (self.compiled.model.nq,):
             fail("data", data, "the data of a state of this task")
         return jnp.concatenate(poses(self.compiled.model, data, [self.objects[name].body]), axis=-1)[0]
 
