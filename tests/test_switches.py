@@ -1,4 +1,4 @@
-"""JAX's switches: `jax_enable_x64`, `jax_default_prng_impl`, `jax_debug_nans`, `jax_numpy_dtype_promotion`."""
+"""JAX's switches: `jax_enable_x64`, `jax_default_prng_impl`, `jax_debug_nans`, `jax_numpy_..._promotion`."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4, max_
 
 @contextlib.contextmanager
 def strict_x64() -> Iterator[None]:
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
         yield
 
 

@@ -15,12 +15,14 @@ R = TypeVar("R")
 def single(function: Callable[P, R]) -> Callable[P, R]:
     """Makes a function compute in float32 and int32, also where it is traced by a caller with `jax_enable_x64`.
 
+    It broadcasts shapes, also with `jax_numpy_rank_promotion`.
+
     The function and all that it calls, such as a task or an engine of one's own, need no dtype in each `jnp.zeros`.
     """
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        with jax.enable_x64(False):
+        with jax.enable_x64(False), jax.numpy_rank_promotion("allow"):
             return function(*args, **kwargs)
 
     return call
