@@ -55,11 +55,11 @@ def _raw_key(implementation: str) -> Any:
 
 def _level(value: Any) -> Any:
     traced, dtype = isinstance(value, Tracer), getattr(value, "dtype", None)
-    real = dtype is not None and (jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating))
-    scalar = not isinstance(value, bool) and (real if dtype is not None else isinstance(value, int | float))
-    # As a Python number: under jit comparisons are traced even where an array is a captured constant.
-    known = (lambda: value) if dtype is None else (lambda: 0) if traced else (lambda: value.item())
-    if not scalar or np.shape(value) or not 0 <= known() <= 1:
+    kinds = (jnp.integer, jnp.floating)
+    number = isinstance(value, int | float) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    # By numpy: under jit comparisons are traced even where an array is a captured constant.
+    inside = number and not np.shape(value) and (traced or 0 <= np.asarray(value) <= 1)
+    if isinstance(value, bool) or not inside:
         raise ValueError("a number in [0, 1]")
     return value
 
