@@ -76,7 +76,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advances by one environment step; actions are clipped to [-1, 1]."""
-        out = self._host.step(np.asarray(action)[None])
+        out = self._host.step([action])
         info: dict[str, Any] = {name: value[0] for name, value in out.info.items()}
         info["agent_rewards"] = out.reward[0]
         reward = float(team_reward(self.env, out.reward.astype(float))[0])

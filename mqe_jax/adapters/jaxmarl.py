@@ -184,7 +184,7 @@ class Env(MultiAgentEnv):
         shapes, kind = ([(), (1,)], jnp.integer) if count else ([(size,)], jnp.number)
         arrays = {}
         for agent in self.agents:
-            with contextlib.suppress(TypeError, ValueError, OverflowError):
+            with contextlib.suppress(Exception):  # of the `repr` of a value too
                 arrays[agent] = action = jnp.asarray(actions[agent])
                 known = isinstance(actions[agent], int | np.integer | np.ndarray)  # without waiting for a device
                 outside = count and known and not 0 <= int(actions[agent]) < count
