@@ -136,7 +136,7 @@ def test_render_returns_images() -> None:
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"autoreset_mode": "later"}, "autoreset_mode: 'later'; allowed: NextStep, SameStep, Disabled"),
+        ({"autoreset_mode": "later"}, "autoreset_mode: 'later' is not allowed; it must be one of NextStep, SameStep"),
         ({"render_mode": "human"}, "render_mode: 'human' is not allowed; it must be 'rgb_array'"),
         ({"num_envs": 0}, "num_envs: 0 is not allowed; .* greater than 0"),
         ({"num_envs": 1.5}, r"num_envs: 1\.5 is not allowed; .* a valid integer"),
