@@ -241,7 +241,7 @@ def test_ratings_recover_the_strengths_behind_many_games() -> None:
     games[0, 1] = games[0, 2] = [3000, 0, 1000]
     games[1, 0] = games[2, 0] = [1000, 0, 3000]
     games[1, 2] = games[2, 1] = [0, 4000, 0]
-    ratings = tournament.rate(games, anchor=1)
+    ratings = tournament.rate(games, reference=1)
     np.testing.assert_allclose(ratings.value, [190.8, 0, 0], atol=1.0)
     assert ratings.low[0] < 190.8 < ratings.high[0] and ratings.high[0] - ratings.low[0] < 30
     np.testing.assert_allclose(tournament.scores(games)[0], [0, 6000, 6000])
@@ -252,7 +252,7 @@ def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> No
     def interval(games: int) -> tuple[float, float]:
         results = np.full((policies, policies, 3), [0, games, 0])
         results[0, 1:], results[1:, 0] = [games, 0, 0], [0, 0, games]
-        value, low, high = (bound[0] for bound in tournament.rate(results, anchor=1))
+        value, low, high = (bound[0] for bound in tournament.rate(results, reference=1))
         assert low < value < high
         return low, high
 
@@ -261,8 +261,8 @@ def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> No
 
 
 @pytest.mark.parametrize("params", [{"control": "position"}, {"commands": ["vx", "yaw_rate"]}])
-def test_where_the_scripted_policy_does_not_fit_the_anchor_is_an_idle_team(params: dict[str, Any]) -> None:
-    assert setup.anchors(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == ["idle", "random"]
+def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(params: dict[str, Any]) -> None:
+    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == ["idle", "random"]
     changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
     assert (
         setup.environments("c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1).eval_env
@@ -271,8 +271,8 @@ def test_where_the_scripted_policy_does_not_fit_the_anchor_is_an_idle_team(param
 
 
 def test_a_tournament_meets_every_pair_on_both_sides(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
-    assert setup.anchors(make("go1revolvingdoor", impl="c", num_envs=1)) == ["scripted", "idle", "random"]
-    monkeypatch.setattr(setup, "anchors", lambda env: ["scripted", "idle"])
+    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1)) == ["scripted", "idle", "random"]
+    monkeypatch.setattr(setup, "reference_opponents", lambda env: ["scripted", "idle"])
     capfd.readouterr()
     arguments = ["go1revolvingdoor", "forward", "--impl", "c", "--set", "line_x=0.8", "--episodes", "4"]
     assert cli.main(["tournament", *arguments, "-o", str(tmp_path), "--json"]) == 0

@@ -187,7 +187,7 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     if config.imitation.teacher is not None:
         teacher = load_as("imitation.teacher", config.imitation.teacher, both)
     if len(both.teams) > 1 and eval_env is not None:
-        fixed = Roster(opponents).fixed or anchors(eval_env.env)[:1]
+        fixed = Roster(opponents).fixed or reference_opponents(eval_env.env)[:1]
         if episodes % len(fixed):
             fail("evaluation.episodes", episodes, f"a multiple of the number of opponents in evaluations, {len(fixed)}")
         eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed)
@@ -221,7 +221,7 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 
 
-def anchors(env: QuadrupedEnv) -> list[str]:
+def reference_opponents(env: QuadrupedEnv) -> list[str]:
     """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
     walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
     return [*(["scripted"] if env.name in PLANNERS and walking else []), "idle", "random"]

@@ -121,7 +121,7 @@ def tournament(
     match, _ = build.make_env(task, impl, params, 1)
     if len(match.teams) < 2:
         fail("task", match.name, "a match: it has one team")
-    fixed = build.anchors(match)
+    fixed = build.reference_opponents(match)
     names = tuple(dict.fromkeys([*policies, *fixed]))
     _, matches = build.make_env(task, impl, params, len(names) * episodes)
     teams = {name: load_policy(name, matches.env, deterministic=deterministic) for name in names}

@@ -33,7 +33,7 @@ from mqe_jax.train.runner import train_seeds
 
 SWEEP_FILE = "sweep.yaml"
 
-Environments = Callable[[TrainConfig, int], Cast]
+MakeEnvironments = Callable[[TrainConfig, int], Cast]
 """Factory of the training and evaluation environments for a given number of seeds trained together."""
 
 
@@ -235,7 +235,7 @@ def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
         write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
 
-class Outcome(NamedTuple):
+class Unfinished(NamedTuple):
     """The jobs that `run` did not finish."""
 
     others: list[Job]
@@ -246,10 +246,10 @@ class Outcome(NamedTuple):
 
 def run(
     jobs: Sequence[Job],
-    environments: Environments,
+    environments: MakeEnvironments,
     on_failure: Callable[[Job, Exception], object] = lambda job, error: None,
     stop: Callable[[], bool] = lambda: False,
-) -> Outcome:
+) -> Unfinished:
     """Trains the jobs sequentially, until `stop()`; each resumes from its checkpoints.
 
     One that fails does not stop the others.
@@ -258,21 +258,21 @@ def run(
     folders first. `on_failure` is called at once for a job that fails with bad input, a file that cannot be read or
     written, a training that became non-finite, or memory that does not suffice.
     """
-    outcome = Outcome([], [])
+    unfinished = Unfinished([], [])
     for job in jobs:
         if stop():
             break
         try:
             _train(job, environments, stop)
         except InUseError:
-            outcome.others.append(job)
+            unfinished.others.append(job)
         except (InputError, OSError, NonFiniteError, jax.errors.JaxRuntimeError) as error:
-            outcome.failed.append((job, error))
+            unfinished.failed.append((job, error))
             on_failure(job, error)
-    return outcome
+    return unfinished
 
 
-def _train(job: Job, environments: Environments, stop: Callable[[], bool]) -> None:
+def _train(job: Job, environments: MakeEnvironments, stop: Callable[[], bool]) -> None:
     """Trains a job, if no other process has finished it since the jobs were planned."""
     if all(map(finished, job.folders)):
         return

@@ -102,30 +102,30 @@ def scores(results: NDArray[Any]) -> Array:
     return points + (results.sum(axis=-1) - points).T
 
 
-@checked(results=Results, anchor=NonNegativeInt)
-def rate(results: NDArray[np.int64], anchor: int) -> Ratings:
-    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `anchor` is 0, and their intervals.
+@checked(results=Results, reference=NonNegativeInt)
+def rate(results: NDArray[np.int64], reference: int) -> Ratings:
+    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `reference` is 0, and their intervals.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
     of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
     """
-    if anchor >= len(results):
-        fail("anchor", anchor, f"the index of one of the {len(results)} policies")
+    if reference >= len(results):
+        fail("reference", reference, f"the index of one of the {len(results)} policies")
     games = results + np.array([0.0, 0.5, 0.0])
     weights = np.random.default_rng(0).standard_gamma(games, (_SAMPLES, *games.shape))
     weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
-    resampled = np.stack([_strengths(scores(again), anchor) for again in weights])
+    resampled = np.stack([_strengths(scores(again), reference) for again in weights])
     low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
-    return Ratings(_strengths(scores(games), anchor), low, high)
+    return Ratings(_strengths(scores(games), reference), low, high)
 
 
-def _strengths(points: Array, anchor: int) -> Array:
+def _strengths(points: Array, reference: int) -> Array:
     """Returns the maximum-likelihood ratings (P,) of points (P, P), by minorisation and maximisation."""
     points = points * (1 - np.eye(len(points)))
     games, strength = points + points.T, np.ones(len(points))
     for _ in range(_ITERATIONS):
         strength = points.sum(axis=1) / (games / (strength[:, None] + strength)).sum(axis=1)
-        strength /= strength[anchor]
+        strength /= strength[reference]
     return _POINTS * np.log(strength)
 
 
