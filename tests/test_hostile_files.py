@@ -15,16 +15,15 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from mqe_jax.cli.options import parse_overrides
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import parse_json, parse_yaml, read_rows, read_tensors
-from mqe_jax.core.settings import build, override
+from mqe_jax.core.files import parse_json, read_rows, read_tensors
+from mqe_jax.core.settings import override
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.selfplay.league import pool
 from mqe_jax.study.runs import read_curve, read_runs
 from mqe_jax.train import checkpoint
-from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.config import load_config
 from mqe_jax.train.monitor import read_evaluations
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train
@@ -69,15 +68,6 @@ def test_bad_yaml(case: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         load_config(path)
     assert str(error.value).startswith(str(path)) and len(str(error.value)) < 500
-
-
-def test_yaml_has_no_dates_and_values_are_shown_shortened() -> None:
-    assert parse_yaml("a: 2020-01-01", "x") == {"a": "2020-01-01"}
-    with pytest.raises(InputError) as error:
-        build(TrainConfig, {"seed": [["x" * 1000] * 1000] * 1000})
-    assert len(str(error.value)) < 500
-    with pytest.raises(InputError, match=r"set: 'x{50,}"):
-        parse_overrides(["x" * 100_000])
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[" * 33 + "]" * 33, "9" * 5000, "{", '{"a": 1} x', ""])

@@ -1,15 +1,11 @@
 """Paths, names and errors of others are shown as they are: nothing in them is markup, or a control character."""
 
 from html.parser import HTMLParser
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mqe_jax.core.errors import InputError, one_line
 from mqe_jax.core.literal import to_html, to_markdown
-from mqe_jax.selfplay.league import tournament
-from mqe_jax.study import figures
 from mqe_jax.study.report import markdown
 
 EVIL = "<script>x</script> <img src=x onerror=y> ![a](b) [c](d) `e` *f* __g__ ~~h~~ | &lt; $\\bad$ \\ 'i' \"j\""
@@ -42,14 +38,6 @@ def test_nothing_is_markup_in_html_and_markdown() -> None:
     ):
         seen = Seen(page)
         assert seen.tags == tags and EVIL in seen.text
-
-
-def test_names_are_no_formulas_in_pictures(tmp_path: Path) -> None:
-    axes = figures._figure(3.0, 3.0).add_subplot()
-    figures._style_axes(axes, "$\\bad$")
-    figures._png(axes.figure)
-    tournament._draw(["$\\bad$", "$"], np.ones((2, 2, 3), np.int64), tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").is_file()
 
 
 def test_a_terminal_gets_one_printable_line() -> None:

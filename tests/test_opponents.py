@@ -80,7 +80,7 @@ def test_teams_may_see_different_groups_of_observations() -> None:
     config = build(TrainConfig, {**SETTINGS, "num_envs": 2, "group": "proprioception"})
     config = override(config, {"network.critic_input": "own"})
     learner = make_learner(Versus(env, [seeing]), config)
-    after, _ = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
+    after, _ = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))
     assert after.obs_normalizer.obs.mean.shape == (27,)
     cast = setup.environments("c", override(config, {"task": "go1gate", "evaluation.every": 1, "seed": 0}), 1)
     assert cast.env.groups == cast.eval_env.groups == ("proprioception",)

@@ -25,17 +25,9 @@ from tests.states import initial, made, moment, placed, stepper
 KEY = jax.random.PRNGKey(0)
 
 
-DRAWN: dict[str, Any] = {
-    **{"friction": (0.5, 1.25), "payload": (-1.0, 3.0), "center_of_mass": (-0.02, 0.04), "motor_strength": (0.7, 1.2)},
-    **{
-        "joint_mechanics": (0.5, 2.0),
-        "action_lag": 3,
-        "motor_offset": 0.1,
-        "observation_noise": 0.05,
-        "push": 0.4,
-        "push_period": 0.1,
-    },
-}
+DRAWN: dict[str, Any] = {"friction": (0.5, 1.25), "payload": (-1.0, 3.0), "center_of_mass": (-0.02, 0.04)}
+DRAWN |= {"motor_strength": (0.7, 1.2), "joint_mechanics": (0.5, 2.0), "action_lag": 3, "motor_offset": 0.1}
+DRAWN |= {"observation_noise": 0.05, "push": 0.4, "push_period": 0.1}
 
 
 @pytest.fixture(scope="module")
@@ -287,16 +279,7 @@ def test_an_ended_episode_is_replaced_whole_and_another_one_left_alone() -> None
             source = seen if field.name in SEEN else fresh if ended and field.name not in KEPT else now
             expected = getattr(source, field.name)
             if field.name == "data":
-                for name in (
-                    "qpos",
-                    "qvel",
-                    "qacc_warmstart",
-                    "ctrl",
-                    "mocap_pos",
-                    "sensordata",
-                    "xfrc_applied",
-                    "time",
-                ):
+                for name in "qpos qvel qacc_warmstart ctrl mocap_pos sensordata xfrc_applied time".split():
                     np.testing.assert_array_equal(getattr(after.data, name), getattr(expected, name), err_msg=name)
             elif field.name != "key":
                 jax.tree.map(np.testing.assert_array_equal, getattr(after, field.name), expected)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mqe_jax
 from mqe_jax import cli, skills
-from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.commands import Eval
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
@@ -29,7 +25,6 @@ from mqe_jax.policies.scripted import planner_of
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
 from mqe_jax.runs.build import players
-from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, save_policy
@@ -58,25 +53,6 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
     assert all(0.0 <= rate <= 1.0 for rate in (*card.results.values(), *card.endings.values()))
     assert {*card.endings} == {*ENDINGS}
     assert sum(card.endings.values()) == pytest.approx(1.0, abs=1e-3)
-
-
-def test_the_cards_have_the_rates_of_the_readme(capfd: pytest.CaptureFixture[str]) -> None:
-    """`mqe zoo` lists them in a row for each task, which fits on a terminal of 80 columns."""
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\|.* `(go1[\w-]+)`:[^|]*\| ([\d.]+) \| ([\d.]+) \|", readme, re.MULTILINE)
-    assert {row[0] for row in rows} == {*zoo.names()}
-    assert cli.main(["zoo"]) == 0
-    lines = capfd.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    listed = {line.split()[0]: line.split()[1:3] for line in lines if line.startswith("go1")}
-    for task, *rates in rows:
-        shown = rates[: 2 if task in MATCHES else 1]
-        assert [float(x) for x in listed[task][: len(shown)]] == [float(x) for x in shown], task
-    assert cli.main(["zoo", "go1gate"]) == 0
-    out = capfd.readouterr().out
-    assert "published-gate" in out and "walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5" in out
-    assert cli.main(["zoo", "--json"]) == 0
-    assert set(json.loads(capfd.readouterr().out)["policies"]) == {*zoo.names()}
 
 
 def test_a_shipped_policy_does_what_its_card_says() -> None:
@@ -366,17 +342,3 @@ def test_contract(name: str) -> None:
     assert target.shape == (12,) and np.abs(target - GO1.default_joints).max() < 1.0
     assert command.shape == (len(skill.commands),) and np.isfinite(command).all()
     assert jax.tree.map(jnp.shape, memory) == jax.tree.map(jnp.shape, after)
-
-
-def test_what_a_user_makes_says_what_it_is() -> None:
-    """The `repr` of environments, wrappers and policies; `dir(mqe_jax)` lists the API."""
-    env = make("go1tug", impl="c", num_envs=4, episode_length=3.0, rewards={"push": 4})
-    actions = "command 3 (walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5)"
-    sizes = f"1 vs 1 agents, observation 10, action {actions}, engine c"
-    task = f"<go1tug: {sizes}, episode_length=3.0, rewards.push=4.0>"
-    batch, scripted = VectorEnv(env, 4), load_policy("scripted", env)
-    policy = "SimplePolicy(task='go1tug', agents=1, name='scripted')"
-    assert repr(env) == task and repr(scripted) == policy
-    assert repr(versus(batch, [scripted])) == f"<Versus of 4 against [{policy}]: <VectorEnv of 4: {task}>>"
-    assert repr(TeamEnv(env, scripted)) == f"<TeamEnv against {policy}: {task}>"
-    assert {*mqe_jax.__all__} <= {*dir(mqe_jax)} and "annotations" not in dir(mqe_jax)

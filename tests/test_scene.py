@@ -152,15 +152,6 @@ def test_collision_sets_are_swapped_as_data() -> None:
     assert touch(slim.model.geom("robot0/FL_foot"), slim.model.geom("robot1/head"))
 
 
-def test_unknown_names_are_refused_with_the_nearest() -> None:
-    with pytest.raises(InputError, match=r"robot: unknown name 'go3'.*did you mean 'go[12]'.*allowed: go1, go2"):
-        robots.get("go3")
-    with pytest.raises(ValueError, match=r"robot: unknown name 'g01'"):
-        make("go1gate", robot="g01")
-    with pytest.raises(InputError, match=r"'go1' is already registered"):
-        robots.register(dataclasses.replace(GO1, kp=10.0))
-
-
 def test_wrong_data_is_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"Robot\.torque_limit: shape \(3,\); expected \(12,\)"):
         dataclasses.replace(GO1, torque_limit=np.ones(3))
