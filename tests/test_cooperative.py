@@ -14,15 +14,8 @@ from mqe_jax.envs.reward import weigh
 from mqe_jax.physics.robots.index import RobotState
 from tests.states import angles, ending, initial, made, moving, placed, robot_state, stepper, still
 
-
-@pytest.fixture(scope="module")
-def gate() -> QuadrupedEnv:
-    return made("go1gate")
-
-
-@pytest.fixture(scope="module")
-def gate_fresh(gate: QuadrupedEnv) -> State:
-    return initial(gate)
+gate = pytest.fixture(scope="module")(lambda: made("go1gate"))
+gate_fresh = pytest.fixture(scope="module")(lambda gate: initial(gate))
 
 
 def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv, gate_fresh: State) -> None:
@@ -134,19 +127,9 @@ def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(t
 # -- Climb on Seesaw ---------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def env() -> Any:
-    return made("go1seesaw")
-
-
-@pytest.fixture(scope="module")
-def step(env: Any) -> Any:
-    return stepper(env.name)
-
-
-@pytest.fixture(scope="module")
-def fresh(env: Any) -> State:
-    return initial(env)
+env = pytest.fixture(scope="module")(lambda: made("go1seesaw"))
+step = pytest.fixture(scope="module")(lambda env: stepper(env.name))
+fresh = pytest.fixture(scope="module")(lambda env: initial(env))
 
 
 def on_plank(x: float, height: float = 0.31) -> list[float]:

@@ -16,9 +16,7 @@ NO = jnp.array(False)
 TASKS = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
 
 
-@pytest.fixture(scope="module")
-def envs() -> dict[str, Any]:
-    return {task: made(task) for task in TASKS}
+envs = pytest.fixture(scope="module")(lambda: {task: made(task) for task in TASKS})
 
 
 @pytest.fixture(scope="module")
@@ -34,24 +32,10 @@ def fresh(drawn: dict[str, State]) -> dict[str, State]:
     return {task: jax.tree.map(lambda x: x[0], states) for task, states in drawn.items()}
 
 
-@pytest.fixture(scope="module")
-def duel(envs: dict[str, Any]) -> Any:
-    return envs["go1football-1vs1"]
-
-
-@pytest.fixture(scope="module")
-def duel_step(duel: Any) -> Any:
-    return stepper(duel.name)
-
-
-@pytest.fixture(scope="module")
-def attack(envs: dict[str, Any]) -> Any:
-    return envs["go1football-defender"]
-
-
-@pytest.fixture(scope="module")
-def attack_step(attack: Any) -> Any:
-    return stepper(attack.name)
+duel = pytest.fixture(scope="module")(lambda envs: envs["go1football-1vs1"])
+duel_step = pytest.fixture(scope="module")(lambda duel: stepper(duel.name))
+attack = pytest.fixture(scope="module")(lambda envs: envs["go1football-defender"])
+attack_step = pytest.fixture(scope="module")(lambda attack: stepper(attack.name))
 
 
 def with_ball(env: QuadrupedEnv, state: State, position: Any, velocity: Any = (0.0, 0.0, 0.0)) -> State:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.envs import Moment, QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs import Moment, VectorEnv, make
 from mqe_jax.npc import defend, flock
 from mqe_jax.physics import objects
 from mqe_jax.physics.scene import Scene, compile_scene
@@ -22,14 +22,8 @@ from tests.states import angles, initial, made, placed, terms_of, with_object
 STEP = 0.02
 
 
-@pytest.fixture(scope="module")
-def box_env() -> QuadrupedEnv:
-    return made("go1pushbox")
-
-
-@pytest.fixture(scope="module")
-def herd() -> Any:
-    return made("go1sheep-hard")
+box_env = pytest.fixture(scope="module")(lambda: made("go1pushbox"))
+herd = pytest.fixture(scope="module")(lambda: made("go1sheep-hard"))
 
 
 def plain(**objects: objects.Object) -> Any:

@@ -86,15 +86,8 @@ def test_teams_may_see_different_groups_of_observations() -> None:
     assert cast.env.groups == cast.eval_env.groups == ("proprioception",)
 
 
-@pytest.fixture(scope="module")
-def door() -> VectorEnv:
-    return matches()
-
-
-@pytest.fixture(scope="module")
-def policies(door: VectorEnv) -> list[TrainedPolicy]:
-    """Two policies of one architecture."""
-    return [new_policy(versus(door, ["idle"]), seed) for seed in (0, 1)]
+door = pytest.fixture(scope="module")(lambda: matches())
+policies = pytest.fixture(scope="module")(lambda door: [new_policy(versus(door, ["idle"]), seed) for seed in (0, 1)])
 
 
 def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv) -> None:

@@ -20,10 +20,7 @@ from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.recording import Episode
 from tests.states import initial, made, placed
 
-
-@pytest.fixture(scope="module")
-def env() -> Any:
-    return FakeEnv()
+env = pytest.fixture(scope="module")(lambda: FakeEnv())
 
 
 @pytest.fixture(scope="module")
