@@ -86,22 +86,17 @@ def _record(x: Any, key: Any = KEY, **options: Any) -> Any:
 
 
 def _render(x: Any, **options: Any) -> Any:
-    return render.render_episode(
-        x["fake"], options.pop("episode", x["episode"]), options.pop("path", x["gif"]), **options
-    )
+    given = {"episode": x["episode"], "path": x["gif"], **options}
+    return render.render_episode(x["fake"], **given)
 
 
-def _save(**options: Any) -> None:
-    save_tree(**{"path": "a", "tree": {}, "metadata": {}, "kind": "policy", **options})
-
-
+SAVED: dict[str, Any] = {"path": "a", "tree": {}, "metadata": {}, "kind": "policy"}
 READERS = (load_yaml, read_torchscript)
 FILES = ((load_policy, "/dev/zero"), *product((*READERS, load_recording), ("/", "/dev/zero")))
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("task: ", lambda x, v: make(v), (3, [], None)),
-    *((name, lambda x, v, name=name: make("go1gate", **{name: v}), (3, [])) for name in ("impl", "control")),
+    *((name, lambda x, v, name=name: make("go1gate", **{name: v}), (3, [])) for name in ("impl", "control", "robot")),
     ("num_envs: ", lambda x, v: make("go1gate", num_envs=v), (NAN, 1.5, 0, True, 10**9, None, [])),
-    ("robot: ", lambda x, v: make("go1gate", robot=[]), (None,)),
     ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300)),
     ("commands", lambda x, v: make("go1gate", commands=3), (None,)),
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], v), (0, NAN, 1.5, 10**9, "x")),
@@ -229,10 +224,9 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("name: ", lambda x, v: register_network(v), (None, 3)),
     ("network: ", lambda x, v: register_network("x")(v), (None, 3, dict)),
     ("skill: ", lambda x, v: skills.register(x.get(v, v)), (None, Path, "task")),
-    *((name, lambda x, v, name=name: _save(**{name: v}), ([], {"a": KEY})) for name in ("path", "metadata", "kind")),
-    ("tree: ", lambda x, v: _save(tree={"a": v}), ("x", object(), [b"a"])),
+    *((n, lambda x, v, n=n: save_tree(**{**SAVED, n: v}), ([], {"a": KEY})) for n in ("metadata", "kind")),
+    *((n, lambda x, v, n=n: save_tree(**{**SAVED, n: {"a": v}}), ("x", [b"a"])) for n in ("path", "tree")),
     ("kind: ", lambda x, v: load_tree("a", {}, kind=v), (None, "x", [])),
-    ("autoreset_mode: ", lambda x, v: gymnasium.VectorEnv("go1plane", autoreset_mode=v), ("x", None, np.zeros((9, 2)))),
     ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
