@@ -131,7 +131,7 @@ def test_a_graph_holds_the_skill_of_the_task(monkeypatch: pytest.MonkeyPatch) ->
 def stub_env(agents: int) -> Any:
     """What `policy_step` reads of a task in `torque` control."""
     sizes = {"num_agents": agents, "observation_size": 7, "privileged_observation_size": 0, "action_size": 12}
-    return SimpleNamespace(name="none", control="torque", robot=GO1, **sizes)
+    return SimpleNamespace(name="none", control="torque", robot=GO1, reset=None, step=None, **sizes)
 
 
 def test_agents_of_mat_act_one_after_another() -> None:
