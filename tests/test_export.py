@@ -120,11 +120,18 @@ def test_networks_memories_and_controls_agree(task: str, control: str, network: 
     assert error_on_random_inputs(new_policy(env, control, **network), env) < 2e-5
 
 
-def test_a_graph_holds_the_skill_of_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("skill", "commands", "memory"),
+    [("lean", ("roll", "pitch"), {"lean_lean": (2, 2)}),
+     (("walk", "agile"), ("vx", "vy", "yaw_rate"), {"choice_acting": (2,), "choice_agile_frames": (2, 9, 39)})],
+)  # fmt: skip
+def test_a_graph_holds_the_skill_of_the_task(
+    skill: Any, commands: Any, memory: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(SKILLS, "lean", StandAndLean)
-    env = make("go1gate", impl="c", num_envs=1, skill="lean", commands=("roll", "pitch"))
+    env = make("go1gate", impl="c", num_envs=1, skill=skill, commands=commands)
     policy = new_policy(env, recurrent=False)
-    assert input_shapes(policy, env)["lean_lean"] == (2, 2)
+    assert memory.items() <= input_shapes(policy, env).items()
     assert error_on_random_inputs(policy, env) < 2e-5
 
 

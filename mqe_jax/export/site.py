@@ -21,7 +21,7 @@ import onnx
 
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.files import write_atomically
-from mqe_jax.core.settings import fail
+from mqe_jax.core.settings import fail, override
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, make
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.export.check import checked
@@ -30,8 +30,11 @@ from mqe_jax.export.policy import shapes
 from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, state_arrays
 from mqe_jax.export.translate import Function
+from mqe_jax.physics import robots
 from mqe_jax.policies import load_policy, parameters_for, zoo
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
+from mqe_jax.policies.translated import together, translate
+from mqe_jax.skills.agile import AgileSkill
+from mqe_jax.train.policy import Policy, TrainedPolicy
 
 PAGE = Path(__file__).parent / "page"
 """Files of the page."""
@@ -119,12 +122,12 @@ def entries(sources: Sequence[str]) -> list[Entry]:
         if entry is None:
             count = sum(known == task for known, *_ in found)
             own = {name: value for name, value in params.items() if not name.startswith("randomization")}
-            env = make(task, num_envs=1, randomization=Randomization(), **own)
+            env = make(task, num_envs=1, randomization=Randomization(), **_drivable(task, own))
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
-            check_policy(policy, entry.env, source)
-            entry.policies[name if name == "shipped" else _short(Path(name), entry.policies)] = policy
+            short = name if name == "shipped" else _short(Path(name), entry.policies)
+            entry.policies[short] = translate(policy, entry.env, source)
     for task, _, entry in found:
         if task in PLANNERS and entry.env.params.commands == type(entry.env.params).commands:
             entry.policies.setdefault("scripted", load_policy("scripted", entry.env))
@@ -143,6 +146,17 @@ def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], 
     if policy.task not in TASKS:
         raise InputError(f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}")
     return policy.task, dict(policy.config.env), {str(Path(source).resolve()): policy}
+
+
+def _drivable(task: str, params: dict[str, Any]) -> dict[str, Any]:
+    """Returns a task's parameters with the agile skill, which the keys drive, beside the skill of its policies."""
+    plain = override(TASKS[task].Params(), {name: value for name, value in params.items() if name != "control"})
+    known = [command.name for command in AgileSkill.commands]
+    if plain.skill != "walk" or plain.skill_weights or not {*plain.commands} <= {*known}:
+        return params
+    ranges = dict(zip(known, AgileSkill(robots.get(plain.robot)).trained(known).tolist(), strict=True))
+    agile = {"skill": "agile", "command_ranges": ranges}
+    return {**params, **together([plain.actions("command"), agile])}
 
 
 def _short(path: Path, taken: Iterable[str]) -> str:

@@ -59,9 +59,10 @@ class TaskFunctions:
             raise InputError(f"control: {env.control!r} is not allowed; graphs of tasks need 'command'")
         if env.params.actuator_network is not None:
             raise InputError("actuator_network: not allowed; graphs of tasks need PD control")
-        if env.controller.npc:
+        if env.controller.npc and env.npc_skill not in [part.name for part in env.controller.skill.parts]:
             raise InputError(
-                f"skill: {env.params.skill!r} is not allowed; graphs of tasks need one skill for all robots"
+                f"skill: {env.params.skill!r} is not allowed; graphs of tasks need that of the NPC robots, "
+                f"{env.npc_skill!r}, alone or among several"
             )
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
@@ -94,7 +95,8 @@ class TaskFunctions:
         action = env.unmirror_action(jnp.clip(inputs["action"], -1.0, 1.0))
         action = jnp.where(inputs["driven"][:, None] > 0.5, inputs["drive"], action)
         commands, npcs = env.controller.skill_commands(action), env.npc_commands(state, robots)
-        commands = commands if npcs is None else jnp.concatenate([commands, npcs])
+        if npcs is not None:
+            commands = jnp.concatenate([commands, env.controller.skill.with_choice(env.npc_skill, npcs)])
         outputs = {"command": commands, **dict(zip(SENSED, robots.proprioception, strict=True))}
         with normal_numbers(inputs.get("noise")):
             data = env.step_npcs(state.data, robots, state.key)

@@ -184,7 +184,7 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         asked = {name: value for name in usual if (value := getattr(needs, name)) != usual[name]}
         params = asked | {name: value for name, value in params.items() if value is not None}
-    return params | together(every)
+    return params | together([needs.by_name() for needs in every])
 
 
 def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -14,7 +14,6 @@ from mqe_jax.core.types import Memory
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.needs import Needs
 from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 
 
@@ -72,16 +71,17 @@ def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
     return policy
 
 
-def together(every: Sequence[Needs]) -> dict[str, Any]:
+def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns the skills and the command ranges with which policies of different skills can meet, each with its own.
 
-    Empty where all have the same skill.
+    Empty where all have the same skill. Policies are given by their `Needs.by_name()`.
     """
-    skills = [needs.skill for needs in every]
+    skills = [needs["skill"] for needs in every]
     if len({*skills}) < 2:
         return {}
     several = [name for skill in skills if isinstance(skill, tuple) for name in skill]
     names = dict.fromkeys([*several, *(name for name in SKILLS if name in skills)])
-    common = [name for name in every[0].commands or () if all(name in needs.command_ranges for needs in every)]
-    limits = {name: list(zip(*(needs.command_ranges[name] for needs in every), strict=True)) for name in common}
+    ranges = [needs["command_ranges"] for needs in every]
+    common = [name for name in ranges[0] if all(name in each for each in ranges)]
+    limits = {name: list(zip(*(each[name] for each in ranges), strict=True)) for name in common}
     return {"skill": tuple(names), "command_ranges": {x: (min(low), max(high)) for x, (low, high) in limits.items()}}

@@ -96,6 +96,10 @@ class Skill(abc.ABC):
         """Returns the values of the commands of `selector` with which the skill of this name acts."""
         return ()
 
+    def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
+        """Returns the commands (N, C) with which the skill of this name acts by its own ones (N, C')."""
+        return commands
+
     # -- common to all skills -----------------------------------------------------------------------------------
 
     def index(self, names: Sequence[str]) -> np.ndarray:

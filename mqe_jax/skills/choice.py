@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.index import Proprioception, placed
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Command, Skill
 
@@ -69,6 +69,11 @@ class Choice(Skill):
     def select(self, name: str) -> tuple[float]:
         place = [part.name for part in self.parts].index(name)
         return ((2 * place + 1) / len(self.parts) - 1,)
+
+    def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
+        default = self.default_commands(skill=self.select(name)[0])
+        columns = self._columns[[part.name for part in self.parts].index(name)]
+        return jax.vmap(functools.partial(placed, default, columns))(commands)
 
     def init_memory(self) -> dict[str, Any]:
         own = {"acting": jnp.zeros(()), "wait": jnp.zeros(())}
