@@ -124,7 +124,7 @@ def test_npc_robots_keep_the_walk_policy(control: str, size: int, weights: str) 
     assert (np.abs(targets[0][:2] - targets[1][:2]).max() > 0.05) == (control == "command")
 
 
-def test_graphs_of_tasks_need_one_skill(weights: str) -> None:
+def test_graphs_of_tasks_need_the_skill_of_npc_robots(weights: str) -> None:
     env = make("go1football-defender", impl="c", num_envs=1, skill="agile", skill_weights=weights)
     with pytest.raises(InputError, match="skill: 'agile' is not allowed"):
         TaskFunctions(env)

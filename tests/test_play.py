@@ -125,11 +125,13 @@ def test_graphs_of_every_task_agree_in_a_long_episode(task: str, tmp_path: Path)
 def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNamespace) -> None:
     functions = TaskFunctions(built.env)
     state = state_arrays(jax.jit(built.env.reset)(jax.random.PRNGKey(1)))
-    drive = jnp.array([[0.5, 0.5, 0.5], [0.1, 0.2, 0.3]])
-    given = {"action": jnp.ones((2, 3)), "drive": drive, "driven": jnp.array([0.0, 1.0]), "noise": jnp.zeros(2)}
+    drive, action = jnp.array([[0.5, 0.5, 0.5, 1.0], [0.1, 0.2, 0.3, 1.0]]), -jnp.ones((2, 4))
+    given = {"action": action, "drive": drive, "driven": jnp.array([0.0, 1.0]), "noise": jnp.zeros(2)}
     command = functions.control({**state, **given})["command"]
-    expected = built.env.controller.skill_commands(jnp.stack([jnp.ones(3), drive[1]]))
+    expected = built.env.controller.skill_commands(jnp.stack([action[0], drive[1]]))
     np.testing.assert_allclose(command, expected)
+    assert built.settings["commands"] == ["vx", "vy", "yaw_rate", "skill"]
+    assert built.env.params.commanded()["vx"] == (-1.5, 2.5)
 
 
 def test_initial_states_are_restored_from_the_columns_that_vary(built: SimpleNamespace) -> None:
