@@ -126,6 +126,13 @@ def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(name: str, 
     assert set(np.asarray(actions[1])[:, 3].tolist()) == {-0.5 if name == "walk" else 0.5}
 
 
+def test_a_gait_is_of_the_skill_that_has_it(policies: Any) -> None:
+    env = make(TASK, impl="c", num_envs=1, skill=BOTH, command_ranges=WIDE, gait="pace")
+    assert isinstance(load_as("policy", policies["agile"], env), Translated)
+    with pytest.raises(InputError, match=r"policy: .* needs gait 'trot'; the environment has 'pace'"):
+        load_as("policy", policies["walk"], env)
+
+
 @pytest.mark.parametrize("skill", ["walk", BOTH])
 def test_scripted_and_idle_policies_use_the_first_skill(skill: Any) -> None:
     env = make(TASK, impl="c", num_envs=1, skill=skill)

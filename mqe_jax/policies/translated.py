@@ -58,7 +58,8 @@ def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
     """
     needs = policy.needs
     if needs.control == "command" == env.control and len(env.controller.skill.parts) > 1:
-        params = dataclasses.replace(env.params, skill=needs.skill, command_ranges=needs.command_ranges)
+        gait = needs.gait and env.params.gait  # a skill may have no gaits
+        params = dataclasses.replace(env.params, skill=needs.skill, gait=gait, command_ranges=needs.command_ranges)
         own, here = params.commander, env.params.commander
         if here.admits(own):
             if beyond := own.skill.untrained(params.commanded()):
