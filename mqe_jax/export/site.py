@@ -118,11 +118,12 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     found: list[tuple[str, dict[str, Any], Entry]] = []
     for source in dict.fromkeys(sources or playable):
         task, params, policies = _source(source, playable)
+        params = _with_both_skills(task, params)
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
             count = sum(known == task for known, *_ in found)
             own = {name: value for name, value in params.items() if not name.startswith("randomization")}
-            env = make(task, num_envs=1, randomization=Randomization(), **_drivable(task, own))
+            env = make(task, num_envs=1, randomization=Randomization(), **own)
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
@@ -148,15 +149,15 @@ def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], 
     return policy.task, dict(policy.config.env), {str(Path(source).resolve()): policy}
 
 
-def _drivable(task: str, params: dict[str, Any]) -> dict[str, Any]:
-    """Returns a task's parameters with the agile skill, which the keys drive, beside the skill of its policies."""
+def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
+    """Returns a task's parameters with the walk policy and the agile skill, one of which policies and keys choose."""
     plain = override(TASKS[task].Params(), {name: value for name, value in params.items() if name != "control"})
     known = [command.name for command in AgileSkill.commands]
-    if plain.skill != "walk" or plain.skill_weights or not {*plain.commands} <= {*known}:
+    if plain.skill not in ("walk", "agile") or plain.skill_weights or not {*plain.commands} <= {*known}:
         return params
     ranges = dict(zip(known, AgileSkill(robots.get(plain.robot)).trained(known).tolist(), strict=True))
-    agile = {"skill": "agile", "command_ranges": ranges}
-    return {**params, **together([plain.actions("command"), agile])}
+    each = [plain.actions("command"), *({"skill": name, "command_ranges": ranges} for name in ("walk", "agile"))]
+    return {**params, **together(each)}
 
 
 def _short(path: Path, taken: Iterable[str]) -> str:
