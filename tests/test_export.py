@@ -182,3 +182,10 @@ def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: An
     assert "jax2onnx cannot translate go1gate (" in refused(str(GATE), "--onnx", file)
     with pytest.raises(InputError, match="needs task 'go1gate'; the environment has 'go1tug'"):
         to_onnx(load_policy(GATE), make("go1tug", impl="c", num_envs=1))
+
+
+@pytest.mark.parametrize("name", ["next_agile_gait", "next_choice_walk_gait"])
+def test_errors_of_gait_phases_are_cyclic(name: str) -> None:
+    graph = translate.translate(lambda inputs: {name: 2.0 * inputs["half"]}, {"half": (2,)}, "test")
+    inputs, expected = np.zeros((1, 2), np.float32), np.full((1, 2), 0.9999, np.float32)
+    assert errors(graph, {"half": inputs}, {name: expected})[name] == pytest.approx(1e-4, rel=1e-2)
