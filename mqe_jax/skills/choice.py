@@ -49,7 +49,7 @@ class Choice(Skill):
         if len(set(names)) < len(names) or len(names) < 2:
             raise InputError(f"skill: {tuple(names)} is not allowed; it must be a name, or several distinct names")
         for part in parts:
-            if not all(hasattr(part.init_memory(), field) for field in SHARED):
+            if not all(hasattr(jax.eval_shape(part.init_memory), field) for field in SHARED):
                 raise InputError(f"skill: {part.name!r} is not allowed with others; it remembers no action and gait")
         every = [
             *(command for part in parts for command in part.commands),
