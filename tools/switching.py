@@ -23,6 +23,7 @@ from mqe_jax.train.evaluate import Rate
 
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
 RANGES: dict[str, dict[str, tuple[float, float]]] = {"narrow": {}, "wide": WIDE}
+MODES = ("walk", "agile", "both")
 PERIOD, LONGEST = 200, 100  # steps
 
 
@@ -59,18 +60,18 @@ def main() -> None:
     parser.add_argument("--robot", default="go1")
     parser.add_argument("--impl", default="auto")
     parser.add_argument("--episodes", type=int, default=5000)
+    parser.add_argument("--cases", nargs="*", default=[f"{name}/{mode}" for name in RANGES for mode in MODES])
     parser.add_argument("--num-envs", type=int, default=2500)
     options = parser.parse_args()
     falls: dict[str, Any] = {}
-    for name, ranges in RANGES.items():
-        params = {"skill": ("walk", "agile"), "command_ranges": ranges, "robot": options.robot}
+    for case in options.cases:
+        name, mode = case.split("/")
+        params = {"skill": ("walk", "agile"), "command_ranges": RANGES[name], "robot": options.robot}
         params |= {"num_agents": 1, "episode_length": 20.0}
         env = mqe_jax.make("go1plane", impl=options.impl, num_envs=options.num_envs, **params)
-        for mode in ("walk", "agile", "both"):
-            policy: Any = Wanderer(mode, env.params.commander)
-            size = {"episodes": options.episodes, "num_envs": options.num_envs}
-            found = mqe_jax.evaluate(env, policy, **size)
-            falls[f"{name}/{mode}"] = Rate.of(found.endings["fall"], options.episodes)
+        policy: Any = Wanderer(mode, env.params.commander)
+        found = mqe_jax.evaluate(env, policy, episodes=options.episodes, num_envs=options.num_envs)
+        falls[case] = Rate.of(found.endings["fall"], options.episodes)
     print(json.dumps({"robot": options.robot, "episodes": options.episodes, "falls (low, high)": falls}))
 
 
