@@ -209,16 +209,6 @@ def script_archive(draw: st.DrawFn, content: bytes) -> bytes:
     return draw(damaged(buffer.getvalue())) if draw(st.integers(0, 3)) == 0 else buffer.getvalue()
 
 
-def small_archive() -> bytes:
-    """Returns a TorchScript archive of one module without tensors."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("net/data.pkl", b"\x80\x02c__torch__\nModule\n)\x81}X\x01\x00\x00\x00aK\x01sb.")
-        archive.writestr("net/data/0", bytes(64))
-        archive.writestr("net/version", "3\n")
-    return buffer.getvalue()
-
-
 PICKLES = (
     b"cos\nsystem\n(S'true'\ntR.",
     b"c__torch__\nModule\n)\x81}(X\x01\x00\x00\x00aubc__torch__\nModule\n)\x81.",

@@ -96,7 +96,6 @@ def test_brax_names_wrong_arguments() -> None:
 
 
 def test_jaxmarl_names_wrong_arguments() -> None:
-    """Also a batch in place of one state, and integers that are no discrete action."""
     jaxmarl, key = adapter("jaxmarl"), jax.random.PRNGKey(0)
     env, discrete = (jaxmarl.Env(task_env("go1gate"), discrete=wanted) for wanted in (False, True))
     _, state = env.reset(key)
@@ -228,10 +227,7 @@ def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any
 SHORT: dict[str, Any] = {"episode_length": 5 * 0.02, "impl": "c"}
 
 
-@pytest.fixture
-def zoo() -> Any:
-    """The adapter of PettingZoo."""
-    return adapter("pettingzoo")
+zoo = pytest.fixture(lambda: adapter("pettingzoo"))
 
 
 def own_test(name: str) -> Any:

@@ -41,9 +41,7 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     }
 
 
-@pytest.fixture(scope="module")
-def match() -> Any:
-    return make(TASK, impl="c", num_envs=4, skill=BOTH, command_ranges=WIDE)
+match = pytest.fixture(scope="module")(lambda: make(TASK, impl="c", num_envs=4, skill=BOTH, command_ranges=WIDE))
 
 
 def rolled(skill: Any, entries: Any, params: Any = None) -> tuple[np.ndarray, list[Any]]:
@@ -84,7 +82,6 @@ def test_the_entry_changes_the_skill_beyond_the_threshold_and_after_the_hold(ent
 
 
 def test_every_skill_remembers_what_was_executed() -> None:
-    """After changes, either skill continues as one that had executed these actions itself."""
     entries = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 6), HOLD)
     targets, memories = rolled(make_skill(BOTH, GO1), entries)
     for target, memory in zip(targets, memories, strict=True):
@@ -100,7 +97,6 @@ def test_every_skill_remembers_what_was_executed() -> None:
 
 
 def test_each_skill_gets_commands_that_it_is_trained_for(match: Any) -> None:
-    """Walking at the same action is at its fastest, which is slower."""
     skill, names = match.controller.skill, ("vx", "vy", "yaw_rate")
     commands = match.controller.skill_commands(jnp.array([[1.0, -1.0, 1.0, 1.0]] * 2))[0]
     np.testing.assert_allclose(commands[skill.index((*names, "skill"))], [2.5, -1.0, 2.5, 1.0])
@@ -144,7 +140,6 @@ def test_scripted_and_idle_policies_use_the_first_skill(skill: Any) -> None:
 
 
 def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
-    """Against opponents, on both sides, and as an environment of one team, each acts with its own skill."""
     batch = VectorEnv(match, 4)
     for wrapped in (batch, BothSides(batch)):
         env = versus(wrapped, [policies["walk"], policies["agile"]])

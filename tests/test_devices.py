@@ -1,7 +1,5 @@
 """The functions that span the processes of a training, with the processes as an axis of `vmap`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -90,7 +88,6 @@ def test_one_group_is_one_permutation() -> None:
 
 @pytest.mark.parametrize("network", ["actor_critic", pytest.param("mat", marks=pytest.mark.soak)])
 def test_two_shares_are_one_batch(network: str) -> None:
-    """The learner's states and metrics after two updates, with every setting that looks at more than one sample."""
     values: dict[str, Any] = {
         "num_envs": 8,
         "rollout_steps": 8,

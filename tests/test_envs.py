@@ -24,19 +24,13 @@ from tests.states import ending, initial, made, placed, stepper
 Array = jax.Array
 
 
-@pytest.fixture(scope="module")
-def gate() -> QuadrupedEnv:
-    return made("go1gate")
+gate = pytest.fixture(scope="module")(lambda: made("go1gate"))
 
 
-@pytest.fixture(scope="module")
-def fresh(gate: QuadrupedEnv) -> State:
-    return initial(gate)
+fresh = pytest.fixture(scope="module")(lambda gate: initial(gate))
 
 
-@pytest.fixture(scope="module")
-def gate_step(gate: QuadrupedEnv) -> Any:
-    return stepper(gate.name)
+gate_step = pytest.fixture(scope="module")(lambda gate: stepper(gate.name))
 
 
 @pytest.mark.parametrize("task", SHIPPED)
@@ -167,34 +161,19 @@ def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate
         (lambda: make("go1gate", impl="mjx"), r"impl: unknown engine 'mjx'.*allowed: auto, warp, c, jax"),
         (lambda: make("go1gate", control="comand"), r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
         (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown name .*did you mean 'gate_width'"),
-        (lambda: make("go1gate", rewards={"colision": 1.0}), r"rewards.colision.*did you mean 'collision'"),
-        (lambda: make("go1gate", gate_width="wide"), r"gate_width: 'wide' is not allowed; it must be a valid number"),
-        (
-            lambda: make("go1gate", gate_width=-1),
-            r"gate_width: -1 is not allowed; it must be greater than or equal to 0.0",
-        ),
         (lambda: make("go1gate", gate_width=4.0), r"gate_width: 4.0 .* less than the width of the track, 3.0"),
-        (lambda: make("go1gate", gate_width=True), r"gate_width: True"),
-        (lambda: make("go1gate", episode_length=float("inf")), r"episode_length: inf"),
         (lambda: make("go1gate", gate_random=(0.5, -0.1)), r"gate_random: \(0.5, -0.1\)|gate_random.*-0.1"),
-        (lambda: make("go1gate", min_height=2.0), r"min_height: 2.0 .* less than max_height, 1.5"),
-        (lambda: make("go1gate", randomization={"payload": (3, 1)}), r"randomization.payload: .*lowest"),
         (lambda: make("go1gate", randomization={"payload": (-9, 1)}), r"randomization.payload: .*mass of the trunk"),
         (
             lambda: make("go1gate", control="torque", randomization={"motor_offset": 0.1}),
             r"randomization.motor_offset: 0.1 .*0 with control torque",
         ),
-        (lambda: make("go1gate", randomization={"friction": (0, 1)}), r"randomization.friction: .*greater than 0"),
         (lambda: make("go1plane", randomization={"joint_mechanics": (0.5, 2.0)}), "randomization.joint_mechanics"),
-        (lambda: make("go1gate", randomization={"action_lag": 1.5}), r"randomization.action_lag: 1.5 .*valid integer"),
         (lambda: make("go1seesaw", plank_start=-0.3), r"plank_start: -0.3 .*within \+-plank.limit"),
-        (lambda: make("go1tug", cylinder={"radius": 0}), r"cylinder.radius: 0 .*greater than or equal to 0.001"),
         (lambda: make("go1revolvingdoor", gap=1.5), r"door.size: .*narrower than the gap, 1.5"),
         (lambda: make("go1bridge", platform_x=(3.0, 4.0)), r"platform_x: .*more than a platform's length"),
         (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate requires 2"),
-        (lambda: make("go1gate", num_envs=0), r"num_envs: 0 is not allowed; .* greater than 0"),
         (lambda: make("go1plane", gait="gallop"), r"gait: unknown name 'gallop'"),
-        (lambda: make("go1plane", commands=("vx", "vz")), r"commands: unknown command 'vz'"),
         (lambda: make("go1plane", skill_weights="/nowhere"), r"walk policy: no file /nowhere"),
     ],
 )

@@ -52,10 +52,7 @@ def test_settings_are_those_of_the_command(words: str, config: Any, env: dict[st
     assert build.for_task(build.settings_of(command.target, config), command.target, env) == expected
 
 
-@pytest.fixture(scope="module")
-def run(shared_programs: None) -> mqe_jax.Run:
-    """A training in memory."""
-    return mqe_jax.learn(fake(), FEW, seed=2)
+run = pytest.fixture(scope="module")(lambda shared_programs: mqe_jax.learn(fake(), FEW, seed=2))
 
 
 def fake() -> Any:

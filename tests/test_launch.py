@@ -1,10 +1,7 @@
 """`mqe launch`: several processes equal one, end together, and resume on another number."""
 
-from __future__ import annotations
-
 import contextlib
 import os
-import random
 import re
 import signal
 import socket
@@ -89,7 +86,6 @@ def test_a_command_that_cannot_be_launched(command: list[str], capfd: pytest.Cap
 
 
 def test_a_mistake_that_all_processes_find_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Whichever ends first."""
     for later in range(2):
         script = f"import os, sys, time; time.sleep({later} ^ int(os.environ['INDEX'])); sys.exit('mqe: num_envs: 3')"
         with pytest.MonkeyPatch.context() as patch:
@@ -129,23 +125,6 @@ def content(run_dir: Path) -> dict[str, np.ndarray]:
     return load_file(list_checkpoints(run_dir)[-1])
 
 
-SWEEP = """
-tasks: [go1gate]
-seeds: [0, 1]
-seeds_together: 1
-settings:
-  {num_envs: 4, rollout_steps: 4, total_steps: STEPS, env: {control: position}, checkpoint: {every: 1000},
-   network: {hidden_sizes: [8], recurrent: false}, ppo: {minibatches: 2, epochs: 1}}
-"""
-
-
-def sweep(folder: Path, steps: int) -> list[str]:
-    """Writes a sweep of two seeds; returns the words that train it."""
-    folder.mkdir()
-    (folder / "cells.yaml").write_text(SWEEP.replace("STEPS", str(steps)))
-    return ["sweep", str(folder / "cells.yaml"), "--folder", str(folder), "--impl", "c"]
-
-
 def metrics(run_dir: Path) -> list[dict[str, float]]:
     return [{name: float(x) for name, x in row.items()} for row in rows(run_dir)]
 
@@ -160,7 +139,6 @@ def assert_equal_runs(one: Path, other: Path, tolerance: float) -> None:
 
 
 def test_two_processes_equal_one(tmp_path: Path) -> None:
-    """One update on the C engine, and that files are written once."""
     one, two = tmp_path / "one", tmp_path / "two"
     steps = ["--total-steps", "16"]
     mqe("launch", "--processes", "2", *TRAIN, *steps, "--run-dir", str(two))
@@ -187,7 +165,6 @@ def test_a_run_resumes_on_another_number_of_processes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Path) -> None:
-    """With one line; after SIGTERM everything is saved."""
     run = tmp_path / "run"
     words = [*MQE, "launch", "--processes", "2", *TRAIN, "--total-steps", "1600000", "--checkpoint.every", "100000"]
     with started([*words, "--run-dir", str(run)]) as process:
@@ -209,57 +186,16 @@ def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Pa
 
 
 @pytest.mark.soak
-def test_processes_end_with_the_launcher(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    with started([*MQE, "launch", "--processes", "2", *TRAIN, "--run-dir", str(run)]) as process:
-        wait_for(lambda: updates(run) > 2, process)
-        both = children(process)
-        process.kill()
-        end = time.monotonic() + 10
-        while any(Path(f"/proc/{child}").exists() for child in both):
-            assert time.monotonic() < end
-            time.sleep(0.1)
-
-
-@pytest.mark.soak
-def test_a_process_of_a_sweep_that_is_killed(tmp_path: Path) -> None:
-    """The other goes on, until the launcher ends: then it ends too."""
-    runs = [tmp_path / "sweep" / "runs" / "go1gate" / "mappo" / f"seed{seed}" for seed in range(2)]
-    words = sweep(tmp_path / "sweep", 16_000_000)
-    with started([*MQE, "launch", "--processes", "2", *words]) as process:
-        wait_for(lambda: all(updates(run) > 2 for run in runs), process)
-        both = children(process)
-        os.kill(both[1], signal.SIGKILL)
-        assert process.stderr is not None
-        line = next(without_progress(process.stderr))
-        assert line == "mqe: a process of the training was killed by SIGKILL; the same command goes on\n"
-        wait_for(lambda: not Path(f"/proc/{both[1]}").exists(), process)
-        assert Path(f"/proc/{both[0]}").exists()
-        process.kill()
-        end = time.monotonic() + 10
-        while Path(f"/proc/{both[0]}").exists():
-            assert time.monotonic() < end
-            time.sleep(0.1)
-
-
-@pytest.mark.soak
 def test_a_terminal_that_interrupts(tmp_path: Path) -> None:
-    """Ctrl-C is a signal to the whole process group, and one line, also for a sweep."""
-    run = tmp_path / "sweep" / "runs" / "go1gate" / "mappo" / "seed1"
-    for words, where in (
-        ([*TRAIN, "--total-steps", "1600000", "--run-dir", str(tmp_path / "run")], tmp_path / "run"),
-        (sweep(tmp_path / "sweep", 16_000_000), run),
-    ):
-        with started([*MQE, "launch", "--processes", "2", *words], start_new_session=True) as process:
-            wait_for(lambda: updates(where) > 5, process)  # noqa: B023
-            both = children(process)
-            assert {os.getpgid(child) for child in both}.isdisjoint([process.pid])
-            os.killpg(process.pid, signal.SIGINT)
-            _, said = process.communicate(timeout=60)
-        resume = "the same command goes on" if "sweep" in words else "the same command with --resume goes on"
-        assert lines(said) == [f"mqe: interrupted; {resume}"]
-        assert process.returncode == 130
-        assert f"step_{updates(where) * 16:012d}" == list_checkpoints(where)[-1].stem
+    run = tmp_path / "run"
+    words = [*MQE, "launch", "--processes", "2", *TRAIN, "--total-steps", "1600000", "--run-dir", str(run)]
+    with started(words, start_new_session=True) as process:
+        wait_for(lambda: updates(run) > 5, process)
+        assert {os.getpgid(child) for child in children(process)}.isdisjoint([process.pid])
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert lines(said) == ["mqe: interrupted; the same command with --resume goes on"] and process.returncode == 130
+    assert f"step_{updates(run) * 16:012d}" == list_checkpoints(run)[-1].stem
 
 
 def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: Any, capfd: Any) -> None:
@@ -271,38 +207,6 @@ def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: 
         process.popen.wait(60)
     assert launch._wait(both, lambda: None) == 137
     assert capfd.readouterr().err == "mqe: a process of the training was killed by SIGKILL; " + launch._RESUME + "\n"
-
-
-@pytest.mark.soak
-def test_ten_kills_change_nothing(tmp_path: Path) -> None:
-    """Killed at random moments, resumed, the run equals an uninterrupted one of two processes bit for bit."""
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    words = ["launch", "--processes", "2", *TRAIN, "--total-steps", str(16 * 3000), "--checkpoint.every", "20"]
-    mqe(*words, "--run-dir", str(whole))
-    chance = random.Random(0)
-    for _ in range(10):
-        with started([*MQE, *words, "--run-dir", str(killed), "--resume"]) as process:
-            before = updates(killed)
-            wait_for(lambda: updates(killed) != before and len(children(process)) == 2, process)  # noqa: B023
-            time.sleep(chance.uniform(0.0, 3.0))
-            os.kill(children(process)[chance.randrange(2)], signal.SIGKILL)
-            _, said = process.communicate(timeout=60)
-            assert process.returncode == 137, said
-            assert sum(line.startswith("mqe: a process of the training was killed") for line in lines(said)) == 1
-    mqe(*words, "--run-dir", str(killed), "--resume")
-    assert_equal_runs(whole, killed, 0.0)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("flags", [["--algorithm", "mappo"], ["--opponent", "scripted", "--opponent", "older"]])
-def test_matches_on_two_processes_equal_one(flags: list[str], tmp_path: Path) -> None:
-    """Both teams learn; a league: both meet every opponent in both processes."""
-    words = ["train", "go1wrestling", "--impl", "c", "--num-envs", "8", "--rollout-steps", "4", "--total-steps", "32"]
-    words += ["--ppo.groups", "2", "--ppo.minibatches", "2", "--ppo.epochs", "2", "--network.hidden-sizes", "8", *flags]
-    words += ["--checkpoint.every", "1"]
-    mqe(*words, "--run-dir", str(tmp_path / "one"))
-    mqe("launch", "--processes", "2", *words, "--run-dir", str(tmp_path / "two"))
-    assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-4)
 
 
 # -- several hosts -----------------------------------------------------------------------------------------------------
@@ -319,7 +223,6 @@ wait $first && wait $second
 
 @pytest.mark.soak
 def test_the_slurm_file_of_the_documentation(tmp_path: Path) -> None:
-    """With a stand-in for srun; it equals one process."""
     file = Path(__file__).parents[1] / "docs" / "slurm.sh"
     for name, script in (("srun", SRUN), ("mqe", f'#!/bin/sh\nexec {" ".join(MQE)} "$@"\n')):
         (tmp_path / name).write_text(script)
@@ -329,17 +232,6 @@ def test_the_slurm_file_of_the_documentation(tmp_path: Path) -> None:
     subprocess.run(words, check=True, env=environment, timeout=300)
     assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
     assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-5)
-
-
-@pytest.mark.soak
-def test_a_sweep_of_srun(tmp_path: Path) -> None:
-    """Each process trains other cells, without minding the others."""
-    words = sweep(tmp_path / "sweep", 48)
-    srun = tmp_path / "srun"
-    srun.write_text(SRUN)
-    subprocess.run(["sh", str(srun), *MQE, "launch", *words], check=True, timeout=300)
-    runs = (tmp_path / "sweep" / "runs" / "go1gate" / "mappo").glob("seed*")
-    assert [updates(run) for run in runs] == [3, 3]
 
 
 def test_on_one_host_nobody_else_can_join() -> None:
@@ -379,7 +271,6 @@ def test_a_port_of_slurm_that_another_program_uses(foreign: str) -> None:
 
 
 def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which devices processes have, and how they find each other."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,6")
     monkeypatch.delenv("SLURM_PROCID", raising=False)
     monkeypatch.setattr(launch, "_gpus", lambda: 0)  # unknown, or no GPU
@@ -438,9 +329,7 @@ def test_what_jax_raises_where_another_process_has_ended(monkeypatch: pytest.Mon
             raise other
 
 
-def test_lines_of_the_coordination_service_are_not_shown(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_lines_of_the_coordination_service_are_not_shown(monkeypatch: Any, capfd: Any) -> None:
     """What JAX writes where process 0 of a training that has ended leaves before the others."""
     said = """go1gate: 1,024 of 1,024 steps
 W1126 00:01:02.123456     123 grpc_client.cc:1] lost

@@ -103,10 +103,7 @@ def test_a_policy_brings_the_parameters_that_it_needs(file: Path) -> None:
     assert env.params.commanded()["vx"] == (-1.5, 2.5)
 
 
-def test_commands_apply_what_a_shipped_policy_needs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Where it is chosen by default, by its name, or as the opponent; settings against it are refused."""
+def test_commands_apply_what_a_shipped_policy_needs(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     zoo.ship(load_policy(AGILE / "go1tug-seed1.safetensors"), zoo.card("go1tug"), tmp_path)
     monkeypatch.setattr(zoo, "FOLDER", tmp_path)
     for chosen in ((), ("go1tug",), ("scripted", "go1tug")):
@@ -175,7 +172,6 @@ def test_the_climber_leaves_the_low_end_of_the_plank_at_its_edge_and_goes_on_hig
 
 
 def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> None:
-    """All tasks but the plane have one, of a module of their own package."""
     assert set(TASKS) - set(PLANNERS) == {"go1plane"}
     for task in PLANNERS:
         assert planner_of(task).__module__.startswith("mqe_jax.policies.scripted.")
@@ -265,8 +261,6 @@ def test_a_skill_needs_no_recurrent_state() -> None:
 
 
 def test_npc_robots_follow_the_skill_in_every_action_mode() -> None:
-    """The agents stand at their default angles; the NPC robot leans to the right."""
-
     class Watched(type(make("go1football-defender", impl="c"))):
         npc_skill = "lean"
 
