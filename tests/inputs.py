@@ -4,11 +4,9 @@
 damaged files may be accepted where they happen to be valid.
 """
 
-import io
 import json
 import struct
 import typing
-import zipfile
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -186,27 +184,6 @@ def tensors_file(draw: st.DrawFn, content: bytes) -> bytes:
     text = json.dumps(header).encode("utf-8", "replace")
     length = draw(st.sampled_from([len(text)] * 6 + [0, 2**40, len(text) - 1]))
     return struct.pack("<Q", length) + text + content[8 + size :]
-
-
-@st.composite
-def script_archive(draw: st.DrawFn, content: bytes) -> bytes:
-    """A TorchScript archive with another pickle, other sizes of storages, or members that lie about themselves."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    name = draw(st.sampled_from(sorted(members)))
-    kind = draw(st.sampled_from(("damaged", "empty", "twice", "large", "renamed", "hostile")))
-    if kind == "damaged":
-        members[name] = draw(damaged(members[name]))
-    elif kind == "hostile":
-        members[next(n for n in members if n.endswith("data.pkl"))] = draw(st.sampled_from(PICKLES))
-    else:
-        other = {"empty": b"", "large": bytes(2**21), "twice": members[name] * 2}.get(kind)
-        members[name if other is not None else name + draw(st.text("abc/.", max_size=5))] = other or members.pop(name)
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for member, data in members.items():
-            archive.writestr(member, data)
-    return draw(damaged(buffer.getvalue())) if draw(st.integers(0, 3)) == 0 else buffer.getvalue()
 
 
 PICKLES = (
