@@ -81,12 +81,6 @@ def refused(kind: Any) -> Strategy:
     return st.one_of(*beyond, *others)
 
 
-def allowed(kind: Any) -> Strategy:
-    """Numbers within the bounds of a kind."""
-    low, high = limits.bounds(kind)
-    return st.integers(int(low), int(high)) if typing.get_args(kind)[0] is int else st.floats(low, high)
-
-
 @st.composite
 def wrong_settings(draw: st.DrawFn) -> tuple[str, str, Any]:
     """A record's name, a dotted name of a number in it, and a value that it must refuse."""

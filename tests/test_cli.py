@@ -133,18 +133,6 @@ def test_bench_prints_its_figures(monkeypatch: pytest.MonkeyPatch, capfd: pytest
     assert result["slowest"] <= result["env_steps_per_s"] <= result["fastest"]
 
 
-def test_resume_says_where_there_is_nothing_to_resume(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for _ in range(2):
-        assert cli.main(["train", "fake", "--run-dir", "new", "--resume", *SMALL]) == 0
-    assert capfd.readouterr().err.count("new has no checkpoint to resume from; starting a new run") == 1
-
-
-def test_render_draws_a_run(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
-    assert cli.main(["render", str(run_folder), "-o", str(tmp_path / "new" / "clip.png"), "--width", "160"]) == 0
-    assert (tmp_path / "new" / "clip.png").stat().st_size > 500
-
-
 def test_the_best_of_several_episodes_is_rendered(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     recorded = [
         recording.Episode(np.zeros((n, 1)), np.zeros((n, 0, 3)), np.zeros((n, 0, 4)), 0.1, success, reward)
@@ -214,12 +202,6 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
         assert parsed.task == override(task, {"shove_length": (0.1, 2.0)})
 
 
-def test_walk_commands_are_those_of_the_skill_walk() -> None:
-    assert arguments.unaliased(["walk", "eval", "--json"]) == ["skill", "eval", "walk", "--json"]
-    assert arguments.unaliased(["walk", "--help"]) == ["skill", "--help"]
-    assert arguments.parse(["walk", "eval", "--seed", "3"]) == arguments.parse(["skill", "eval", "walk", "--seed", "3"])
-
-
 @pytest.mark.parametrize("words", ["--run-dir go1tug", "--no-both-sides --run_dir go1tug", "--start go1tug"])
 def test_the_task_comes_first(words: str, capfd: pytest.CaptureFixture[str]) -> None:
     parsed, alone = parse_train(["go1gate", *words.split()]), parse_train(["go1gate"]).settings
@@ -274,11 +256,3 @@ def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str],
         assert cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
         assert "no checkpoint" not in capfd.readouterr().err
     assert json.loads(Path("run/evaluation.json").read_text())["after"]["episodes"] == 4
-
-
-def test_settings_of_another_task_are_used_and_named(capfd: pytest.CaptureFixture[str]) -> None:
-    config = build.base_config("go1seesaw", "demo")
-    assert build.for_task(config, "go1seesaw").task == "go1seesaw"
-    assert "the settings are for 'go1gate'; training 'go1seesaw'" in capfd.readouterr().err
-    build.for_task(config, "go1gate")
-    assert not capfd.readouterr().err

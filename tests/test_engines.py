@@ -163,15 +163,11 @@ FRICTION, PASSIVE = BIT.mjDSBL_FRICTIONLOSS, BIT.mjDSBL_SPRING | BIT.mjDSBL_DAMP
         ("joint", "", ("dof_armature", "dof_damping", "dof_frictionloss"), 0),
         ("joint", "", ("body_gravcomp",), FRICTION),
         ("joint", "frictionloss='0.1'", (), PASSIVE),
-        ("joint", "damping='0.1'", (), FRICTION),
         ("joint", "stiffness='0.1'", (), FRICTION),
         ("fixed", "frictionloss='0.1'", (), PASSIVE),
-        ("fixed", "damping='0.1'", (), FRICTION),
-        ("fixed", "stiffness='0.1'", (), FRICTION),
         ("motor", "damping='0.1'", (), FRICTION),
         ("body", "gravcomp='1'", (), FRICTION),
         ("option", "viscosity='1'", (), FRICTION),
-        ("option", "integrator='implicitfast'", (), FRICTION),
     ],
 )
 def test_warp_computes_no_terms_that_are_zero(

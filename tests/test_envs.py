@@ -14,7 +14,6 @@ import mqe_jax
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task, replay
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entities
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.registry import SHIPPED
@@ -217,20 +216,6 @@ def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any
     after, clipped = gate_step(fresh, action), gate_step(fresh, jnp.clip(action, -1.0, 1.0))
     jax.tree.map(np.testing.assert_array_equal, (after.data.ctrl, after.obs), (clipped.data.ctrl, clipped.obs))
     assert np.abs(np.asarray(gate_step(fresh, 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl - after.data.ctrl)).max() > 0
-
-
-def test_overrides_reach_every_level() -> None:
-    env = make("go1gate", impl="c", control="torque", gate_width=0.8, **{"rewards.collision": -5})
-    assert env.params.gate_width == 0.8 and env.params.rewards.collision == -5.0
-    assert env.action_size == 12 and float(env.compiled.model.actuator_gainprm[0, 0]) == 1.0
-
-
-def test_parameters_are_made_by_keyword() -> None:
-    assert GateParams(gate_width=0.7).gate_width == 0.7
-    with pytest.raises(InputError, match="gate_width: 0 is not allowed"):
-        GateParams(gate_width=0)
-    env = make("go1gate", impl="c", control="position", gate_width=np.float32(0.5), solver_iterations=np.int64(2))
-    assert env.params.gate_width == 0.5 and env.params.solver_iterations == 2
 
 
 def test_a_taken_or_missing_id_is_refused() -> None:

@@ -325,17 +325,6 @@ def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str
 
 
 @inputs.CASES
-@given(st.data())
-def test_a_number_within_its_bounds_is_taken_or_refused_for_another_field(data: st.DataObject) -> None:
-    name = data.draw(st.sampled_from(sorted(inputs.records())))
-    fields = dict(inputs.numbers(inputs.records()[name]))
-    field = data.draw(st.sampled_from(sorted(fields)))
-    value = data.draw(inputs.allowed(fields[field]))
-    with refusing():
-        build(inputs.records()[name], {field: value} | ({"tasks": ("go1gate",)} if name == "sweep" else {}))
-
-
-@inputs.CASES
 @given(inputs.wrong_flags())
 def test_flags_are_parsed_or_refused(words: list[str]) -> None:
     """A number outside its bounds is not parsed; other texts may be allowed where a text belongs."""

@@ -26,7 +26,7 @@ from mqe_jax.core.settings import (
     to_mapping,
 )
 from mqe_jax.envs.gate import GateParams
-from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.config import TrainConfig
 
 
 @record
@@ -232,12 +232,3 @@ def test_parameters_in_training_change_those_that_they_name() -> None:
 def test_mistakes_name_field_value_and_what_is_allowed(way: Any, values: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=f"^{message}"):
         way(TrainConfig, values)
-
-
-def test_a_file_with_a_mistake_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "bad.yaml"
-    path.write_text("ppo: {gama: 1}")
-    with pytest.raises(InputError, match=r"bad.yaml: ppo.gama: .*'gamma'"):
-        load_config(path)
-    path.write_text("env: {a: 1}")
-    assert load_config(path).env == {"a": 1}

@@ -83,20 +83,6 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (first / "wandb" / "run_id").read_text() == run_id
 
 
-@pytest.mark.parametrize(
-    ("row", "said"),
-    [
-        ({"average_step_reward": 0.25, "episode_return": 9.0, "success": 0.5}, "reward 0.25, success 50%, 8 steps/s"),
-        ({"episode_return": 9.0}, "return 9, 8 steps/s"),
-        ({"average_step_reward": math.nan}, "steps, 8 steps/s"),
-    ],
-)
-def test_progress_shows_what_is_known(row: dict[str, float], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with logs.ProgressLog("walk", 100) as log:
-        log.write({"env_steps": 100, "fps": 8.0, **row})
-    assert said in capsys.readouterr().err
-
-
 def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     display = pytest.importorskip("IPython.display", reason="needs the extra notebook")
     shown: list[str] = []

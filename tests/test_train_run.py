@@ -19,7 +19,7 @@ from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import build, override, to_mapping
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.train import checkpoint as checkpoints
-from mqe_jax.train import runner, start
+from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
@@ -272,12 +272,6 @@ def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainStat
         save_policy(tmp_path, broken)
 
 
-def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=r"run_dir: .*file.* cannot be written"):
-        train(PROBE, settings(), tmp_path / "file" / "run")
-
-
 def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState]) -> None:
     run_dir, _ = straight
     policy = read_policy(run_dir)
@@ -317,12 +311,6 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
         InputError, match=r"start: .*straight.* is not allowed; it must be a policy with this run's network"
     ):
         train(PROBE, settings(start=str(run_dir), network__hidden_sizes=(8,)), tmp_path / "b")
-
-
-def test_a_start_by_name_says_what_to_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start, "NAMED", {})
-    with pytest.raises(InputError, match=r"start: 'go1gate' is not allowed; .* after `import mqe_jax.policies.zoo`"):
-        train(PROBE, settings(start="go1gate"), tmp_path)
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
