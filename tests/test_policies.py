@@ -20,7 +20,7 @@ from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
 from mqe_jax.envs.state import ENDINGS
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.policies import BothTeams, SimplePolicy, load_policy, zoo
+from mqe_jax.policies import BothTeams, SimplePolicy, load_policy, parameters_for, zoo
 from mqe_jax.policies.scripted import planner_of
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
@@ -31,6 +31,7 @@ from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 
 AGILE = Path(__file__).parents[1] / "results" / "agile"
+POSITION = {"control": "position", "position_scale": 2.0}
 MATCHES = [name for name in zoo.names() if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")]
 
 
@@ -101,6 +102,22 @@ def test_a_policy_brings_the_parameters_that_it_needs(file: Path) -> None:
     env: Any = players(file.stem.rpartition("-")[0], file, impl="c").env
     assert env.params.skill == "agile" and set(env.params.commanded()) == {"vx", "vy", "yaw_rate"}
     assert env.params.commanded()["vx"] == (-1.5, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "expected"),
+    [
+        ("go1seesaw", [{}, POSITION], POSITION),
+        ("go1tug", [{"skill": "agile"}], {}),
+        ("go1seesaw", [{"gait": None, "skill": "agile"}], {"gait": None, "skill": "agile"}),
+        ("go1seesaw", [{"gait": "trot"}], {"gait": "trot"}),
+        ("go1seesaw", [{"robot": "go2"}, {"robot": "go2"}], {"robot": "go2"}),
+    ],
+)
+def test_parameters_are_those_that_policies_need_beyond_the_defaults(task: str, changes: Any, expected: Any) -> None:
+    policy = load_policy("go1seesaw")
+    policies = [dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **change)) for change in changes]
+    assert parameters_for(task, "forward", "nobody", *policies) == expected
 
 
 def test_commands_apply_what_a_shipped_policy_needs(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
