@@ -105,7 +105,7 @@ def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainSt
 def test_a_league_resumed_without_environments_plays_its_members(history: list[TrainState], tmp_path: Path) -> None:
     config, state = config_of(), history[9]
     league = League(matches(num_envs=8), SOURCES, config)
-    metadata = {"task": "go1tug", "config": to_mapping(config), "environments": False}
+    metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
     file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
     learner, processes = own_learner(league.env, config, league)
     resumed, _ = first_state(league.env, learner, processes, config, file, Seeds(learner.init, 1).shared, league)
