@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import VectorEnv, cli, learn, make
+from mqe_jax import VectorEnv, learn, make
 from mqe_jax.core.errors import InputError
 from mqe_jax.export.task import TaskFunctions
 from mqe_jax.physics.robots.go1 import GO1
@@ -20,7 +19,7 @@ from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.networks import EnvDims
-from mqe_jax.train.policy import TrainedPolicy, save_policy
+from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.walk_policy import WalkPolicy
 
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -191,16 +190,6 @@ def test_policies_that_need_something_else_are_refused(
     for source in (policy, *([] if own else ["go1football-1vs1"])):
         with pytest.raises(InputError, match=rf"{field}: .* needs {said}"):
             load_as(field, source, env)
-
-
-@pytest.mark.parametrize("words", [["eval"], ["tournament", "go1tug"]])
-@pytest.mark.parametrize("changes", ["skill=agile", "command_ranges.vx=[-1.0, 1.2]", "robot=go2"])
-def test_commands_refuse_them_by_name(
-    words: list[str], changes: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    file = str(save_policy(tmp_path, load_policy("go1tug")))
-    assert cli.main([*words, file, "--impl", "c", "--set", changes]) == 2
-    assert f"{file} needs {changes.split('=')[0].split('.')[0]}" in capfd.readouterr().err
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:

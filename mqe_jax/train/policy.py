@@ -220,11 +220,11 @@ def policy_of(state: TrainState, env: VectorEnv, config: TrainConfig, **metadata
     return TrainedPolicy(policy_params, state.obs_normalizer.obs, needs, config, metadata)
 
 
-def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
+def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "policy") -> None:
     """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, a trained one's `Needs`.
 
     Raises:
-        InputError: naming what differs, with the values of both.
+        InputError: naming `field`, the policy and what differs, with the values of both.
     """
     check("policy", policy, AnyPolicy)
     needs = {"task": policy.task, "agents": policy.agents}
@@ -234,9 +234,9 @@ def check_policy(policy: Policy, env: Any, name: str = "policy") -> None:
         needs, found = {"group": group}, {"group": ", ".join(sorted(groups))}
         if group in groups:
             needs, found = policy.needs.by_name(), needs_of(env, policy.config).by_name()
-    for field, value in needs.items():
-        if value != found[field]:
-            raise InputError(f"policy: {name} needs {field} {value!r}; the environment has {found[field]!r}")
+    for need, value in needs.items():
+        if value != found[need]:
+            raise InputError(f"{field}: {name} needs {need} {value!r}; the environment has {found[need]!r}")
 
 
 NAMED: dict[str, Callable[[], TrainedPolicy]] = {}

@@ -120,10 +120,7 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
         fail("start", start, f"a run folder, a policy file, or {shipped}")
     policy = NAMED[start]() if start in NAMED else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
-    try:
-        check_policy(policy, env, start)
-    except InputError as error:
-        raise InputError(str(error).replace("policy:", "start:", 1)) from None
+    check_policy(policy, env, start, "start")
     if shapes != jax.tree.map(jnp.shape, policy.params):
         fail("start", start, "a policy with this run's network")
     theirs = dict(_leaves(to_mapping(policy.config)))
